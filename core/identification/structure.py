@@ -128,7 +128,7 @@ class Structure:
         source: str = "structure",
         schedule: Schedule | None = None,
     ) -> Structure:
-        """From the list under `structure:` in a signals file.
+        """From the list under `structure:` in a signals file; `source`: what errors call it.
 
         Each rule names elements by `state` (the row; `*` for all) and `from` (a state, a control, `disturbance`,
         `noise` or `*` for every state and control), and gives `nominal` and/or `half_width`: a number, or
@@ -137,29 +137,6 @@ class Structure:
         Of a scheduled model, `knot` names the knot or mode that a rule holds for, by its number from 1 on (a list of
         numbers if there are two scheduling signals), or all, which is the default; `shared: true` has the elements be
         the same at all of them.
-
-        Parameters
-        ----------
-        rules : object
-            The list.
-        states : sequence of str
-            Names.
-        controls : sequence of str
-            Names.
-        source : str, default "structure"
-            What errors call the list.
-        schedule : Schedule, optional
-            Of a scheduled model.
-
-        Returns
-        -------
-        Structure
-            The structure.
-
-        Raises
-        ------
-        FitError
-            A rule names what is not there, or is not of this form.
         """
         n, m = len(states), len(controls)
         blocks = 1 if schedule is None else schedule.blocks
@@ -218,13 +195,7 @@ class Structure:
         return cls(n, m, lower=lower, upper=upper, blocks=blocks, shared=structure.shared)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain data for the model file; null for no bound.
-
-        Returns
-        -------
-        dict
-            `lower` and `upper`, each by the names of `Structure`, and `shared` where an element is.
-        """
+        """`lower`, `upper` and `shared` for the model file; null for no bound."""
 
         def plain(values: Any) -> Any:
             return [plain(v) for v in values] if isinstance(values, list) else values if math.isfinite(values) else None
@@ -239,27 +210,7 @@ class Structure:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], n: int, m: int) -> Structure:
-        """From what `to_dict` returned.
-
-        Parameters
-        ----------
-        data : mapping of str to object
-            Of a model file.
-        n : int
-            Number of states.
-        m : int
-            Number of controls.
-
-        Returns
-        -------
-        Structure
-            The structure.
-
-        Raises
-        ------
-        FitError
-            It is not of that form.
-        """
+        """From what `to_dict` returned."""
 
         def arrays(side: str, kind: type = np.float64) -> dict[str, Any]:
             try:
@@ -274,30 +225,9 @@ class Structure:
         return cls(n, m, lower=shaped["lower"], upper=shaped["upper"], blocks=blocks, shared=shared)
 
     def stacked(self, names: Collection[str], tied: Sequence[int] = (0,)) -> tuple[Array, Array, Array, Array]:
-        """Bounds in the order of the unknowns.
+        """Lower and upper bounds of theta (r, n), and of d (q, n), in the order of the unknowns.
 
-        Parameters
-        ----------
-        names : collection of str
-            Arrays of the additive terms that the fit has.
-        tied : sequence of int, optional
-            Of each block of the fit the one whose elements it has, itself if they are its own; default one block.
-
-        Returns
-        -------
-        array (r, n)
-            Lower bounds of theta.
-        array (r, n)
-            Upper bounds of theta.
-        array (q, n)
-            Lower bounds of d.
-        array (q, n)
-            Upper bounds of d.
-
-        Raises
-        ------
-        FitError
-            An additive element is fixed to a number other than 0, and the fit does not have that term.
+        `names`: arrays of the additive terms that the fit has; `tied`: of each block the one whose elements it has.
         """
         additive = [name for which in ("nominal", "half") for term in ADDITIVE if (name := getattr(term, which))]
         for name in additive:
@@ -328,19 +258,9 @@ class Structure:
     def shared_elements(
         self, names: Collection[str], tied: Sequence[int]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-        """Which unknowns are one.
+        """Of each nominal element and each half-width the position of the one that it is; None if none is shared.
 
-        Parameters
-        ----------
-        names : collection of str
-            Arrays of the additive terms that the fit has.
-        tied : sequence of int
-            Of each block of the fit the one whose elements it has, itself if they are its own.
-
-        Returns
-        -------
-        tuple of array (r, n) and (q, n) of int, or None
-            Of each nominal element and each half-width the position of the one that it is; None where none is shared.
+        `names`, `tied`: as of `stacked`.
         """
         own = all(r == block for r, block in enumerate(tied))
         if own and (len(tied) == 1 or not any(array.any() for array in self.shared.values())):

@@ -104,13 +104,7 @@ class Repeats:
         return f"Repeats(longest {', '.join(f'{s:.3g} s' for s in self.longest_repeat_s)})"
 
     def to_dict(self) -> dict[str, list[float]]:
-        """The form of the model file.
-
-        Returns
-        -------
-        dict
-            Plain data.
-        """
+        """As it is in a model file."""
         found = {name: getattr(self, name).tolist() for name in _KEYS}
         if not self.noisy_steps.any():
             del found["noisy_steps"]
@@ -118,23 +112,7 @@ class Repeats:
 
     @classmethod
     def from_dict(cls, data: Any) -> Repeats:
-        """From the form of the model file.
-
-        Parameters
-        ----------
-        data : object
-            As JSON gives it.
-
-        Returns
-        -------
-        Repeats
-            What it holds.
-
-        Raises
-        ------
-        ModelError
-            It is not of that form; names the field.
-        """
+        """From a model file."""
         if not isinstance(data, Mapping) or _KEYS[0] not in data:
             raise ModelError("field 'frozen' must be an object with longest_repeat_s; fit the model again")
         return cls(**object_of(data, "frozen", known=_KEYS))

@@ -155,23 +155,7 @@ class Schedule:
         return tuple(product(*(range(len(axis)) for axis in self.axes)))
 
     def positions(self, names: Sequence[str]) -> tuple[int, ...]:
-        """Where the scheduling signals are among all signals.
-
-        Parameters
-        ----------
-        names : sequence of str
-            Names of [x; u; further scheduling signals].
-
-        Returns
-        -------
-        tuple of int
-            One per axis.
-
-        Raises
-        ------
-        ModelError
-            A signal is not among them; names it.
-        """
+        """Where the scheduling signals are among these names of [x; u; further scheduling signals], one per axis."""
         for axis in self.axes:
             if axis.signal not in names:
                 raise ModelError(
@@ -180,36 +164,16 @@ class Schedule:
         return tuple(list(names).index(axis.signal) for axis in self.axes)
 
     def corners(self, s: ArrayLike) -> tuple[NDArray[np.intp], Array]:
-        """The blocks that hold at s, and their weights.
+        """The blocks that hold at normalised s (axes, K), and their weights.
 
-        Parameters
-        ----------
-        s : array (axes, K)
-            Scheduling vectors, normalised.
-
-        Returns
-        -------
-        array of int (C, K)
-            Blocks, C = 1, 2 or 4, the first axis slowest; -1 where a mode is not listed or a value is NaN.
-        array (C, K)
-            Their weights, which sum to 1; NaN where the block is -1.
+        Both (C, K), C = 1, 2 or 4, the first axis slowest: numbers of blocks, -1 where a mode is not listed or a value
+        is NaN, and weights that sum to 1, NaN there.
         """
         found: tuple[NDArray[np.intp], Array] = self.table.at(s)
         return found
 
     def weights(self, s: ArrayLike) -> Array:
-        """Weights of every block, w(s).
-
-        Parameters
-        ----------
-        s : array (axes, K)
-            Scheduling vectors, normalised.
-
-        Returns
-        -------
-        array (blocks, K)
-            Weights, which sum to 1; NaN where a mode is not listed or a value is NaN.
-        """
+        """Weights (blocks, K) of every block at normalised s (axes, K); NaN where a mode is not listed or s is NaN."""
         places, corner_weights = self.corners(s)
         dense = np.zeros((self.blocks, places.shape[1]))
         column = np.arange(places.shape[1])
@@ -219,18 +183,7 @@ class Schedule:
         return dense
 
     def main_block(self, s: ArrayLike) -> NDArray[np.intp]:
-        """The block that has the largest weight, of two alike the first.
-
-        Parameters
-        ----------
-        s : array (axes, K)
-            Scheduling vectors, normalised.
-
-        Returns
-        -------
-        array of int (K,)
-            Numbers of blocks; -1 where a mode is not listed or a value is NaN.
-        """
+        """The block of the largest weight at s (axes, K), of two alike the first; -1 for an unlisted mode."""
         places, weights = self.corners(s)
         found: NDArray[np.intp] = np.take_along_axis(places, np.argmax(weights, axis=0)[None], axis=0)[0]
         return found
@@ -238,40 +191,15 @@ class Schedule:
     def unknown(
         self, s: ArrayLike, places: NDArray[np.intp], weights: Array, known: NDArray[np.bool_]
     ) -> NDArray[np.bool_]:
-        """Whether the regime is unknown: s lies beyond its end knots, or no recording visited a block that holds.
+        """Whether the regime is unknown (K,): s lies beyond its end knots, or no recording visited a block that holds.
 
-        Parameters
-        ----------
-        s : array (axes, K)
-            Scheduling vectors, normalised.
-        places : array of int (C, K)
-            Of `corners`.
-        weights : array (C, K)
-            Of `corners`.
-        known : array of bool (blocks,)
-            Blocks that a recording visited.
-
-        Returns
-        -------
-        array of bool (K,)
-            True where no bound can be trusted.
+        `s` (axes, K): normalised; `places, weights` (C, K): of `corners`; `known` (blocks,): that a recording visited.
         """
         unknown: NDArray[np.bool_] = self.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0)
         return unknown
 
     def beyond(self, s: ArrayLike) -> NDArray[np.bool_]:
-        """Whether s lies beyond the end knots of some axis, where the blocks of the end are used.
-
-        Parameters
-        ----------
-        s : array (axes, K)
-            Scheduling vectors, normalised.
-
-        Returns
-        -------
-        array of bool (K,)
-            False for modes and for NaN.
-        """
+        """Whether normalised s (axes, K) lies beyond the end knots of some axis; False for modes and for NaN."""
         s = np.asarray(s, dtype=np.float64)
         left = np.zeros(s.shape[1], dtype=bool)
         for axis, values in zip(self.axes, s, strict=True):
@@ -280,18 +208,7 @@ class Schedule:
         return left
 
     def recorded_values(self, signals: Sequence[Signal]) -> list[Array]:
-        """Knots or modes in recorded units.
-
-        Parameters
-        ----------
-        signals : sequence of Signal
-            With the scheduling signals, their steady states and scales.
-
-        Returns
-        -------
-        list of array (knots or modes,)
-            One per axis.
-        """
+        """Knots or modes of each axis in recorded units."""
         named = {signal.name: signal for signal in signals}
         return [
             np.asarray(
@@ -301,20 +218,7 @@ class Schedule:
         ]
 
     def block_name(self, r: int, signals: Sequence[Signal]) -> str:
-        """Where one block holds, in words.
-
-        Parameters
-        ----------
-        r : int
-            Number of the block.
-        signals : sequence of Signal
-            With the scheduling signals, their units, steady states and scales.
-
-        Returns
-        -------
-        str
-            `fan_speed = 0.92`, for example, in recorded units.
-        """
+        """Where one block holds, in recorded units, such as `fan_speed = 0.92`."""
         units = {signal.name: signal.unit for signal in signals}
         at = zip(self.axes, self.recorded_values(signals), self.indices[r], strict=True)
         return ", ".join(f"{axis.signal} = {values[k]:.6g} {units[axis.signal]}".rstrip() for axis, values, k in at)
@@ -327,34 +231,12 @@ class Schedule:
         )
 
     def to_list(self) -> list[dict[str, Any]]:
-        """As it is in a model file.
-
-        Returns
-        -------
-        list of dict
-            One per axis: its signal, and its knots or modes.
-        """
+        """As it is in a model file."""
         return [{"signal": axis.signal, ("knots" if axis.knots else "modes"): list(axis.values)} for axis in self.axes]
 
     @classmethod
     def from_list(cls, data: Any) -> Schedule:
-        """From a model file.
-
-        Parameters
-        ----------
-        data : Any
-            What `to_list` wrote.
-
-        Returns
-        -------
-        Schedule
-            The schedule.
-
-        Raises
-        ------
-        ModelError
-            It is not that; names the field.
-        """
+        """From what `to_list` wrote."""
         if not isinstance(data, list):
             raise ModelError("field 'schedule' is not a list of scheduling signals")
         axes = []

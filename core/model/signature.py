@@ -72,13 +72,7 @@ class Signature:
         return f"Signature({self.label!r} of {plural(self.recordings, 'recording')})"
 
     def to_dict(self) -> dict[str, Any]:
-        """The form of the model file.
-
-        Returns
-        -------
-        dict
-            Plain data.
-        """
+        """As it is in a model file."""
         return {name: getattr(self, name) for name in _KEYS[:3]} | {
             "steps": list(self.steps),
             "moments": self.moments.tolist(),
@@ -86,23 +80,7 @@ class Signature:
 
     @classmethod
     def list_from(cls, data: Any) -> tuple[Signature, ...]:
-        """From the form of the model file.
-
-        Parameters
-        ----------
-        data : object
-            As JSON gives it.
-
-        Returns
-        -------
-        tuple of Signature
-            In the same order.
-
-        Raises
-        ------
-        ModelError
-            It is not of that form; names the field.
-        """
+        """From a model file."""
         if not isinstance(data, list) or not all(isinstance(entry, Mapping) for entry in data):
             raise ModelError("field 'signatures' must be a list of objects")
         for entry in data:
