@@ -16,10 +16,9 @@ import numpy as np
 import pytest
 from test_several_steps import A, B, assembled, recordings, started
 
-from uncertain_lti.identification import output_error
-from uncertain_lti.identification.output_error import nearest_to_all
+from uncertain_lti.identification import several_steps
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.several_steps import Elements, runs_over_steps, segments
+from uncertain_lti.identification.several_steps import Elements, nearest_to_all, runs_over_steps, segments
 from uncertain_lti.identification.spread import likelier_alone
 from uncertain_lti.identification.structure import Structure
 
@@ -43,12 +42,12 @@ def test_it_is_nearer_to_the_machine_than_least_squares_several_steps_ahead() ->
 
 @pytest.mark.parametrize("knots", [(), (-0.3, 0.3)])
 def test_no_element_makes_the_error_over_segments_smaller(knots: tuple[float, ...], monkeypatch: Any) -> None:
-    monkeypatch.setattr(output_error, "_DONE", 1e-12)
-    monkeypatch.setattr(output_error, "_ROUNDS", 40)
-    monkeypatch.setattr(output_error, "_EVERY", 1)
+    monkeypatch.setattr(several_steps, "_DONE", 1e-12)
+    monkeypatch.setattr(several_steps, "_ROUNDS", 40)
+    monkeypatch.setattr(several_steps, "_EVERY", 1)
     problem = assembled(recordings(0.02, bend=2.0), knots)
     _, found, elements = both(problem)
-    steps, recorded = segments(problem, problem.k, output_error.LONGER * 20, 10**6)  # type: ignore[misc]
+    steps, recorded = segments(problem, problem.k, several_steps.LONGER * 20, 10**6)  # type: ignore[misc]
 
     def error(values: Any) -> float:
         """With the best initial states, states weighted by the spread of the solution: by linear least squares."""

@@ -29,10 +29,9 @@ from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum
-from uncertain_lti.identification.output_error import nearest_to_all
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.row import Row
-from uncertain_lti.identification.several_steps import Elements, runs_over_steps
+from uncertain_lti.identification.several_steps import Elements, nearest_to_all, runs_over_steps
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths

@@ -7,12 +7,17 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Least squares several steps ahead: elements whose run stays near the recordings where the readings are noisy.
+"""Runs near the recordings over several steps where the readings are noisy: least squares, and the output-error method.
 
 One step ahead, least squares takes the noise of a reading for a movement that dies out within a step: the elements are
 biased, and their run drifts off (errors in variables). The error several steps ahead has the noise of both ends once,
 and the movement of all the steps. It is not linear in the elements; the Gauss-Newton method with Levenberg's and
 Marquardt's damping goes from least squares of one step over windows of 2, 4, 8... steps.
+
+That still starts each run from a reading, and uses the last sample of each window only. By the output-error method the
+initial state of each segment is unknown as well and every sample counts, each state by the spread of its own error:
+with noise on the readings alone, this is the maximum of the likelihood (multiple shooting). The initial states are
+eliminated segment by segment.
 """
 
 from __future__ import annotations
@@ -32,9 +37,13 @@ MOST_UNKNOWNS = 600
 """Of models with more elements the least squares of one step is all that is tried."""
 _STEPS_LOOKED_AT = 16_000  # of all windows of one length together, about
 _FEWEST, _MOST = 500, 1500  # windows
-_ROUNDS = 8
+_ROUNDS, _TRIES = 8, 8
 _LONGER = 2  # times as long, from one length of window to the next
 _DONE = 1e-3  # a smaller share of the squared error gained ends the rounds
+LONGER = 2
+"""A segment is so many times as long as the longest horizon."""
+_SAMPLES = 32_000  # that are run, of all segments, about
+_EVERY = 2  # of them counts: neighbours say much the same
 
 
 @dataclass(frozen=True)
@@ -230,7 +239,7 @@ def runs_over_steps(problem: Problem, k: NDArray[np.intp], rows: Sequence[Row], 
             scale = np.sqrt(np.mean(error**2, axis=0))
             scale = np.where(scale > 0.0, scale, 1.0)
         else:
-            values, gained = _nearest(windows, elements, values, scale)
+            values, gained = _nearest(_Ends(windows, elements, scale), elements, values)
             if steps >= 4 and gained:
                 yield elements.theta(values)
         if steps >= longest:
@@ -238,37 +247,135 @@ def runs_over_steps(problem: Problem, k: NDArray[np.intp], rows: Sequence[Row], 
         steps = min(_LONGER * steps, longest)
 
 
-def _nearest(windows: _Windows, elements: Elements, values: Array, scale: Array) -> tuple[Array, bool]:
-    """From these values to the least squared error over the windows, and whether it became smaller."""
+def nearest_to_all(
+    problem: Problem, k: NDArray[np.intp], elements: Elements, begins: Sequence[Array], longest: int
+) -> Array | None:
+    """Elements of the least squared error over all samples of segments, from the nearest of those to begin with.
+
+    `k` (N,): numbers of their samples; where one does not follow the one before, segments end; `begins` and what
+    returns (blocks, q, n): elements of [x; u] or [x; u; 1], one block after another; None if there are no segments, or
+    nothing is gained.
+    """
+    found = segments(problem, k, LONGER * longest, _SAMPLES)
+    if found is None:
+        return None
+    steps, recorded = found
+    with np.errstate(over="ignore", invalid="ignore"):
+        errors = [recorded - steps.run(recorded[0], theta)[0] for theta in begins]
+        scales = [np.sqrt(np.mean(error**2, axis=(0, 1))) for error in errors]
+        nearest = int(np.argmin([s.prod() if np.isfinite(s).all() else np.inf for s in scales]))
+    if not np.isfinite(scales[nearest]).all():
+        return None
+    sought = _Segments(steps, elements, recorded, scales[nearest])
+    values, gained = _nearest(sought, elements, elements.values(begins[nearest]))
+    return elements.theta(values) if gained else None
+
+
+def _nearest(sought: _Ends | _Segments, elements: Elements, values: Array) -> tuple[Array, bool]:
+    """From these values to the least squared error, and whether it became smaller: Gauss and Newton, damped."""
     damping, gained = 1e-4, False
-
-    def error_of(which: Array) -> tuple[Array, list[Array], float]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            x, used = windows.steps.run(windows.begin, elements.theta(which))
-            left = ((windows.end - x[-1]) / scale).ravel()
-            return left, used, float(left @ left)
-
-    left, used, before = error_of(values)
-    for _ in range(_ROUNDS):
-        if not 0.0 < before < np.inf:
-            break
-        slope = elements.chosen(_jacobian(windows, elements.theta(values), used) / scale[:, None, None])
-        slope *= elements.unit
-        gram, pull = slope.T @ slope, slope.T @ left
-        size = np.diagonal(gram).copy()
-        size[size <= 1e-12 * size.max()] = max(1e-12 * float(size.max()), 1e-300)
+    with np.errstate(over="ignore", invalid="ignore"):
+        before = sought.error(values)
         for _ in range(_ROUNDS):
-            change = np.linalg.lstsq(gram + damping * np.diag(size), pull, rcond=None)[0]
-            tried = np.clip(values + change * elements.unit, elements.lower, elements.upper)
-            found = error_of(tried)
-            if found[2] < before:
+            normal = sought.normal(values) if 0.0 < before < np.inf else None
+            if normal is None:
                 break
-            damping *= 10.0
-        else:
-            break
-        done = found[2] > before * (1.0 - _DONE)
-        values, gained, damping = tried, True, damping / 5.0
-        left, used, before = found
-        if done:
-            break
+            gram, pull = normal
+            size = np.diagonal(gram)
+            size = np.maximum(size, max(1e-12 * float(size.max()), 1e-300))
+            for _ in range(_TRIES):
+                change = np.linalg.lstsq(gram + damping * np.diag(size), pull, rcond=None)[0]
+                tried = np.clip(values + change * elements.unit, elements.lower, elements.upper)
+                after = sought.error(tried)
+                if after < before:
+                    break
+                damping *= 10.0
+            else:
+                break
+            values, gained, damping = tried, True, damping / 5.0
+            done, before = after > before * (1.0 - _DONE), sought.accept(after)
+            if done:
+                break
     return values, gained
+
+
+class _Ends:
+    """The last states of windows, whose runs begin at the readings."""
+
+    def __init__(self, windows: _Windows, elements: Elements, scale: Array) -> None:
+        self._windows, self._elements, self._scale = windows, elements, scale
+
+    def error(self, values: Array) -> float:
+        """Squared error with these values of the unknowns."""
+        x, self._used = self._windows.steps.run(self._windows.begin, self._elements.theta(values))
+        self._left = ((self._windows.end - x[-1]) / self._scale).ravel()
+        return float(self._left @ self._left)
+
+    def accept(self, error: float) -> float:
+        """Go on from the values last looked at: their squared error from here on."""
+        return error
+
+    def normal(self, values: Array) -> tuple[Array, Array]:
+        """Gram matrix and right side of the changes of these values, scaled."""
+        slope = _jacobian(self._windows, self._elements.theta(values), self._used) / self._scale[:, None, None]
+        slope = self._elements.chosen(slope) * self._elements.unit
+        return slope.T @ slope, slope.T @ self._left
+
+
+class _Segments:
+    """Every second state of segments, whose initial states (K, n) are unknown as well."""
+
+    def __init__(self, steps: Steps, elements: Elements, recorded: Array, scale: Array) -> None:
+        self._steps, self._elements, self._recorded = steps, elements, recorded
+        self._counted = np.unique([*range(0, len(recorded), _EVERY), len(recorded) - 1])
+        self._begin = recorded[0].copy()
+        self._scale = np.where(scale > 0.0, scale, 1.0)
+        self._follow: tuple[Array, Array, Array, Array] | None = None
+
+    def error(self, values: Array) -> float:
+        """As of `_Ends`, each state by the spread of its own error."""
+        if self._follow is not None:  # the initial states change with the elements
+            begin, own, by_elements, at = self._follow
+            self._begin = begin + own - by_elements @ (values - at)
+        x, self._used = self._steps.run(self._begin, self._elements.theta(values))
+        self._left = (self._recorded - x)[self._counted]
+        return float(np.sum((self._left / self._scale) ** 2))
+
+    def accept(self, error: float) -> float:
+        """As of `_Ends`, by the spread that the errors have now."""
+        scale = np.sqrt(np.mean(self._left**2, axis=(0, 1)))
+        self._scale = np.where(scale > 0.0, scale, 1.0)
+        return float(np.sum((self._left / self._scale) ** 2))
+
+    def normal(self, values: Array) -> tuple[Array, Array] | None:
+        """Without the initial states: by the complement of Schur, segment by segment."""
+        steps, elements, scale, theta = self._steps, self._elements, self._scale, self._elements.theta(values)
+        (count, n), size = self._begin.shape, elements.size
+        by_elements, by_first = np.zeros((count, n, size)), np.broadcast_to(np.eye(n), (count, n, n))
+        gram, pull = np.zeros((size, size)), np.zeros(size)
+        own, mixed, turned = np.zeros((count, n, n)), np.zeros((count, n, size)), np.zeros((count, n, 1))
+        next_counted, left = 0, self._left / scale
+        for t in range(len(self._used) + 1):
+            if t:
+                step = steps.transition(theta, t - 1)
+                by_elements, by_first = step @ by_elements, step @ by_first
+                elements.add(by_elements, self._used[t - 1].reshape(count, -1))
+            if t != self._counted[next_counted]:
+                continue
+            scaled, of_first = by_elements / scale[:, None], (by_first / scale[:, None]).transpose(0, 2, 1)
+            flat = scaled.reshape(-1, size)
+            gram += flat.T @ flat
+            pull += flat.T @ left[next_counted].ravel()
+            own += of_first @ of_first.transpose(0, 2, 1)
+            mixed += of_first @ scaled
+            turned += of_first @ left[next_counted][:, :, None]
+            next_counted += 1
+        try:
+            solved = np.linalg.solve(own, np.concatenate([mixed, turned], axis=2))
+        except np.linalg.LinAlgError:
+            return None
+        gram -= np.tensordot(mixed, solved[:, :, :-1], axes=((0, 1), (0, 1)))
+        pull -= np.tensordot(mixed, solved[:, :, -1], axes=((0, 1), (0, 1)))
+        self._follow = self._begin, solved[:, :, -1], solved[:, :, :-1], values
+        gram, pull = gram * np.outer(elements.unit, elements.unit), pull * elements.unit
+        return (gram, pull) if np.isfinite(gram).all() and np.isfinite(pull).all() else None
