@@ -67,7 +67,7 @@ def compiled() -> list[Extension]:
 extras = {
     # What `uncertain_lti.fit` needs. The newest of these want numpy 2: in a sourced ROS 2 say
     # `pip install '.[fit]' 'numpy<2'` (./run pins its numpy), and pip takes the last that do without.
-    "fit": ["daqp", "highspy", "piqp", "scipy"],
+    "fit": ["daqp", "highspy", "piqp", "scipy", "threadpoolctl"],
     # `fit(method="cvxpy")`: the whole problem as written, for comparison.
     "oracle": ["cvxpy", "highspy", "osqp>=1"],
     "cluster": ["distributed"],

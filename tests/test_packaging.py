@@ -63,7 +63,7 @@ ROSDEP_KEY = {
     "yaml": "python3-yaml",
     "zstandard": "mcap-ros2-support",
 }
-WITHOUT_ROSDEP_KEY = {"control", "daqp", "distributed", "piqp"}
+WITHOUT_ROSDEP_KEY = {"control", "daqp", "distributed", "piqp", "threadpoolctl"}
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -26,7 +28,28 @@ def core_count() -> int:
 
 def on_cores(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
     """function(*arguments) for each, by threads; in their order."""
+    return list(one_by_one(function, arguments))
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """BLAS keeps to the thread that calls it: on small arrays, from several threads, its own only wait for another."""
+    with _libraries().limit(limits=1, user_api="blas"):
+        yield
+
+
+@cache
+def _libraries() -> Any:
+    import scipy.linalg  # noqa: F401  # brings a BLAS of its own
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def one_by_one(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterator[T]:
+    """As `on_cores`, each as soon as it and those before it are done; an error ends what has not begun."""
     if len(arguments) < 2 or core_count() < 2:
-        return [function(*some) for some in arguments]
+        yield from (function(*some) for some in arguments)
+        return
     with ThreadPoolExecutor(min(core_count(), len(arguments))) as pool:
-        return list(pool.map(lambda some: function(*some), arguments))
+        yield from pool.map(lambda some: function(*some), arguments)

@@ -233,4 +233,4 @@ def _drop(row: Row, index: int) -> None:
 def _solve(engine: WorkingSet, row: Row, criterion: str) -> None:
     if criterion == "lp":
         row.limit = None
-    engine._settle([row], Row.solve_quadratic if criterion == "qp" else Row.solve_linear)
+    engine._settle(row, Row.solve_quadratic if criterion == "qp" else Row.solve_linear)

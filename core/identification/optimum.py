@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.cores import one_thread_each
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.identification.problem import Problem
@@ -38,7 +39,8 @@ def optimum(
     """
     fleet, sums = engine.fleet, engine.sums
     if method == "working-set":
-        solution = engine.quadratic() if criterion == "qp" else engine.linear()
+        with one_thread_each():
+            solution = engine.quadratic() if criterion == "qp" else engine.linear()
     else:
         solution = _as_written(engine, criterion)
     limits = engine.half_limits

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
-from uncertain_lti.identification.solvers import FEASIBLE, Answer, Simplex, dual_bound, solve_near, solve_qp
+from uncertain_lti.identification.solvers import FEASIBLE, Answer, Simplex, dual_bound, linear_bound, solve_near, solve_qp
 
 TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
@@ -169,6 +169,7 @@ class Row:
         self._bounds = bounds
         self._shared = shared
         self.refined = False
+        self.rounds = 0  # programmes solved
         self._held: _Held | None = None
         self.width: Array = np.empty(0)
         self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
@@ -654,15 +655,21 @@ class Row:
         return simplex
 
     def least_width(self) -> float:
-        """A lower bound of δ, in units of scale: the optimum of (11) on the samples that decide it, then on more."""
+        """A lower bound of δ, in units of scale: by multipliers, or the optimum on the samples that decide it."""
         assert self.limit is not None
+        xi = np.concatenate([*self.scaled(), [self.limit]])
+        cost = np.append(np.zeros(len(xi) - 1), 1.0)
+        low, high = np.append(self.lower, 0.0), np.append(self.upper, np.inf)
+        bound = linear_bound(cost, *self._rows(self.pool), low, high, xi)
+        if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+            return bound
         inside, room = self.slacks()
         assert room is not None
         few = 2 * (self.r + self.q)
         inside, room = inside[self.pool], room[self.pool]
         least = np.argpartition(room, few)[:few] if len(room) > few else np.arange(len(room))
         decisive = np.union1d(np.flatnonzero(inside < 1e-7), least)
-        bound = 0.0
+        bound = max(bound, 0.0)
         for pool in (self.pool[decisive], self.pool):
             simplex = self._minimax()
             simplex.add(*self._rows(pool))
@@ -684,6 +691,8 @@ class Row:
         The programme that is solved adds the tie-break and the ridge to the squared widths; both are bounded. inf
         where the columns are so collinear that the ridge is not.
         """
+        if not self.unknown:
+            return 0.0
         theta, d = self.scaled()
         factor, ridge = self.attempt
         if self.basis is not None:

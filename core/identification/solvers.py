@@ -28,6 +28,8 @@ FEASIBLE = 1e-9
 
 _SLIGHT = 1e-11
 """The same of a row that the programme left out."""
+_HOLD = 1e-2
+"""Share of the largest weight with which a step is held back that mends what an answer violates."""
 _NEAR = 2
 """Rows per unknown that a programme begins with."""
 
@@ -59,11 +61,38 @@ def solve_qp(
     """Minimise ½ ξᵀHξ + fᵀξ subject to G ξ >= h, lower <= ξ <= upper.
 
     H must be positive definite, everything scaled to order one. DAQP (dual active set, exact to rounding) first;
-    PIQP if it gives up or returns what violates a row by more than `FEASIBLE`.
+    PIQP if it gives up or returns what violates a row by more than `FEASIBLE`. DAQP's tolerance is one on rows in the
+    metric of H, coarse where H hardly weighs an unknown: what it leaves is mended with the step held back.
 
     `H` (v, v): positive definite; `f` (v,): linear term; `G` (K, v): rows of the constraints; `h` (K,): their lower
     limits; `lower` (v,): bounds of ξ; -inf for none; `upper` (v,): bounds of ξ; inf for none.
     """
+    answer, violation = _solved(H, f, G, h, lower, upper, active, any_solver, feasible)
+    hold = _HOLD * float(np.diagonal(H).max(initial=0.0))
+    while violation > _SLIGHT and answer.active is not None:
+        held = H + hold * np.eye(len(f)), f - hold * answer.xi
+        try:
+            nearer, left = _solved(*held, G, h, lower, upper, answer.active, False, feasible)
+        except FitError:
+            break
+        if left > 0.1 * violation:
+            break
+        answer, violation = nearer, left
+    return answer
+
+
+def _solved(
+    H: Array,
+    f: Array,
+    G: Array,
+    h: Array,
+    lower: Array,
+    upper: Array,
+    active: Sense | None,
+    any_solver: bool,
+    feasible: float,
+) -> tuple[Answer, float]:
+    """The answer of the first solver that has a good one, and by how much it violates a row."""
     # a diagonal scaling makes a badly scaled Hessian harmless to every solver
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
     rows, limits = G, h
@@ -80,9 +109,9 @@ def solve_qp(
         if best is None or violation < best[0]:
             best = (violation, Answer(answer, name, found))
         if violation <= FEASIBLE:
-            return best[1]
+            break
     if best is not None and best[0] <= feasible:
-        return best[1]
+        return best[1], best[0]
     names = ", ".join(name for name, _ in _SOLVERS)
     raise FitError(f"no solver ({names}) could solve the quadratic programme; scale the signals to order one")
 
@@ -194,6 +223,21 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
         left = whitened @ multiplier - linear
         best = max(best, float(limits @ multiplier - 0.5 * left @ left))
     return best
+
+
+def linear_bound(cost: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
+    """As `dual_bound`, of the linear programme minimise costᵀξ subject to G ξ >= h, lower <= ξ <= upper."""
+    from scipy.optimize import nnls
+
+    rows, limits = np.vstack([np.eye(len(cost)), -np.eye(len(cost)), G]), np.concatenate([lower, -upper, h])
+    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
+    unit = np.maximum(np.linalg.norm(rows[near], axis=1), 1e-300)
+    try:
+        multiplier = nnls(rows[near].T / unit, cost)[0] / unit
+    except RuntimeError:  # too many iterations
+        return -np.inf
+    left = float(np.abs(rows[near].T @ multiplier - cost).sum())
+    return float(limits[near] @ multiplier) if left <= _SLIGHT else -np.inf
 
 
 _ITERATIONS = 50

@@ -18,6 +18,7 @@ from time import perf_counter
 import numpy as np
 
 from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.cores import on_cores, one_by_one
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
@@ -43,6 +44,7 @@ _FURTHER = 2.5
 SUBSAMPLE = 10_000
 """Transitions of the first solve; up to twice as many are held as a whole."""
 MAX_ROUNDS, FEW_ROUNDS = 200, 60
+Settle = Callable[[Row], None]
 _HELD_BYTES = 300_000_000
 """Memory for the samples of the rows that are proven together, about."""
 _SILENCE = 2.0
@@ -113,6 +115,7 @@ class WorkingSet:
         self.rounds, self.passes = 0, 1
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
+        self._together = False  # (10) with full weights: the rows share a programme
         self._coupled_gap = np.inf
         self._like: Row | None = None  # the row that held samples last
         self._least_eigenvalue: float | None = None  # of the full weights, once it is needed
@@ -123,7 +126,7 @@ class WorkingSet:
             return self._coupled_quadratic()
         self._start(self._settle_quadratic)
         self._prove(self._settle_quadratic)
-        gaps = np.array([row.duality_gap() if row.unknown else 0.0 for row in self.rows])
+        gaps = np.array(on_cores(Row.duality_gap, [(row,) for row in self.rows]))
         again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
         if again:
             before = {row.i: (row.answer(), self._lifted(row)) for row in again}
@@ -139,25 +142,22 @@ class WorkingSet:
                     row.keep(answer)
         return replace(self._solution(), gap=float(gaps.max(initial=0.0)))
 
-    def _again(self, rows: list[Row], settle: Callable[[list[Row]], None]) -> None:
+    def _again(self, rows: list[Row], settle: Settle) -> None:
         """Solve rows once more, in refined coordinates; what a solver cannot improve stays as it was."""
 
-        def settle_each(some: list[Row]) -> None:
-            for row in some:
-                theta, d, limit = row.theta.copy(), row.d.copy(), row.limit
-                try:
-                    settle([row])
-                except InfeasibleError:
-                    raise
-                except FitError:
-                    row.theta, row.d, row.limit = theta, d, limit
+        def improve(row: Row) -> None:
+            theta, d, limit = row.theta.copy(), row.d.copy(), row.limit
+            try:
+                settle(row)
+            except InfeasibleError:
+                raise
+            except FitError:
+                row.theta, row.d, row.limit = theta, d, limit
 
         for group in self._groups(rows):
-            for row in group:
-                if not row.refined:
-                    self._refine(row)
-            settle_each(group)
-            self._prove(settle_each, group)
+            on_cores(self._refine, [(row,) for row in group if not row.refined])
+            self._each(group, improve)
+            self._prove(improve, group)
 
     def _refine(self, row: Row) -> None:
         """Refine a row with the first samples at hand, which it may have released."""
@@ -165,21 +165,20 @@ class WorkingSet:
             self._hold(row, self._first[row.i])
         row.refine()
 
-    def _settle_quadratic(self, rows: list[Row]) -> None:
-        for row in rows:
-            self._settle_or_refine(row, Row.solve_quadratic, polish=True)
+    def _settle_quadratic(self, row: Row) -> None:
+        self._settle_or_refine(row, Row.solve_quadratic, polish=True)
 
     def _settle_or_refine(self, row: Row, solve: Callable[[Row], str], polish: bool = False) -> None:
         """Settle a row, in refined coordinates if it does not settle in those of its steps."""
         if not row.refined:
             try:
-                self._settle([row], solve, polish)
+                self._settle(row, solve, polish)
                 return
             except InfeasibleError:
                 raise
             except FitError:
                 row.refine()
-        self._settle([row], solve, polish)
+        self._settle(row, solve, polish)
 
     def _lifted(self, row: Row) -> float:
         """Part of the row in the objective of (10), with the half-widths lifted over what is violated."""
@@ -189,6 +188,7 @@ class WorkingSet:
 
     def _coupled_quadratic(self) -> Solution:
         """(10) with full weights: all rows in one programme, then one row after the other if that is not good."""
+        self._together = True
         try:
             self._start(self._settle_coupled)
             self._prove(self._settle_coupled)
@@ -203,11 +203,11 @@ class WorkingSet:
         for row in self.rows:
             if not row.refined:
                 row.refine()
-        self._settle_in_turn(self.rows)
+        self._settle_in_turn(self.rows[0])
         self._prove(self._settle_in_turn)
         return replace(self._solution(), gap=self._coupled_linear_gap())
 
-    def _settle_in_turn(self, rows: list[Row]) -> None:
+    def _settle_in_turn(self, _: Row) -> None:
         """(10) with full weights by one row at a time, the others as they are.
 
         The rows meet in the objective alone, which is convex and smooth, so going round them descends to the optimum
@@ -219,7 +219,7 @@ class WorkingSet:
             for row in self.rows:
                 if row.unknown:
                     row.among(self.sums.coupled, [other.d for other in self.rows])
-                self._settle([row], Row.solve_among, polish=True)
+                self._settle(row, Row.solve_among, polish=True)
             flat = np.concatenate([row.d for row in self.rows])
             value = float(flat @ self.sums.coupled @ flat)
             if value >= before * (1.0 - 1e-11):
@@ -230,40 +230,36 @@ class WorkingSet:
         """Solve (11), then least sum of squared widths among its optima, then the centre."""
         deltas = np.zeros(self.fleet.n)
 
-        def settle(rows: list[Row]) -> None:
-            for row in rows:
-                if not row.exact:
-                    try:
-                        self._settle([row], Row.solve_regularised, polish=True)
-                    except InfeasibleError:
-                        raise
-                    except FitError:
-                        row.exact = True
-                if row.exact:
-                    row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
-                    self._settle_or_refine(row, Row.solve_linear)
-                if row.limit is None:  # nothing unknown: the structure fixes the widths
-                    row.limit = float((row.width * row.half).max(initial=0.0))
-                deltas[row.i] = row.limit * row.limit_unit
-                row.limit *= 1.0 + WIDTH_SLACK
-                row.allowed = row.limit
-                if row.exact:
-                    self._settle([row], Row.solve_bounded, polish=True)
+        def settle(row: Row) -> None:
+            if not row.exact:
+                try:
+                    self._settle(row, Row.solve_regularised, polish=True)
+                except InfeasibleError:
+                    raise
+                except FitError:
+                    row.exact = True
+            if row.exact:
+                row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
+                self._settle_or_refine(row, Row.solve_linear)
+            if row.limit is None:  # nothing unknown: the structure fixes the widths
+                row.limit = float((row.width * row.half).max(initial=0.0))
+            deltas[row.i] = row.limit * row.limit_unit
+            row.limit *= 1.0 + WIDTH_SLACK
+            row.allowed = row.limit
+            if row.exact:
+                self._settle(row, Row.solve_bounded, polish=True)
 
         self._start(settle)
         self._prove(settle)
+        unknown = [row for row in self.rows if row.unknown]
         bounds = deltas.copy()
-        again = []
-        for row in self.rows:
-            if row.unknown:
-                bounds[row.i] = self._least_width(row)
-                above = deltas[row.i] > (1.0 + WIDTH_SLACK) * bounds[row.i] + 1e-13 * row.scale
-                if above and not row.exact:
-                    again.append(row)
+        bounds[[row.i for row in unknown]] = on_cores(self._least_width, [(row,) for row in unknown])
+        above = deltas > (1.0 + WIDTH_SLACK) * bounds + 1e-13 * np.array([row.scale for row in self.rows])
+        again = [row for row in unknown if above[row.i] and not row.exact]
         for row in again:
             row.exact = True
         if again:  # the weight relative to δ was too large for these rows
-            settle(again)
+            self._each(again, settle)
             self._prove(settle, again)
         again = [
             row
@@ -332,7 +328,7 @@ class WorkingSet:
             np.column_stack([row.d for row in self.rows]),
             np.array([row.outside() * row.scale if row.kept is None else row.kept for row in self.rows]),
             delta,
-            self.rounds,
+            self.rounds + sum(row.rounds for row in self.rows),
             self.passes,
             [len(row.pool) for row in self.rows],
             self.solvers,
@@ -340,34 +336,37 @@ class WorkingSet:
 
     # --- all samples ---
 
-    def _start(self, settle: Callable[[list[Row]], None]) -> None:
+    def _start(self, settle: Settle) -> None:
         """Solve on the first samples."""
         for row, samples in zip(self.rows, self._first, strict=True):
             self._hold(row, samples)
             row.start()
             row.widen_pool(most=4 * (row.r + row.q))
-        if self.sums.coupled is not None:
-            settle(self.rows)
+        self._each(self.rows, settle)
+
+    def _each(self, rows: list[Row], settle: Settle) -> None:
+        """Settle rows on all cores, which the solvers do without the lock; those that share a programme at once."""
+        if self._together:
+            settle(rows[0])
             return
         began = said = perf_counter()
-        for number, row in enumerate(self.rows, start=1):
-            settle([row])
+        for number, _ in enumerate(one_by_one(settle, [(row,) for row in rows]), start=1):
             now = perf_counter()
-            if now - said > _SILENCE and number < len(self.rows):
-                said, left = now, (now - began) / number * (len(self.rows) - number)
-                text = f"row {number + 1} of {len(self.rows)}, about {left:.0f} s left"
-                self.progress(CountedStep(text, number + 1, len(self.rows)))
+            if now - said > _SILENCE and number < len(rows):
+                said, left = now, (now - began) / number * (len(rows) - number)
+                text = f"row {number + 1} of {len(rows)}, about {left:.0f} s left"
+                self.progress(CountedStep(text, number + 1, len(rows)))
 
     def _groups(self, rows: list[Row]) -> list[list[Row]]:
         """Rows whose samples fit in memory together; with full weights, all."""
-        if self.sums.coupled is not None or self.whole:
+        if self._together or self.whole:
             return [rows]
         columns, count = self.fleet.columns, self.fleet.columns.count
         each = 8 * SUBSAMPLE * (3 * self.fleet.p + len(columns.nominal) + len(columns.half)) * count
         size = max(1, _HELD_BYTES // each)
         return [rows[k : k + size] for k in range(0, len(rows), size)]
 
-    def _prove(self, settle: Callable[[list[Row]], None], rows: list[Row] | None = None) -> None:
+    def _prove(self, settle: Settle, rows: list[Row] | None = None) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
         if self.whole:
             return
@@ -378,7 +377,7 @@ class WorkingSet:
                 for row in rows:
                     row.release()
 
-    def _prove_group(self, settle: Callable[[list[Row]], None], rows: list[Row]) -> None:
+    def _prove_group(self, settle: Settle, rows: list[Row]) -> None:
         most = 2 * SUBSAMPLE + self.fleet.N // 500
         share = 0.2 * most / self.fleet.N
         scanned = False
@@ -403,7 +402,7 @@ class WorkingSet:
             self.progress(f"pass {self.passes}: {plural(left, 'sample')} outside, working set {self._sizes()}")
             if not todo:
                 return
-            settle(rows if self.sums.coupled is not None else todo)
+            self._each(todo, settle)
             moved = [self._moved(row, *old) for row, old in zip(rows, before, strict=True)]
             again = [
                 row
@@ -412,7 +411,7 @@ class WorkingSet:
             ]
             if not again:
                 return
-            rows = self.rows if self.sums.coupled is not None else again
+            rows = self.rows if self._together else again
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
     def _candidate(self, reach: Array, room: Array, most: int, rows: list[Row]) -> Candidate:
@@ -472,24 +471,23 @@ class WorkingSet:
 
     # --- held samples ---
 
-    def _settle(self, rows: list[Row], solve: Callable[[Row], str], polish: bool = False) -> None:
-        for row in rows:
-            for number in range(MAX_ROUNDS if row.refined else FEW_ROUNDS):
-                if row.unknown:
-                    self._guarded(row, solve)
-                self.rounds += 1
-                # most rows settle in 15 rounds; where rounding makes nearly every sample active, all of them may join
-                most = None if number < 40 else max(JOIN, 2 * (row.r + row.q)) * 2 ** min(number - 40, 20)
-                if row.unknown and row.widen_pool(most):
-                    continue
-                if polish and row.unknown:
-                    row.polish()
-                if not polish or not row.unknown or not row.widen_pool(most):
-                    break
-            else:
-                raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; {_REMEDY}")
-            if not row.unknown:
-                self._known_row(row)
+    def _settle(self, row: Row, solve: Callable[[Row], str], polish: bool = False) -> None:
+        for number in range(MAX_ROUNDS if row.refined else FEW_ROUNDS):
+            if row.unknown:
+                self._guarded(row, solve)
+            row.rounds += 1
+            # most rows settle in 15 rounds; where rounding makes nearly every sample active, all of them may join
+            most = None if number < 40 else max(JOIN, 2 * (row.r + row.q)) * 2 ** min(number - 40, 20)
+            if row.unknown and row.widen_pool(most):
+                continue
+            if polish and row.unknown:
+                row.polish()
+            if not polish or not row.unknown or not row.widen_pool(most):
+                break
+        else:
+            raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; {_REMEDY}")
+        if not row.unknown:
+            self._known_row(row)
 
     def _guarded(self, row: Row, solve: Callable[[Row], str]) -> None:
         try:
@@ -508,11 +506,11 @@ class WorkingSet:
             distance = float(-slack[worst] * row._sizes(worst) * row.scale)
             raise InfeasibleError(row.i, int(row.samples.index[worst]), distance)
 
-    def _settle_coupled(self, rows: list[Row]) -> None:
-        for _ in range(MAX_ROUNDS):
+    def _settle_coupled(self, _: Row) -> None:
+        for _number in range(MAX_ROUNDS):
             self._solve_coupled()
             self.rounds += 1
-            if not any([row.widen_pool() for row in rows]):
+            if not any([row.widen_pool() for row in self.rows]):
                 return
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} rounds; scale the signals to order one")
 
