@@ -141,6 +141,25 @@ def test_a_step_that_is_counted_moves_the_bar():
     assert "note: said while the bar stands\n" in screen.getvalue()
 
 
+def test_a_log_gets_a_line_now_and_then_with_the_time_left(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    log, silent = io.StringIO(), io.StringIO()
+    for stream, quiet in ((log, False), (silent, True)):
+        now = 0.0
+        with Progress(quiet, stream=stream) as progress, progress.stage("fitting") as step:
+            for number in range(1, 31):
+                now = number - 1.0
+                step(CountedStep(f"row {number} of 30", number, 30))
+    lines = [f"fitting: row {k} of 30, about {31 - k} s left" for k in (3, 13, 23)]
+    assert (log.getvalue().splitlines(), silent.getvalue()) == (lines, "")
+    with Progress(stream=log) as progress:
+        for number in progress.iterate("reading")(range(5000), 5000):
+            now += 0.002
+            assert number < 5000
+    assert log.getvalue().splitlines()[3:] == ["reading: 1024 of 5000 messages, about 8 s left"]
+
+
 def test_bars_go_where_an_error_passes_through():
     screen = Terminal()
     with pytest.raises(KeyboardInterrupt), Progress(stream=screen) as progress:
@@ -237,7 +256,9 @@ def test_ctrl_c_at_any_time(long_run, cache):
         time.sleep(share * took)
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=300)
-        lines = [line for line in said.decode().splitlines() if not line.startswith("note: ")]
+        lines = [
+            line for line in said.decode().splitlines() if not line.startswith(("note: ", "reading: ", "fitting: "))
+        ]
         left = {p.name for p in output.iterdir()} - {"cache"}
         assert left == {"m.model.json"}
         if process.returncode in (130, -signal.SIGINT) and b"uncertain-lti fit" in said:  # the same to a shell

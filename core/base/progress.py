@@ -23,6 +23,7 @@ from uncertain_lti.base.english import printable
 
 _DELAY = 0.4  # s; what is done sooner shows no bar
 _REDRAW = 0.1  # s
+_FIRST_LINE, _LINE = 2.0, 10.0  # s; where no terminal is, from one line of a long part to the next
 _LONGEST_LINE = 20_000  # letters of a result
 
 
@@ -40,7 +41,7 @@ class CountedStep(str):
 
 
 class Progress:
-    """Bars on a terminal, nothing elsewhere; remarks, unless quiet; every line of the work, where verbose.
+    """Bars on a terminal, a line now and then elsewhere; remarks, unless quiet; every line of the work, where verbose.
 
     `iterate` gives what `read_transients(progress=)` takes, `stage` what `fit(progress=)`, `validate(progress=)` and
     `fit_archive(progress=)` take. As a context it takes its bars away however the block ends.
@@ -71,7 +72,7 @@ class Progress:
     def note(self, text: str) -> None:
         """A remark that the reader should know, unless quiet."""
         if not self.quiet:
-            self._write(f"note: {printable(text)}")
+            self.write(f"note: {printable(text)}")
 
     def say(self, text: str) -> None:
         """Part of the result, on standard output, unless quiet; a bar stays below it."""
@@ -87,25 +88,33 @@ class Progress:
     def detail(self, text: str) -> None:
         """A line for who asked to see the work."""
         if self.verbose:
-            self._write(f"{time.perf_counter() - self._began:8.2f} s  {printable(text)}")
+            self.write(f"{time.perf_counter() - self._began:8.2f} s  {printable(text)}")
 
     def iterate(self, what: str, unit: str = "messages") -> Callable[[Iterable[object], int], Iterable[object]] | None:
-        """Wrapper (iterable, total) -> iterable that shows how far it has come; None where nobody would see it."""
+        """Wrapper (iterable, total) -> iterable that tells how far it has come; None where nobody would see it."""
 
         def wrap(items: Iterable[object], total: int) -> Iterator[object]:
             began = time.perf_counter()
-            with self._bar(
-                iterable=items, desc=what, total=total, unit=f" {unit}", unit_scale=True, delay=_DELAY
-            ) as bar:
-                yield from bar
+            if self.shown:
+                with self._bar(
+                    iterable=items, desc=what, total=total, unit=f" {unit}", unit_scale=True, delay=_DELAY
+                ) as bar:
+                    yield from bar
+            else:
+                log = _Log(self, what)
+                for number, item in enumerate(items):
+                    if number % 1024 == 0 or total < 1024:
+                        log.write(f"{number} of {total} {unit}", number, total)
+                    yield item
             self.detail(f"{what}: {total} {unit} in {time.perf_counter() - began:.2f} s")
 
-        return wrap if self.shown or self.verbose else None
+        return wrap if self.verbose or not self.quiet else None
 
     @contextmanager
     def stage(self, what: str) -> Iterator[Callable[[str], None]]:
         """Yields a callable for one line of text per step; a `CountedStep` moves the bar there."""
         began = drawn = time.perf_counter()
+        log = _Log(self, what)
         with ExitStack() as stack:
             bar: Any = None
 
@@ -113,7 +122,11 @@ class Progress:
                 nonlocal bar, drawn
                 self.detail(f"{what}: {text}")
                 now = time.perf_counter()
-                if not self.shown or now - began < _DELAY or (bar is not None and now - drawn < _REDRAW):
+                if not self.shown:
+                    counted = isinstance(text, CountedStep)
+                    log.write(text, text.number - 1 if counted else 0, text.total if counted else 0)
+                    return
+                if now - began < _DELAY or (bar is not None and now - drawn < _REDRAW):
                     return
                 drawn = now
                 if bar is None:
@@ -150,13 +163,33 @@ class Progress:
             columns = lines = 0
         return columns or 80, lines or 24
 
-    def _write(self, text: str) -> None:
+    def write(self, text: str) -> None:
+        """A line on the stream, above the bars."""
         if any(not bar.disable for bar in self._bars):
             from tqdm import tqdm
 
             tqdm.write(text, file=self._stream)
         else:
             print(text, file=self._stream, flush=True)
+
+
+class _Log:
+    """Lines on a long part of the work where no terminal is."""
+
+    def __init__(self, progress: Progress, what: str) -> None:
+        self._progress, self._what = progress, what
+        self._began = time.perf_counter()
+        self._next = self._began + _FIRST_LINE
+
+    def write(self, text: str, done: int, total: int) -> None:
+        """A line on what is about to be done, with the time left if so many of all are done, unless one was just."""
+        now = time.perf_counter()
+        if now < self._next or self._progress.quiet or self._progress.verbose:  # who sees every line anyway
+            return
+        self._next = now + _LINE
+        if done and " left" not in text:
+            text += f", about {(now - self._began) / done * (total - done):.0f} s left"
+        self._progress.write(f"{self._what}: {printable(text)}")
 
 
 def _coloured(text: str) -> str:

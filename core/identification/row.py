@@ -22,7 +22,15 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
-from uncertain_lti.identification.solvers import FEASIBLE, Answer, Simplex, dual_bound, linear_bound, solve_near, solve_qp
+from uncertain_lti.identification.solvers import (
+    FEASIBLE,
+    Answer,
+    Simplex,
+    dual_bound,
+    linear_bound,
+    solve_near,
+    solve_qp,
+)
 
 TOLERANCE = 1e-11
 """Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""

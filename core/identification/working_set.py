@@ -215,7 +215,7 @@ class WorkingSet:
         """
         assert self.sums.coupled is not None
         before = np.inf
-        for _ in range(MAX_ROUNDS):
+        for _number in range(MAX_ROUNDS):
             for row in self.rows:
                 if row.unknown:
                     row.among(self.sums.coupled, [other.d for other in self.rows])
