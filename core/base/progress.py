@@ -123,8 +123,8 @@ class Progress:
                 self.detail(f"{what}: {text}")
                 now = time.perf_counter()
                 if not self.shown:
-                    counted = isinstance(text, CountedStep)
-                    log.write(text, text.number - 1 if counted else 0, text.total if counted else 0)
+                    done, total = (text.number - 1, text.total) if isinstance(text, CountedStep) else (0, 0)
+                    log.write(text, done, total)
                     return
                 if now - began < _DELAY or (bar is not None and now - drawn < _REDRAW):
                     return
