@@ -417,7 +417,7 @@ def test_a_model_that_most_data_leaves_and_nothing_vouches_for_is_refused():
 
 
 def test_what_weighs_most_is_printed_first():
-    from uncertain_lti.reports.findings_text import findings_text
+    from uncertain_lti.reports.findings import findings_text
 
     text = findings_text(judged([0.9, 0.9], validated(9, 10, 0.9999))).splitlines()
     weights = [line.split(":")[0].strip() for line in text[1:] if not line.startswith("what")]

@@ -28,7 +28,7 @@ from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.model_text import model_text
-from uncertain_lti.reports.signature_text import signature_text
+from uncertain_lti.reports.validation_text import signature_text
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.validation.signatures import learn_signatures
 

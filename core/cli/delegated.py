@@ -26,8 +26,8 @@ def _add_info(parser: argparse.ArgumentParser) -> None:
 def run_info(options: argparse.Namespace) -> int:
     """Print the model."""
     from uncertain_lti.reports.model_text import model_text
-    from uncertain_lti.reports.plain_data import finite_data
     from uncertain_lti.reports.regimes import block_facts
+    from uncertain_lti.reports.tables import finite_data
 
     model = load_model(options.model)
     if options.json:

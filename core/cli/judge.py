@@ -205,8 +205,7 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
 
 def run_report(options: argparse.Namespace) -> int:
     """Write the page or print its facts, and return whether the alarm was raised."""
-    from uncertain_lti.reports.findings import findings
-    from uncertain_lti.reports.findings_text import findings_text
+    from uncertain_lti.reports.findings import findings, findings_text
     from uncertain_lti.reports.page_file import page_target, write_page
 
     judged = _judged(options)

@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Learn the signatures and write the model with them."""
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.reports.signature_text import signature_text
+    from uncertain_lti.reports.validation_text import signature_text
     from uncertain_lti.validation.signatures import learn_signatures
 
     output = model_target(options.output, options.force)

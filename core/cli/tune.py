@@ -53,7 +53,7 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti import Transient, read_transients, tune
     from uncertain_lti.base.files import sha256
     from uncertain_lti.reports.fit_text import alarm_text, headline_text
-    from uncertain_lti.reports.tune_text import tune_text
+    from uncertain_lti.reports.validation_text import tune_text
     from uncertain_lti.validation.groups import resolve_groups
 
     output = None if options.output is None else model_target(options.output, options.force)

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from scipy.linalg import expm
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fit
@@ -45,34 +44,17 @@ SHORT_CONTROLS = ("fuel", "area", "fan vanes", "comp. vanes")
 
 @dataclass(frozen=True)
 class Case:
-    """One identification and its check.
+    """One identification and its check on another transient.
 
-    `name`: what it was identified from; `model`: the model fitted; `verdicts`: on the check transient; `outside`:
-    transitions outside the bounds in the identification transients; `inside` (n,): share of the check's transitions
-    inside the bounds of each state; `inside_all`: share of the check's transitions inside all bounds; `mean_width`
-    (n,): mean width of the bounds over the check, normalised, per step; `max_width` (n,): largest such width;
-    `squared`: discrepancy of the nominal model over the check, Leibov (2006), eq. (4), W = I; `largest` (n,): the same,
-    eq. (5); `outside_domain`: transitions of the check outside the fitted ranges; `seconds`: wall-clock time of the
-    fit.
+    `numbers`: of the fit and the check, as `reproduce.json` has them. Shares and widths are of the check's transitions,
+    a value per state; widths per step, normalised; `discrepancy_4` and `discrepancy_5` of the nominal model, Leibov
+    (2006), eq. (4) with W = I and (5).
     """
 
     name: str
     model: UncertainLTI
     verdicts: Verdicts
-    outside: int
-    inside: Array
-    inside_all: float
-    mean_width: Array
-    max_width: Array
-    squared: float
-    largest: Array
-    outside_domain: int
-    seconds: float
-
-    @property
-    def fitted_by(self) -> tuple[str, str]:
-        """Criterion and additive term."""
-        return self.model.fit_summary["criterion"], self.model.fit_summary["additive"]
+    numbers: dict[str, Any]
 
     @classmethod
     def of(
@@ -88,39 +70,23 @@ class Case:
         ranges = replace(model.domain, measure=None)  # pulses, one control at a time, fit few combinations
         width = ((verdicts.upper - verdicts.lower) / model.operating_point.X)[judged]
         squared, largest = model.discrepancy(check)
-        return cls(
-            name,
-            model,
-            verdicts,
-            sum(int(monitor.check(t).violated.sum()) for t in transients),
-            1.0 - (verdicts.flags[judged] == 1.0).mean(axis=0),
-            1.0 - float(verdicts.violated[judged].mean()),
-            width.mean(axis=0),
-            width.max(axis=0),
-            squared,
-            largest,
-            int(ranges.outside(point.normalise_x(steps.x), point.normalise_u(steps.u)).sum()),
-            seconds,
-        )
-
-    def data(self) -> dict[str, Any]:
-        """The numbers, as plain data for JSON."""
-        return {
-            "identified_from": self.name,
-            "criterion": self.model.fit_summary["criterion"],
-            "additive": self.model.fit_summary["additive"],
-            "objective": np.asarray(self.model.fit_summary["objective"]).tolist(),
-            "outside_identification": self.outside,
-            "inside": self.inside.tolist(),
-            "inside_all": self.inside_all,
-            "mean_width": self.mean_width.tolist(),
-            "max_width": self.max_width.tolist(),
-            "discrepancy_4": self.squared,
-            "discrepancy_5": self.largest.tolist(),
-            "outside_domain": self.outside_domain,
-            "eigenvalues": [[v.real, v.imag] for v in self.model.eigenvalues().tolist()],
-            "seconds": self.seconds,
+        numbers = {
+            "identified_from": name,
+            "criterion": criterion,
+            "additive": additive,
+            "objective": np.asarray(model.fit_summary["objective"]).tolist(),
+            "outside_identification": sum(int(monitor.check(t).violated.sum()) for t in transients),
+            "inside": (1.0 - (verdicts.flags[judged] == 1.0).mean(axis=0)).tolist(),
+            "inside_all": 1.0 - float(verdicts.violated[judged].mean()),
+            "mean_width": width.mean(axis=0).tolist(),
+            "max_width": width.max(axis=0).tolist(),
+            "discrepancy_4": squared,
+            "discrepancy_5": largest.tolist(),
+            "outside_domain": int(ranges.outside(point.normalise_x(steps.x), point.normalise_u(steps.u)).sum()),
+            "eigenvalues": [[v.real, v.imag] for v in model.eigenvalues().tolist()],
+            "seconds": seconds,
         }
+        return cls(name, model, verdicts, numbers)
 
 
 def reproduce(
@@ -174,9 +140,9 @@ def reproduce(
         searches.append(
             {
                 "identified_from": name,
-                "exact": float(exact.model.fit_summary["objective"]),
+                "exact": exact.numbers["objective"],
                 "direct_search": found.objective,
-                "exact_seconds": exact.seconds,
+                "exact_seconds": exact.numbers["seconds"],
                 "direct_search_seconds": found.seconds,
                 "evaluations": found.evaluations,
             }
@@ -185,13 +151,13 @@ def reproduce(
     for case in cases:
         label = case.name.replace(" (the paper's)", "").replace(", noise 0.0001", "_noise")
         name = label.replace("±", "both").replace("+", "up").replace("%", "")
-        name = f"{name}_{case.model.fit_summary['criterion']}_{case.model.fit_summary['additive']}"
+        name = f"{name}_{case.numbers['criterion']}_{case.numbers['additive']}"
         case.model.save(folder / f"{name}.model.json")
     for name, case in (("check", chosen), ("check_paper_pulses", first)):
         save(envelope_figure(case.model, case.verdicts), folder / f"{name}.png")
         save(utilisation_figure(case.model, case.verdicts), folder / f"{name}_utilisation.png")
     data = {
-        "cases": [c.data() for c in cases],
+        "cases": [c.numbers for c in cases],
         "direct_search": searches,
         "published_eigenvalues": [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()],
     }
@@ -223,26 +189,21 @@ def trim_text() -> str:
 def cases_text(cases: Sequence[Case]) -> str:
     """Shares of the check inside."""
     rows = [
-        [
-            c.name, *c.fitted_by, str(c.outside), f"{c.inside_all:.0%}",
-            *(f"{share:.0%}" for share in c.inside), str(c.outside_domain),
-        ]
-        for c in cases
+        [*_identified(c), str(c["outside_identification"]), f"{c['inside_all']:.0%}",
+         *(f"{share:.0%}" for share in c["inside"]), str(c["outside_domain"])]
+        for c in (case.numbers for case in cases)
     ]  # fmt: skip
-    return (
-        "Check: lever from 68 to 60 deg, 100 transitions; shares inside the one-step bounds\n"
-        + table(("identified from", "", "additive", "outside fit", "all", *SHORT, "outside domain"), rows)
-    )  # fmt: skip
+    header = ("identified from", "", "additive", "outside fit", "all", *SHORT, "outside domain")
+    title = "Check: lever from 68 to 60 deg, 100 transitions; shares inside the one-step bounds"
+    return f"{title}\n{table(header, rows)}"
 
 
 def width_text(cases: Sequence[Case]) -> str:
     """Widths and discrepancies over the check."""
     rows = [
-        [
-            c.name, *c.fitted_by, *(f"{1e4 * w:.2f}" for w in c.mean_width),
-            number(c.squared), *(number(1e4 * e) for e in c.largest),
-        ]
-        for c in cases
+        [*_identified(c), *(f"{1e4 * w:.2f}" for w in c["mean_width"]), number(c["discrepancy_4"]),
+         *(number(1e4 * e) for e in c["discrepancy_5"])]
+        for c in (case.numbers for case in cases)
     ]  # fmt: skip
     x = cases[0].model.operating_point.normalise_x(cases[0].verdicts.transient.x)
     step = np.sqrt(np.mean(np.diff(x, axis=0) ** 2, axis=0))
@@ -252,6 +213,10 @@ def width_text(cases: Sequence[Case]) -> str:
         "Mean width of the bounds over the check, and discrepancies (4) and (5) of the nominal model's free run;\n"
         "widths and (5) in 1e-4 of the scale\n" + table(header, rows)
     )
+
+
+def _identified(numbers: dict[str, Any]) -> list[str]:
+    return [numbers[key] for key in ("identified_from", "criterion", "additive")]
 
 
 def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:

@@ -27,10 +27,9 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.detectable_text import detectable_data
-from uncertain_lti.reports.plain_data import finite_data, list_of, numbers_of
 from uncertain_lti.reports.regimes import block_facts, blocks_in_words
-from uncertain_lti.reports.reliance import answer, reasons
-from uncertain_lti.reports.tables import number, shortened
+from uncertain_lti.reports.reliance import WEIGHTS, answer, reasons
+from uncertain_lti.reports.tables import finite_data, list_of, number, numbers_of, shortened
 from uncertain_lti.reports.validation_text import rule_text
 
 APART = 10
@@ -303,3 +302,13 @@ def _violated(recording: Mapping[str, Any]) -> dict[str, Any]:
 
 def _episodes_word(count: int) -> str:
     return "in one episode" if count == 1 else f"in {count} episodes"
+
+
+def findings_text(facts: Mapping[str, Any]) -> str:
+    """What `report` prints of `findings`."""
+    lines = [f"may I rely on it? {facts['rely']['answer']}"]
+    reasons = sorted(facts["rely"]["reasons"], key=lambda r: WEIGHTS.index(r["weight"]))
+    lines += [f"  {r['weight']}: {r['text']}" for r in reasons]
+    lines.append("what happened?")
+    lines += [f"  {h['recording']}: {h['text']}" for h in facts["happened"]]
+    return "\n".join(lines)

@@ -19,9 +19,8 @@ from typing import Any
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.reports.check_data import UNVOUCHED
-from uncertain_lti.reports.plain_data import list_of, numbers_of
 from uncertain_lti.reports.regimes import blocks_in_words
-from uncertain_lti.reports.tables import number, shortened
+from uncertain_lti.reports.tables import list_of, number, numbers_of, shortened
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
 """Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""

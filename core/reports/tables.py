@@ -7,12 +7,13 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Tables, numbers and names as a person reads them."""
+"""Tables, numbers and names as a person reads them, and data as JSON holds it."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -46,3 +47,25 @@ def beyond(utilisation: float) -> str:
 def shortened(name: str, longest: int = 40) -> str:
     """A name for a sentence, with its middle left out where it is long."""
     return name if len(name) <= longest else f"{name[: longest // 2]}…{name[len(name) - longest // 2 + 1 :]}"
+
+
+def numbers_of(value: Any, count: int) -> list[float] | None:
+    """Read numbers from a model file, in which anything may be written."""
+    if hasattr(value, "tolist"):  # of a model that was not written yet
+        value = value.tolist()
+    good = isinstance(value, (list, tuple)) and len(value) == count and all(isinstance(v, (int, float)) for v in value)
+    return [float(v) for v in value] if good else None
+
+
+def list_of(value: Any) -> list[Any]:
+    """Read a list from a model file, in which anything may be written."""
+    return list(value) if isinstance(value, (list, tuple)) else []
+
+
+def finite_data(value: Any) -> Any:
+    """Replace numbers that JSON has no text for."""
+    if isinstance(value, dict):
+        return {key: finite_data(v) for key, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite_data(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What `validate` prints, and `fit` of what it left out."""
+"""What `validate`, `tune` and `signature` print, and `fit` of what it left out."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from typing import Any
 from uncertain_lti.base.english import plural
 from uncertain_lti.reports.detectable_text import detectable_data, detectable_text
 from uncertain_lti.reports.tables import number, table
+from uncertain_lti.validation.signatures import Learnt
 
 MOST_PARTS = 20
 """Recordings or blocks that the table of each names, those with most alarms first."""
@@ -151,3 +152,37 @@ def _interval(low: float, high: float | None) -> str:
     if high is None:
         return "unknown"
     return f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"
+
+
+def tune_text(data: dict[str, Any]) -> str:
+    """What `tune` prints: every way that was tried, and what was chosen."""
+    rows = [
+        [
+            trial["way"],
+            number(trial["size"]),
+            "-" if trial["width_over_range"] is None else f"{trial['width_over_range']:.2%}",
+            "-" if trial["limit_per_hour"] is None else number(trial["limit_per_hour"]),
+        ]
+        for trial in data["trials"]
+        if "refused" not in trial
+    ]
+    header = ("way", "jumps seen, over those of fit", "width/range", "false alarms per hour at most")
+    refused = [f"  {t['way']}: {t['refused']}" for t in data["trials"] if "refused" in t]
+    return "\n".join([table(header, rows), *refused, f"chosen: {data['reason']}"])
+
+
+def signature_text(learnt: Learnt) -> str:
+    """What `signature` prints."""
+    rows = [[s.label, str(s.recordings), str(s.verdicts), ", ".join(map(str, s.steps))] for s in learnt.signatures]
+    lines = [table(("signature", "recordings", "verdicts", "steps"), rows)]
+    labels = [label for _, label, _ in learnt.named]
+    tried = [(label, found) for _, label, found in learnt.named if labels.count(label) > 1]
+    if tried:
+        right = sum(label == found for label, found in tried)
+        unknown = sum(not found for _, found in tried)
+        lines.append(
+            f"left out in turn, {right} of {plural(len(tried), 'recording')} named as labelled, "
+            f"{len(tried) - right - unknown} as another fault, {unknown} unknown"
+        )
+    lines += [f"'{a}' and '{b}' look alike (match {match:.2f}), so neither is named" for a, b, match in learnt.alike]
+    return "\n".join(lines)
