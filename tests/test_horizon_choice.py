@@ -118,7 +118,7 @@ def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without(
 
 
 def test_a_choice_says_which_horizons_are_useless(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uncertain_lti.identification.horizons.WIDER", 0.0)
+    monkeypatch.setattr("uncertain_lti.identification.horizon_fit.WIDER", 0.0)
     model = fit(RUNS[:2], additive="noise", horizons={"longest": 0.1}, widths="constant")
     assert model.steps == ()
     (said,) = [text for text in model.fit_summary["messages"] if "worth having" in text]

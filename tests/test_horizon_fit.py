@@ -21,10 +21,10 @@ from scipy.optimize import linprog
 import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import FitError, ModelError
-from uncertain_lti.identification import fit, horizons
+from uncertain_lti.identification import fit, horizon_fit
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Regimes
-from uncertain_lti.identification.horizons import better_run, fit_horizons, run_of
+from uncertain_lti.identification.horizon_fit import better_run, fit_horizons, run_of
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.horizon import Run
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -142,7 +142,7 @@ def test_what_is_run_are_the_least_squares_of_the_elements_that_the_model_has(
 
 
 def test_the_run_that_stays_nearer_to_the_recordings_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(horizons, "PAYS", 0.1)
+    monkeypatch.setattr(horizon_fit, "PAYS", 0.1)
     transients = runs()
     model = fit(transients, additive="noise", horizons=[20])
     problem = assemble(transients, model.operating_point, None, "noise")

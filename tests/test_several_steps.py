@@ -17,11 +17,11 @@ import numpy as np
 import pytest
 
 from uncertain_lti import Transient
-from uncertain_lti.identification import fit, horizons, several_steps
+from uncertain_lti.identification import fit, horizon_fit, several_steps
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.horizons import better_run, run_of
+from uncertain_lti.identification.horizon_fit import better_run, run_of
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.several_steps import Elements, _jacobian, _windows, runs_over_steps
 from uncertain_lti.identification.structure import Structure
@@ -59,7 +59,7 @@ def started(problem: Problem, structure: Structure | None = None) -> Any:
 
 
 def test_noise_of_the_readings_does_not_bias_what_is_run(monkeypatch: Any) -> None:
-    monkeypatch.setattr(horizons, "PAYS", 0.1)
+    monkeypatch.setattr(horizon_fit, "PAYS", 0.1)
     transients = recordings(0.05)
     one = run_of(assembled(transients))
     model = fit(transients, additive="noise", operating_point=POINT, horizons=[20])
@@ -130,7 +130,7 @@ def test_without_noise_and_with_too_many_elements_least_squares_stay(monkeypatch
 
 
 def test_a_fitted_model_that_is_nearest_is_run_itself(monkeypatch: Any) -> None:
-    monkeypatch.setattr(horizons, "PAYS", 0.1)
+    monkeypatch.setattr(horizon_fit, "PAYS", 0.1)
     transients = recordings(0.05)
     model = fit(transients, additive="noise", operating_point=POINT)
     problem = assembled(transients)

@@ -19,11 +19,11 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import excitation, regimes, residuals, sensors
+from uncertain_lti.identification import excitation, predictability, regimes, sensors
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.excitation import quoted as _list
-from uncertain_lti.identification.noise import Memory, memory
 from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.predictability import Prediction
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -139,7 +139,7 @@ def describe(
     messages += _tied(model, scheduled, all_sums) + _beyond_knots(model, scheduled)
     part = _stretches(problem)
     signals = (*model.signals.states, *model.signals.controls)
-    lagged = residuals.lagged_states(signals, model.n)
+    lagged = predictability.lagged_states(signals, model.n)
     alike = excitation.collinear(problem, sums, names, 1e-12 * problem.p, lagged)
 
     def place(some: Sequence[int]) -> str:
@@ -148,7 +148,7 @@ def describe(
     broken = [*sensors.coded(problem, sums, signals), *sensors.flipped(problem, signals, place)]
     messages = [*broken, *messages]
     messages += [*([] if broken else _carried(few, discarded, problem, names, place)), *alike]
-    known = memory(part)
+    known = predictability.prediction(part)
     told, follow = _recordings(model, problem, part, sums, names, transients, place, bool(broken))
     messages += told
     messages += _noise_like(known, part, states, follow)
@@ -266,11 +266,11 @@ def _recordings(
     broken: some numbers are no movement; what the jumps do to the residuals comes from them.
     """
     signals = (*model.signals.states, *model.signals.controls)
-    past = residuals.lagged_states(signals, model.n)
+    past = predictability.lagged_states(signals, model.n)
     rare = excitation.rare(part, names)
     known = {*rare, *past}
     held, late = sensors.held(part, signals), sensors.delayed(part, signals, past)
-    found = None if late or broken else residuals.residuals(part)
+    found = None if late or broken else predictability.autocorrelation(part)
     # what a slow topic or a late control explains needs no further state
     follow = {i for i in range(model.n) if found and found.follows(i) and not any(f"'{names[i]}'" in m for m in held)}
     speed = max((abs(v) for block in model.blocks for v in block.eigenvalues()), default=0.0) * (
@@ -279,9 +279,9 @@ def _recordings(
     uneven = [] if broken else sensors.jittering(part, signals, float(speed), model.sampling.clock)
     messages = [*rare.values(), *uneven]
     if found:
-        messages += residuals.missing(found, signals, follow)
+        messages += predictability.missing(found, signals, follow)
     lost = {j: (i, certainty) for j, (i, certainty) in excitation.lost(problem, sums, known).items() if i not in follow}
-    messages += [] if broken else residuals.weak(problem, lost, names, place)
+    messages += [] if broken else predictability.weak(problem, lost, names, place)
     messages += excitation.one_sided(part, names, known)
     messages += excitation.fed_back(part, names, past)
     messages += late
@@ -364,7 +364,7 @@ def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
     return found
 
 
-def _noise_like(known: Memory, problem: Problem, states: Sequence[str], follow: Collection[int]) -> list[str]:
+def _noise_like(known: Prediction, problem: Problem, states: Sequence[str], follow: Collection[int]) -> list[str]:
     """States whose next sample cannot be predicted from those before."""
     moving = np.ptp(problem.z[:, : problem.n], axis=0) > 0
     like = [i for i in range(problem.n) if moving[i] and known.like_noise(i) and i not in follow]
@@ -379,7 +379,7 @@ def _noise_like(known: Memory, problem: Problem, states: Sequence[str], follow: 
     ]
 
 
-def _slow(model: UncertainLTI, known: Memory, apart: bool, hidden: bool) -> list[str]:
+def _slow(model: UncertainLTI, known: Prediction, apart: bool, hidden: bool) -> list[str]:
     """Modes that a step of forward Euler is too long for, if the recordings confirm them.
 
     apart: the columns can be separated, so that the eigenvalues mean something; hidden: a state is missing, so that
@@ -412,7 +412,7 @@ def _wide(
     sums: Moments,
     mean_width: Array,
     states: Sequence[str],
-    known: Memory,
+    known: Prediction,
     few: Carriers | None,
     slow: bool,
     follow: Collection[int],

@@ -29,7 +29,7 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.horizons import better_run, fit_horizons
+from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.identification.noise import NOISE, predicted
+from uncertain_lti.identification.predictability import NOISE, predicted
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.effects import FAINT, SHOWS, Steps, steps_of
 

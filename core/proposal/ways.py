@@ -23,7 +23,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.residuals import residuals
+from uncertain_lti.identification.predictability import autocorrelation
 from uncertain_lti.identification.sensors import late_controls
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Axis, Schedule
@@ -155,7 +155,7 @@ def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) ->
 def memory_candidates(transients: Sequence[Transient], additive: str = "noise") -> list[tuple[Remembered, ...]]:
     """Sets of memories that may narrow the envelope, by what least squares leaves unexplained.
 
-    Of the states whose residual follows from sample to sample (`residuals.Residuals.follows`) the rates (the
+    Of the states whose residual follows from sample to sample (`Autocorrelation.follows`) the rates (the
     differences, if the step is constant) and the values one sample earlier; of the controls that seldom change the
     values one sample earlier, and their changes.
     """
@@ -167,7 +167,7 @@ def memory_candidates(transients: Sequence[Transient], additive: str = "noise") 
         return []
     taken = {*first.state_names, *first.control_names, *first.scheduling_names}
     remembered = {r.of for r in first.signals.recalled} if first.signals is not None else set()
-    found = residuals(problem)
+    found = autocorrelation(problem)
     follow = [i for i in range(problem.n) if found is not None and found.follows(i) and i not in remembered]
     rate = "rate" if first.step is None else "diff"
     events = []

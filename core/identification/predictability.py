@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What one step leaves unexplained: whether it follows from sample to sample, or a few transitions dominate it."""
+"""Predictability: what the signals of one instant say of the next sample, and whether the rest is noise or a state."""
 
 from __future__ import annotations
 
@@ -17,14 +17,24 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.identification.excitation import DETERMINED, certainty_of, successive, unexplained
+from uncertain_lti.identification.excitation import (
+    DETERMINED,
+    certainty_of,
+    least_squares,
+    successive,
+    triangle,
+    unexplained,
+)
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.signals.memory import Memory
 from uncertain_lti.signals.signal_map import Signal
 
-Array = NDArray[np.float64]
-
+NOISE = 0.5
+"""A state of whose variance less than this share is predicted from one sample to the next moves like noise."""
+_OWN = 0.3
+"""Share of a mode's largest component from which on a state has part in the mode."""
 FOLLOW, ALTERNATE = 0.5, -0.7
 """Autocorrelation from which on residuals follow one another. Sensor noise alone gives -0.5 to 0 at one sample, and
 0 at two."""
@@ -44,7 +54,72 @@ OUTLYING = 10.0
 
 
 @dataclass(frozen=True)
-class Residuals:
+class Prediction:
+    """How well a state's own past predicts its next sample.
+
+    `predicted` (n,): share of variance that least squares on the sample before and its control predicts one sample
+    ahead; `fastest`: |1 - eigenvalue| of the fastest mode of the step that does not come from measurement noise; inf
+    where too few samples follow one another.
+    """
+
+    predicted: Array
+    fastest: float
+
+    def like_noise(self, state: int) -> bool:
+        """Whether the state moves like noise."""
+        return bool(self.predicted[state] < NOISE)
+
+
+def predicted(X: Array, U: Array, after: Array) -> Array:
+    """Share of the variance that least squares on [X, U, 1] predicts.
+
+    `X` (N, n): regressors; `U` (N, m): further regressors; `after` (N, k): targets; Returns (k,): at most 1; without
+    the share that any regressor explains by chance, so that it can be negative.
+    """
+    design = np.vstack([X.T, U.T, np.ones(len(X))])
+    design /= np.maximum(np.abs(design).max(axis=1), 1e-300)[:, None]
+    reduced = triangle(np.vstack([design, after.T]))
+    regressors, targets = np.split(np.arange(reduced.shape[1]), [len(design)])
+    answer, rank = least_squares(reduced, regressors, targets, len(X))
+    rest = reduced[:, targets] - reduced[:, regressors] @ answer
+    total = ((after - after.mean(axis=0)) ** 2).sum(axis=0)
+    freedom = max(len(X) - rank, 1)
+    left = (rest**2).sum(axis=0) * (len(X) - 1) / freedom  # without the share that any regressor explains by chance
+    return np.asarray(1.0 - left / np.maximum(total, 1e-300))
+
+
+def prediction(problem: Problem) -> Prediction:
+    """Prediction of the states, estimated from a problem's own samples.
+
+    Noise on a measured state makes least squares believe that it decays within a step. The sample before, as an
+    instrument, carries the state and none of that noise; a mode is fast if both ways agree for a state that is
+    predicted at all.
+    """
+    n, p = problem.n, problem.p
+    share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
+    follows = successive(problem)
+    if len(follows) < 20 * p:
+        return Prediction(share, np.inf)
+    count, z = len(follows), problem.z_columns
+    reduced = triangle(
+        np.vstack([z[:, follows], z[:, follows + 1], np.ones(count), problem.next_columns[:, follows + 1]])
+    )
+    before, now, after = np.arange(p), np.arange(p, 2 * p + 1), np.arange(2 * p + 1, 2 * p + 1 + n)
+    instruments = np.concatenate([before, now[n:]])
+    projected = reduced[:, instruments] @ least_squares(reduced, instruments, now, count)[0]
+    speeds = []
+    for design in (reduced[:, now], projected):
+        both = np.hstack([design, reduced[:, after]])
+        found, _ = least_squares(both, np.arange(p + 1), np.arange(p + 1, p + 1 + n), count)
+        values, vectors = np.linalg.eig(found[:n].T)
+        parts = np.abs(vectors)
+        seen = [(share[parts[:, j] >= _OWN * parts[:, j].max()] >= NOISE).all() for j in range(n)]
+        speeds.append(float(np.max(np.abs(1.0 - values[seen]), initial=0.0)))
+    return Prediction(share, min(speeds))
+
+
+@dataclass(frozen=True)
+class Autocorrelation:
     """What least squares on one sample leaves unexplained of each state's step.
 
     `correlation` (n, 2): autocorrelation at one and at two samples; `gain` (n,): root mean square over that with the
@@ -71,8 +146,8 @@ def _autocorrelated(one: float, two: float) -> bool:
     return _correlated(one) or abs(two) >= FOLLOW
 
 
-def residuals(problem: Problem) -> Residuals | None:
-    """Residuals of least squares, and what would explain them."""
+def autocorrelation(problem: Problem) -> Autocorrelation | None:
+    """Autocorrelation of least squares, and what would explain them."""
     n, p = problem.n, problem.p
     before = successive(problem)
     if len(before) < 40 * p:
@@ -80,7 +155,7 @@ def residuals(problem: Problem) -> Residuals | None:
     now = before + 1
     correlation = _correlation(problem, now)
     if not any(_autocorrelated(*of) for of in correlation.tolist()):  # nothing follows: what would explain it is idle
-        return Residuals(correlation, np.ones(n), np.ones(n))
+        return Autocorrelation(correlation, np.ones(n), np.ones(n))
     dt = problem.dt[now, None]
     z = problem.z[now]
     step = problem.x_next[now] - z[:, :n]
@@ -97,7 +172,7 @@ def residuals(problem: Problem) -> Residuals | None:
     plain = left(own, slice(None))
     past = np.array([left(np.append(own, p + 1 + i), slice(i, i + 1))[0] for i in range(n)])
     curved = left(np.append(own, np.arange(p + 1 + n, basis.shape[1])), slice(None))
-    return Residuals(correlation, np.sqrt(plain / past), np.sqrt(plain / curved))
+    return Autocorrelation(correlation, np.sqrt(plain / past), np.sqrt(plain / curved))
 
 
 def _curves(z: Array) -> Array:
@@ -138,7 +213,7 @@ def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
     return {j for j, s in enumerate(signals) if j >= n and (s.delay > 0 or s.memory) and (s.topic, s.inner) in states}
 
 
-def missing(known: Residuals, signals: Sequence[Signal], states: Collection[int]) -> list[str]:
+def missing(known: Autocorrelation, signals: Sequence[Signal], states: Collection[int]) -> list[str]:
     """The sentence for each state whose next sample depends on more than the signals at one instant."""
     messages = []
     for i in sorted(states):
