@@ -405,3 +405,7 @@ def read_text(page: Path) -> str:
     """What a page says, without its tags; long dashes as they were typed."""
     text = html.unescape(re.sub(r"<[^>]+>", " ", page.read_text()))
     return text.replace("\u2013", "--")
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 900
