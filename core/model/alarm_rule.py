@@ -20,8 +20,8 @@ from typing import Any
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
-from uncertain_lti.model.elements import object_of
 from uncertain_lti.model.horizon import MOST_STEPS
+from uncertain_lti.model.terms import object_of
 
 LONGEST_WINDOW = 1_000_000
 """Verdicts that the alarm looks at, at most."""

@@ -28,13 +28,12 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
-from uncertain_lti.model.elements import blocks_of, checked, object_of
 from uncertain_lti.model.horizon import Horizon, Run
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
-from uncertain_lti.model.terms import ARRAYS, REQUIRED
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, object_of
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.table_layout import TableLayout
 
@@ -51,72 +50,58 @@ _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
 def structure(model: Any) -> dict[str, Any]:
     """The structure of a model file, in the oldest format that holds the model."""
-    states = [_signal(s, _STATE) for s in model.signals.states]
-    controls = [_signal(s, _CONTROL) for s in model.signals.controls]
-    s = model.sampling
+    signals, sampling, domain, rule = model.signals, model.sampling, model.domain, model.alarm_rule
     arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
-    scheduled = model.schedule is not None
-    one_rule = model.alarm == (model.alarm_rule,)
-    newer = (
-        scheduled
-        or model.domain.measure is not None
-        or model.domain.step_max is not None
-        or model.signals.table is not None
-        or bool(model.horizons)
+    one_rule = model.alarm == (rule,)
+    newer_sampling = _known(step=sampling.step, table=signals.table and signals.table.to_dict())
+    newer_domain = _known(
+        measure=domain.measure and domain.measure.to_dict(),
+        step_max=None if domain.step_max is None else domain.step_max.tolist(),
     )
-    newer = newer or not one_rule or model.residuals is not None or model.run is not None
-    newer |= s.step is not None or any(g.memory or g.valid is not None or g.ignore for g in model.signals)
-    newer |= bool(model.signals.arrivals) or any(g.judged for g in model.signals)
-    newer = newer or model.repeats is not None or bool(model.signatures)
-    regimes: dict[str, Any] = {}
-    if scheduled:
-        regimes["schedule"] = model.schedule.to_list()
-        if model.signals.scheduling:
-            regimes["scheduling"] = [_signal(s, _SCHEDULING) for s in model.signals.scheduling]
-        regimes["blocks"] = [
-            {name: getattr(model, name)[r].tolist() for name in arrays}
-            | {"transitions": facts.transitions, "tied_to": facts.tied_to}
-            for r, facts in enumerate(model.block_data)
-        ]
+    regimes = {name: getattr(model, name).tolist() for name in arrays}
+    if model.schedule is not None:
+        regimes = {"schedule": model.schedule.to_list()}
+        regimes |= {"scheduling": [_signal(s, _SCHEDULING) for s in signals.scheduling]} if signals.scheduling else {}
+        each = zip(model.blocks_to_list(arrays), model.block_data, strict=True)
+        regimes["blocks"] = [b | {"transitions": f.transitions, "tied_to": f.tied_to} for b, f in each]
+    runs = _known(horizons=[h.to_dict() for h in model.horizons] or None, run=model.run and model.run.to_dict())
+    residuals = _known(residuals=model.residuals and model.residuals.to_dict())
+    evidence = _known(
+        frozen=model.repeats and model.repeats.to_dict(),
+        signatures=[signature.to_dict() for signature in model.signatures] or None,
+    )
+    newer = (
+        *(newer_sampling, newer_domain, runs, residuals, evidence),
+        *(model.schedule is not None, not one_rule, len(arrays) > len(_IN_EVERY_FILE), signals.arrivals),
+        *(g.memory or g.valid is not None or g.ignore or g.judged for g in signals),
+    )
     return {
-        "format": FORMATS[newer or len(arrays) > len(_IN_EVERY_FILE)],
-        "states": states,
-        "controls": controls,
-        "sampling": {
-            "clock": s.clock,
-            "clock_type": s.clock_type,
-            "time": dict(s.time),
-            "dt_median": s.dt_median,
-            "dt_min": s.dt_min,
-            "dt_max": s.dt_max,
-            "max_gap": s.max_gap,
-            "min_step": s.min_step,
-            "max_skew": s.max_skew,
-        }
-        | ({} if s.step is None else {"step": s.step})
-        | ({} if model.signals.table is None else {"table": model.signals.table.to_dict()}),
-        **(regimes if scheduled else {name: getattr(model, name).tolist() for name in arrays}),
-        **({"horizons": [horizon.to_dict() for horizon in model.horizons]} if model.horizons else {}),
-        **({} if model.run is None else {"run": model.run.to_dict()}),
+        "format": FORMATS[any(newer)],
+        "states": [_signal(s, _STATE) for s in signals.states],
+        "controls": [_signal(s, _CONTROL) for s in signals.controls],
+        "sampling": {f.name: getattr(sampling, f.name) for f in fields(Sampling) if f.name != "step"}
+        | {"time": dict(sampling.time)}
+        | newer_sampling,
+        **regimes,
+        **runs,
         "domain": {
-            name: [v if math.isfinite(v) else None for v in getattr(model.domain, name).tolist()]
+            name: [v if math.isfinite(v) else None for v in getattr(domain, name).tolist()]
             for name in ("x_min", "x_max", "u_min", "u_max")
         }
-        | ({} if model.domain.measure is None else {"measure": model.domain.measure.to_dict()})
-        | ({} if model.domain.step_max is None else {"step_max": model.domain.step_max.tolist()}),
-        **({} if model.residuals is None else {"residuals": model.residuals.to_dict()}),
-        "alarm": {
-            "violations": model.alarm_rule.violations,
-            "window": model.alarm_rule.window,
-            "margin": model.alarm_rule.margin,
-        }
+        | newer_domain,
+        **residuals,
+        "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
         if one_rule
         else {"rules": [rule.to_dict() for rule in model.alarm]},
-        **({} if model.repeats is None else {"frozen": model.repeats.to_dict()}),
-        **({"signatures": [signature.to_dict() for signature in model.signatures]} if model.signatures else {}),
+        **evidence,
         "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
         "validation": _plain(model.validation),
     }
+
+
+def _known(**fields: Any) -> dict[str, Any]:
+    """Those of some fields that are not None."""
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def _signal(signal: Signal, keys: Sequence[str]) -> dict[str, Any]:

@@ -33,9 +33,9 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import Judge, centre_and_half
-from uncertain_lti.model.elements import Elements, blocks_of, object_of
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Schedule
+from uncertain_lti.model.terms import Elements, blocks_of, object_of
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""

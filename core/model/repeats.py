@@ -38,7 +38,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import changes, edges
-from uncertain_lti.model.elements import checked, object_of
+from uncertain_lti.model.terms import checked, object_of
 
 _KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond", "noisy_steps")
 WINDOW_S = 1.0

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.elements import checked, object_of
+from uncertain_lti.model.terms import checked, object_of
 
 _KEYS = ("mean", "covariance")
 _RELATIVE = "relative"

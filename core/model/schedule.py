@@ -35,8 +35,8 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import Blocks
-from uncertain_lti.model.elements import object_of
 from uncertain_lti.model.operating_point import recorded
+from uncertain_lti.model.terms import object_of
 from uncertain_lti.signals.signal_map import Signal
 
 MOST_AXES = 2

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.elements import checked
+from uncertain_lti.model.terms import checked
 
 MOST_SIGNATURES = 256
 _KEYS = ("label", "recordings", "verdicts", "steps", "moments")

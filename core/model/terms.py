@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Terms of the uncertain model, in one table: name, shape, regressor, and where the width goes.
+"""Terms of the uncertain model, in one table (name, shape, regressor, where the width goes), and arrays of them.
 
 The model is linear in every term. With phi the regressors of the nominal elements and psi those of the half-widths,
 
@@ -19,12 +19,19 @@ Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
 
 from __future__ import annotations
 
+import reprlib
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, real
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.limits import LARGEST
 
 
 @dataclass(frozen=True)
@@ -101,3 +108,140 @@ def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
     rows = arrays["v"].shape
     others = [arrays[term.half] for term in TERMS if not term.times_dt]
     return side_by_side("nominal"), side_by_side("half"), np.sum(others, axis=0) if len(others) > 1 else others[0]
+
+
+class Elements:
+    """The arrays of one envelope, read-only; with a schedule of R blocks each has a leading axis of R.
+
+    `given`: by the names of `ARRAYS`; what is not there, or is None and not required, is 0. `where`: begins the name of
+    each in errors; `lead`: (R,), or () without a schedule; default as A has it.
+    """
+
+    A: Array
+    B: Array
+    dA: Array
+    dB: Array
+    c: Array
+    dc: Array
+    v: Array
+
+    def __init__(self, given: Mapping[str, Any], where: str = "", lead: tuple[int, ...] | None = None) -> None:
+        A, B = (checked(given[name], f"{where}{name}", None) for name in ("A", "B"))
+        lead = A.shape[:-2][:1] if lead is None else lead
+        each = f", once for each of {plural(lead[0], 'block')}" if lead else ""
+        n, m = A.shape[-1] if A.ndim else 0, B.shape[-1] if B.size else 0
+        if A.shape != (*lead, n, n) or n == 0:
+            raise ModelError(f"{where}A has shape {A.shape}; it must be square, one row per state{each}")
+        if B.size and B.shape != (*lead, n, m):
+            raise ModelError(f"{where}B has shape {B.shape}; it must have {plural(n, 'row')}, one per state{each}")
+        for name in ARRAYS:
+            shape = (*lead, *SHAPES[name].shape(n, m))
+            absent = name not in given or (given[name] is None and name not in REQUIRED)
+            array = checked(np.zeros(shape) if absent else given[name], f"{where}{name}", shape, name in HALF_WIDTHS)
+            array.flags.writeable = False
+            setattr(self, name, array)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[-1])
+
+    @property
+    def m(self) -> int:
+        """Number of controls."""
+        return int(self.B.shape[-1])
+
+    @property
+    def arrays(self) -> dict[str, Array]:
+        """All of them, by name."""
+        return {name: getattr(self, name) for name in ARRAYS}
+
+    @cached_property
+    def tables(self) -> tuple[Array, Array, Array]:
+        """Nominal elements and half-widths side by side, and what dt does not multiply (`tables`)."""
+        return tables(self.arrays)
+
+    def fits(self, other: Elements, name: str) -> None:
+        """Refuse the elements of another envelope, called so, if it has other states, controls or blocks."""
+        if (other.A.shape, other.B.shape) != (self.A.shape, self.B.shape):
+            raise ModelError(
+                f"{name}: A {other.A.shape} and B {other.B.shape} do not fit the model, whose A is {self.A.shape} and "
+                f"B {self.B.shape}"
+            )
+
+    def blocks_to_list(self, names: Sequence[str] = ARRAYS) -> list[dict[str, Any]]:
+        """Of each block the arrays of these names, as they are in a model file."""
+        lead = self.A.ndim > 2
+        return [
+            {name: (getattr(self, name)[r] if lead else getattr(self, name)).tolist() for name in names}
+            for r in range(len(self.A) if lead else 1)
+        ]
+
+
+def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
+    """An array of a model, held to its shape."""
+    try:
+        if isinstance(value, Sequence) and not _numbers_only(value):
+            raise TypeError
+        array = real(value)
+    except (TypeError, ValueError, OverflowError):
+        raise ModelError(f"field '{name}' is not an array of numbers") from None
+    if shape is not None and array.shape != shape:
+        if array.size == 0 and 0 in shape:
+            return np.zeros(shape)
+        raise ModelError(f"field '{name}' has shape {array.shape}; it must be {shape}")
+    if not np.isfinite(array).all():
+        raise ModelError(f"field '{name}' holds a number that is not finite")
+    if (np.abs(array) > LARGEST).any():
+        raise ModelError(f"field '{name}' holds a number above {LARGEST:g}, which the arithmetic cannot carry")
+    if half_width and (array < 0).any():
+        raise ModelError(f"field '{name}' holds a negative half-width")
+    return array
+
+
+def _numbers_only(value: Any) -> bool:
+    """No texts, truth values or nulls, which numpy would turn into numbers."""
+    if isinstance(value, (list, tuple)):
+        return all(_numbers_only(v) for v in value)
+    return not isinstance(value, (str, bool)) and value is not None
+
+
+def blocks_of(
+    data: Any,
+    name: str,
+    n: int,
+    m: int,
+    blocks: int | None,
+    names: Sequence[str] = ARRAYS,
+    needed: Collection[str] = REQUIRED,
+    also: Collection[str] = (),
+) -> dict[str, Array]:
+    """The arrays of the blocks of a schedule, or of the only one, of a model file."""
+    if not isinstance(data, list) or len(data) != (blocks or 1):
+        one_each = "" if blocks is None else ", one per knot or mode"
+        raise ModelError(f"field '{name}' must be a list of {plural(blocks or 1, 'block')}{one_each}")
+    arrays: dict[str, list[Array]] = {array: [] for array in names}
+    for r, block in enumerate(data):
+        object_of(block, f"{name}[{r}]", {*names, *also}, needed)
+        for array, values in arrays.items():
+            shape = SHAPES[array].shape(n, m)
+            value = np.zeros(shape) if block.get(array) is None else block[array]
+            values.append(checked(value, f"{name}[{r}].{array}", shape, array in HALF_WIDTHS))
+    return {array: values[0] if blocks is None else np.stack(values) for array, values in arrays.items()}
+
+
+def object_of(
+    data: Any, name: str, known: Collection[str] | None = None, needed: Collection[str] = (), remedy: str = ""
+) -> dict[str, Any]:
+    """An object of a model file, its fields checked."""
+    if not isinstance(data, Mapping):
+        raise ModelError(f"field '{name}' is not an object")
+    within = f"{name}." if name else ""
+    for key in needed:
+        if key not in data:
+            raise ModelError(f"field '{within}{key}' is missing; {remedy or 'fit the model again'}")
+    for key in data:
+        if known is not None and key not in known:
+            unknown = f"{within}{reprlib.repr(key)[1:-1]}"
+            raise ModelError(f"unknown field '{unknown}'; known are {', '.join(sorted(known))}")
+    return dict(data)
