@@ -24,6 +24,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.reports.charts import runs
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status
@@ -66,13 +67,13 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     change, largest = jumps(model, before, transient.x)
     for i, name in enumerate(model.state_names):
         bad, own = verdicts.flags[:, i] == 1.0, int((~np.isnan(verdicts.flags[:, i])).sum())
-        runs = _runs(bad)
-        longest = max(runs, key=lambda run: (run[1] - run[0], -run[0]), default=None)
+        violated = runs(bad)
+        longest = max(violated, key=lambda run: (run[1] - run[0], -run[0]), default=None)
         states[name] = {
             "violations": int(bad.sum()),
             "verdicts": own,
             "inside": None if not own else 1.0 - int(bad.sum()) / own,
-            "first_violation": _instant(transient, runs[0][0]) if runs else None,
+            "first_violation": _instant(transient, violated[0][0]) if violated else None,
             "longest_violation": None
             if longest is None
             else {**_instant(transient, longest[0]), "samples": longest[1] - longest[0], **_length(t, longest)},
@@ -81,7 +82,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             "unit": model.signals.states[i].unit,
             "jump": _jump(model, verdicts, i, change[:, i], float(largest[i])),
         }
-    alarms = _runs(verdicts.alarm)
+    alarms = runs(verdicts.alarm)
     data: dict[str, Any] = {
         "recording": transient.name,
         "samples": len(transient),
@@ -210,7 +211,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: NDArray[np.bool_]) 
     for i, name in enumerate(model.state_names):
         fresh = np.concatenate([[True], (np.diff(transient.x[:, i]) != 0) | (np.diff(transient.segment) > 0)])
         begins = np.maximum.accumulate(np.where(fresh, np.arange(len(fresh)), 0))
-        for start, stop in _runs(which[:, i]):
+        for start, stop in runs(which[:, i]):
             begin = int(begins[start])
             seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, start))
             longest = float(model.repeats.longest_repeat_s[i])
@@ -232,7 +233,7 @@ def _before(frozen: NDArray[np.bool_], longer: NDArray[np.bool_]) -> NDArray[np.
     """Samples of `longer` whose repeat goes on to be frozen, which is told already."""
     found = np.zeros_like(longer)
     for i in range(longer.shape[1]):
-        for start, stop in _runs(longer[:, i]):
+        for start, stop in runs(longer[:, i]):
             found[start:stop, i] = stop < len(frozen) and frozen[stop, i]
     return found
 
@@ -286,12 +287,6 @@ def _raised(verdicts: Verdicts, k: int) -> list[dict[str, Any]]:
         {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
         for r in verdicts.raised(k)
     ]
-
-
-def _runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """[start, stop) of every run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _instant(transient: Transient, k: int) -> dict[str, Any]:

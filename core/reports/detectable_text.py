@@ -50,32 +50,8 @@ def detectable_data(validation: Mapping[str, Any]) -> dict[str, Any] | None:
     """The section on detectable faults of a model's validation, if it is one."""
     try:
         data = validation["detectable"]
-        faults = [
-            {
-                "kind": str(f["kind"]),
-                "of": str(f["of"]),
-                "signal": str(f["signal"]),
-                "unit": str(f["unit"]),
-                "size": _real(f["size"]),
-                "size_interval": [_real(v) for v in f["size_interval"]],
-                "largest": float(f["largest"]),
-                "share": _real(f["share"]),
-                "share_interval": [float(v) for v in f["share_interval"]],
-                "delay": _real(f["delay"]),
-                "cases": int(f["cases"]),
-                "refused": str(f.get("refused", "")),
-            }
-            for f in data["faults"]
-        ]
-        return {
-            "within": float(data["within"]),
-            "share": float(data["share"]),
-            "confidence": float(data["confidence"]),
-            "cases": int(data["cases"]),
-            "left_out": int(data["left_out"]),
-            "faults": [f for f in faults if f["kind"] in TITLES],
-            "refused": str(data.get("refused", "")),
-        }
+        faults = [_typed(fault, _FAULT) for fault in data["faults"]]
+        return {**_typed(data, _ABOUT), "faults": [f for f in faults if f["kind"] in TITLES]}
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
 
@@ -86,6 +62,19 @@ def _real(value: Any) -> float | None:
     if isinstance(value, str) or not math.isfinite(value):
         raise ValueError
     return float(value)
+
+
+def _typed(data: Mapping[str, Any], types: Mapping[str, Any]) -> dict[str, Any]:
+    """The entries of a model file, in which anything may be written, each by what makes it of its type."""
+    return {key: kind(data[key]) for key, kind in types.items()} | {"refused": str(data.get("refused", ""))}
+
+
+_ABOUT: Mapping[str, Any] = {"within": float, "share": float, "confidence": float, "cases": int, "left_out": int}
+_FAULT: Mapping[str, Any] = {
+    **dict.fromkeys(("kind", "of", "signal", "unit"), str), **dict.fromkeys(("size", "share", "delay"), _real),
+    "size_interval": lambda ends: [_real(end) for end in ends], "largest": float,
+    "share_interval": lambda ends: [float(end) for end in ends], "cases": int,
+}  # fmt: skip
 
 
 def size_text(fault: Mapping[str, Any], interval: bool = True) -> str:
