@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
-from uncertain_lti.identification import fit, fleet, formulation, passes, row, solvers, working_set
+from uncertain_lti.identification import fit, fleet, formulation, passes, programmes, solvers, working_set
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
@@ -845,7 +845,7 @@ def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch
     """The simplex method tells that δ is not the least, and takes over: the same optimum, ties broken alike."""
     transient = drawn(leibov2006(), N, 4, noise=1e-3)
     expected = fit(transient, "lp", additive="noise")
-    monkeypatch.setattr(row, "REGULARISATION", 100.0)
+    monkeypatch.setattr(programmes, "REGULARISATION", 100.0)
     model = fit(transient, "lp", additive="noise")
     np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-7)
     np.testing.assert_allclose(model.fit_summary["mean_width"], expected.fit_summary["mean_width"], rtol=1e-3)

@@ -69,7 +69,7 @@ def test_rows_that_are_solved_in_turn_have_a_bound(seed, known):
     engine.quadratic()
     for row in engine.rows:
         row.d = 1.01 * row.d
-    assert engine._coupled_linear_gap() >= (1 - 1 / 1.01**2) - 1e-5  # what is 1 % wider is known to be
+    assert engine._coupled.linear_gap() >= (1 - 1 / 1.01**2) - 1e-5  # what is 1 % wider is known to be
 
 
 @pytest.mark.parametrize("bag", ["turbofan_pulses_up", "turbofan_pulses_down", "turbofan_check", "turbofan_levels"])
@@ -157,13 +157,13 @@ def test_a_state_and_its_lag_are_fitted(criterion, scale, offset):
 
 def test_a_gap_that_is_not_small_is_said(monkeypatch):
     transient = plant(7, 3, 1, 200, 1e-3)
-    monkeypatch.setattr(working_set.Row, "duality_gap", lambda row: 0.2)
-    monkeypatch.setattr(working_set.Row, "linear_gap", lambda row: 0.1)
+    monkeypatch.setattr(working_set.Programmes, "duality_gap", lambda programmes: 0.2)
+    monkeypatch.setattr(working_set.Programmes, "linear_gap", lambda programmes: 0.1)
     model = fit(transient, "qp", additive="noise")
     assert model.fit_summary[KEY] == pytest.approx(0.1)
     assert any("10 % above the optimum at most" in message for message in model.fit_summary["messages"])
-    monkeypatch.setattr(working_set.Row, "duality_gap", lambda row: np.inf)
-    monkeypatch.setattr(working_set.Row, "linear_gap", lambda row: np.inf)
+    monkeypatch.setattr(working_set.Programmes, "duality_gap", lambda programmes: np.inf)
+    monkeypatch.setattr(working_set.Programmes, "linear_gap", lambda programmes: np.inf)
     model = fit(transient, "qp", additive="noise")
     assert model.fit_summary[KEY] is None
     assert any("no bound of the distance from the optimum" in message for message in model.fit_summary["messages"])

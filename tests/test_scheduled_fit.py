@@ -22,8 +22,8 @@ from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.programmes import Programmes
 from uncertain_lti.identification.regimes import Modes
-from uncertain_lti.identification.row import Row
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import SUBSAMPLE
 from uncertain_lti.model.schedule import Axis, Schedule
@@ -247,11 +247,11 @@ def test_the_least_largest_width_by_the_nominal_elements_alone(monkeypatch, addi
     """Half-widths of one size reach it where the structure lets them: the same as with all half-widths unknown."""
     transient = drawn(THREE, 3000, 8, noise=1e-4)
     taken = []
-    nearest = Row._nearest
-    monkeypatch.setattr(Row, "_nearest", lambda row: taken.append(row.i) or nearest(row))
+    nearest = Programmes._nearest
+    monkeypatch.setattr(Programmes, "_nearest", lambda own: taken.append(own.row.i) or nearest(own))
     model = fit(transient, "lp", additive=additive, structure=structure, schedule=THREE)
     assert (0 in taken) == short
-    monkeypatch.setattr(Row, "box", None)
+    monkeypatch.setattr(Programmes, "box", None)
     other = fit(transient, "lp", additive=additive, structure=structure, schedule=THREE)
     assert model.fit_summary["objective"] == pytest.approx(other.fit_summary["objective"], rel=2e-8)
     steps = transient.transitions()

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -21,6 +20,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.programmes import Programmes
 from uncertain_lti.identification.row import Row
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
@@ -126,7 +126,7 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
     stale = set(range(len(engine.rows)))
     while True:
         for i in stale:
-            gains[i] = _gains(engine, engine.rows[i]) if criterion == "qp" else _linear_gains(engine.rows[i])
+            gains[i] = _gains(engine, engine.rows[i]) if criterion == "qp" else _linear_gains(engine, engine.rows[i])
         total: dict[int, float] = {}
         for i, row_gains in enumerate(gains):
             for index, gain in row_gains.items():
@@ -137,9 +137,9 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
         yield index, total[index]
         stale = set()
         for row, row_gains in zip(engine.rows, gains, strict=True):
-            _drop(row, index)
+            engine.programmes[row.i].drop(index)
             if index in row_gains:
-                _solve(engine, row, criterion)
+                _solve(engine, engine.programmes[row.i], criterion)
                 stale.add(row.i)
 
 
@@ -158,14 +158,14 @@ def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:
     value = _value(row, "qp", engine.weights)
     gains = {}
     for index in row.samples.index[np.flatnonzero(row.slack() < _ACTIVE)].tolist():
-        trial = _copy(row)
-        _drop(trial, index)
-        _solve(engine, trial, "qp")
-        gains[index] = value - _value(trial, "qp", engine.weights)
+        own = engine.programmes[row.i].trial()
+        own.drop(index)
+        _solve(engine, own, "qp")
+        gains[index] = value - _value(own.row, "qp", engine.weights)
     return gains
 
 
-def _linear_gains(row: Row) -> dict[int, float]:
+def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
     """Fall of δ of (11) in the same way, by one programme whose rows are released in turn.
 
     δ falls only without a sample that has a price (a dual variable) in the optimum: without another one the same
@@ -173,13 +173,13 @@ def _linear_gains(row: Row) -> dict[int, float]:
     """
     if not row.unknown:
         return {}
-    trial = _copy(row)
-    simplex = trial._minimax()
+    own = engine.programmes[row.i].trial()
+    trial, simplex = own.row, own.minimax()
     owner, least = np.full(len(trial.asked), -1), np.full(len(trial.asked), -np.inf)
 
     def add(pool: Index) -> None:
         nonlocal owner, least
-        rows, h = trial._rows(pool)
+        rows, h = own.rows(pool)
         simplex.add(rows, h)
         owner, least = np.concatenate([owner, np.tile(pool, len(h) // len(pool))]), np.concatenate([least, h])
 
@@ -187,16 +187,16 @@ def _linear_gains(row: Row) -> dict[int, float]:
         while True:
             answer = simplex.solve()
             trial.store(answer[:-1])
-            trial.limit = float(answer[-1])
+            trial.bound(float(answer[-1]))
             slack = trial.slack()
             slack[trial.pool] = np.inf
             if without >= 0:
                 slack[without] = np.inf
             outside = np.flatnonzero(slack < -trial.tolerance)
             if not len(outside):
-                return trial.limit
+                return float(answer[-1])
             add(outside)
-            trial.pool = np.concatenate([trial.pool, outside])
+            trial.join(outside)
 
     add(trial.pool)
     value = solve()
@@ -209,28 +209,7 @@ def _linear_gains(row: Row) -> dict[int, float]:
     return gains
 
 
-def _copy(row: Row) -> Row:
-    """A row that can be solved on its own, sharing what is only read."""
-    trial = copy.copy(row)
-    trial.theta, trial.d = row.theta.copy(), row.d.copy()
-    trial._simplex, trial._known = None, np.empty(0, dtype=np.intp)
-    return trial
-
-
-def _drop(row: Row, index: int) -> None:
-    """Take a sample out of what the row holds."""
-    keep = row.samples.index != index
-    if keep.all():
-        return
-    position = np.cumsum(keep) - 1
-    row.pool = position[row.pool[keep[row.pool]]]
-    row.samples = row.samples[keep]
-    row.plain_phi, row.psi = row.plain_phi[keep], row.psi[keep]
-    row.y, row.half, row.width = row.y[keep], row.half[keep], row.width[keep]
-    row._simplex, row._known = None, np.empty(0, dtype=np.intp)
-
-
-def _solve(engine: WorkingSet, row: Row, criterion: str) -> None:
+def _solve(engine: WorkingSet, own: Programmes, criterion: str) -> None:
     if criterion == "lp":
-        row.limit = None
-    engine._settle(row, Row.solve_quadratic if criterion == "qp" else Row.solve_linear)
+        own.row.bound(None)
+    engine._settle(own, Programmes.quadratic if criterion == "qp" else Programmes.linear)

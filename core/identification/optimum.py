@@ -20,8 +20,9 @@ from uncertain_lti.base.cores import one_thread_each
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.programmes import GOOD
 from uncertain_lti.identification.repair import E, repair
-from uncertain_lti.identification.row import GOOD, LEAST
+from uncertain_lti.identification.row import LEAST
 from uncertain_lti.identification.working_set import Solution, WorkingSet
 
 

@@ -7,11 +7,11 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""One row of the model: its unknowns, the samples held for it, and its small programmes."""
+"""One row of the model: its scaled unknowns, and the samples held for it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -22,53 +22,14 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
-from uncertain_lti.identification.solvers import (
-    FEASIBLE,
-    Answer,
-    Simplex,
-    dual_bound,
-    linear_bound,
-    solve_near,
-    solve_qp,
-)
 
-TOLERANCE = 1e-11
-"""Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
-TIE_BREAK = 1e-8
-"""Weight of the squared distance of the centre relative to the squared half-widths.
-
-|rate - centre| <= half-width for every sample, so the sum of squared distances is at most that of squared half-widths,
-and the optimum of the sum is within TIE_BREAK (relative) of the optimum of (10) alone, with the centre that the stated
-tie-break asks for.
-"""
-ROUGH = 1e-4
-"""Violation, in scaled units, up to which a first answer is worth judging: how good it is, is measured at the end."""
 LEAST = 1e-9
 """Widths below this share of the steps themselves are rounding, and so is their distance from the optimum."""
+_EPS = float(np.finfo(np.float64).eps)
 COLLINEAR = 1e-11
 """Relative singular value of the columns below which the effect of a direction is lost in rounding."""
-_EPS = float(np.finfo(np.float64).eps)
-GOOD = 1e-7
-"""Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
-coordinates of its residual."""
-WIDTH_SLACK = 2e-8
-"""Relative room above δ of (11) in which its ties are broken: closer to δ, what they are is rounding."""
-BOUNDED_TIE_BREAK = 1e-5
-"""The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
-REGULARISATION = 1e-4
-"""Weight of the squared widths relative to δ in (11), for a solver of strictly convex programmes.
-
-With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
-of the squared widths. Whether it was is seen from the optimum of δ alone, at the end. With the unknowns of many blocks
-it seldom is small enough, so they are left to the simplex method at once.
-"""
-_ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
-_HELD = 12
-"""Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
-_HOLD = (1e-2, 1e-4, 1e-6)
-"""Shares of the largest weight with which the ties of (11) are held back to where they were, one after the other."""
-_ROOM = (1e-10, 1e-9, 1e-8)
-"""Violation, in scaled units, that they may leave, tried in turn: the set of optima can be as thin as that."""
+TOLERANCE = 1e-11
+"""Violation, in scaled units, below which a sample counts as contained; the repair lifts the rest."""
 JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
 
@@ -177,7 +138,6 @@ class Row:
         self._bounds = bounds
         self._shared = shared
         self.refined = False
-        self.rounds = 0  # programmes solved
         self._held: _Held | None = None
         self.width: Array = np.empty(0)
         self.kept: float | None = None  # violation, in units of the size, of an answer of before that was good
@@ -187,18 +147,6 @@ class Row:
         self.samples = Samples.join([], len(sums.low))
         self.pool: Index = np.empty(0, dtype=np.intp)  # positions in samples
         self.limit: float | None = None  # δ of (11) in units of scale x width_unit
-        self._unit = 1.0  # of the δ that the nominal elements alone decide, in units of the limit
-        self.allowed = 0.0  # δ that the ties may have, in the same units
-        self.exact = sums.visits.size > 1  # (11) by the simplex method
-        self.least = 0.0  # δ of (11) that it found, in the same units as the limit
-        self._forget()
-
-    def _forget(self) -> None:
-        """What solvers start from."""
-        self.attempt = _ATTEMPTS[0]
-        self._last: dict[str, Answer] = {}  # to the last programme of a kind
-        self._simplex: Simplex | None = None
-        self._known: Index = np.empty(0, dtype=np.intp)
 
     def _coordinates(self, scale: float) -> None:
         """Scaled unknowns: columns of unit size, elements in units of `scale` per step."""
@@ -300,7 +248,6 @@ class Row:
             self.lower = np.concatenate([np.full(self.r, -np.inf), self.lower[-self.q :] if self.q else np.empty(0)])
             self.upper = np.concatenate([np.full(self.r, np.inf), self.upper[-self.q :] if self.q else np.empty(0)])
         self.theta, self.d = theta, d
-        self._forget()
         self.width_unit = 1.0
         self.hold(samples, self._columns)
         self.width_unit = float(np.sqrt(np.mean(self.width**2))) if len(samples) else 1.0
@@ -313,7 +260,7 @@ class Row:
         """Of `limit`, in normalised units."""
         return self.scale * self.width_unit
 
-    def _sizes(self, positions: Index | int) -> Array:
+    def sizes(self, positions: Index | int) -> Array:
         """Size of held samples: the unit of their slack, with `scale`."""
         return np.asarray(self.width[positions] * self.width_unit / (2.0 * self.samples.root_weight[positions]))
 
@@ -358,11 +305,11 @@ class Row:
 
         `answer` (r + q,): scaled unknowns ξ.
         """
-        self._store_theta(answer[: self.r])
+        self.store_theta(answer[: self.r])
         d = np.maximum(answer[self.r :], np.maximum(self.lower[self.r :], 0.0))
         self.psi_columns.put(self.d, d * self.unit_psi * self.scale)
 
-    def _store_limited(self, answer: Array) -> None:
+    def store_limited(self, answer: Array) -> None:
         """Take [ξ δ]: δ is no less than the widths it limits, to the last bit.
 
         Where noise alone makes the widths, all samples are about as wide as the widest, and a δ that is short of it
@@ -373,7 +320,8 @@ class Row:
         widest = self.width[self.pool] * (self.psi[self.pool] @ d + self.half[self.pool])
         self.limit = max(float(answer[-1]), float(widest.max(initial=0.0)))
 
-    def _store_theta(self, answer: Array) -> None:
+    def store_theta(self, answer: Array) -> None:
+        """Take scaled nominal unknowns, in the row's coordinates."""
         change = answer if self.basis is None else self.basis @ answer
         theta = change * self.unit_phi * self.scale
         self.phi_columns.put(self.theta, theta + self.fixed_theta[self.free_phi] if self.refined else theta)
@@ -425,7 +373,7 @@ class Row:
         self.pool = np.concatenate([self.pool, np.flatnonzero(outside)])
         self.hold(self.samples[np.sort(self.pool)], self._columns)
 
-    def _along(self, pool: Index) -> Array:
+    def along(self, pool: Index) -> Array:
         """Regressors of the nominal unknowns of some samples, in the row's coordinates, (K, r)."""
         return self.plain_phi[pool] if self.basis is None else self.plain_phi[pool] @ self.basis
 
@@ -447,6 +395,27 @@ class Row:
         inside, room = self.slacks()
         return inside if room is None else np.minimum(inside, room)
 
+    def bound(self, limit: float | None) -> None:
+        """Let no sample be wider than this, in units of `limit_unit`."""
+        self.limit = limit
+
+    def trial(self) -> Row:
+        """A row that can be solved on its own, sharing what is only read."""
+        trial = copy.copy(self)
+        trial.theta, trial.d = self.theta.copy(), self.d.copy()
+        return trial
+
+    def drop(self, index: int) -> None:
+        """Take a transition out of what the row holds."""
+        keep = self.samples.index != index
+        if keep.all():
+            return
+        position = np.cumsum(keep) - 1
+        self.pool = position[self.pool[keep[self.pool]]]
+        self.samples = self.samples[keep]
+        self.plain_phi, self.psi = self.plain_phi[keep], self.psi[keep]
+        self.y, self.half, self.width = self.y[keep], self.half[keep], self.width[keep]
+
     def reach(self, share: float) -> tuple[float, float]:
         """Slack below which so large a share of all samples is expected: from leaving the bounds, from being too wide.
 
@@ -467,15 +436,19 @@ class Row:
         most = most or max(JOIN, 2 * (self.r + self.q))
         if len(outside) > most:
             outside = outside[np.argpartition(slack[outside], most)[:most]]
-        self.pool = np.concatenate([self.pool, outside])
+        self.join(outside)
         return len(outside) > 0
+
+    def join(self, positions: Index) -> None:
+        """Let these held samples join the working set."""
+        self.pool = np.concatenate([self.pool, positions])
 
     def containment(self, pool: Index) -> tuple[Array, Array]:
         """Containment (8)(9) of some samples as G ξ >= h.
 
         Returns (2 K, r + q): G; Returns (2 K,): h.
         """
-        phi, psi = self._along(pool), self.psi[pool]
+        phi, psi = self.along(pool), self.psi[pool]
         y, half = self.y[pool], self.half[pool]
         return np.vstack([np.hstack([phi, psi]), np.hstack([-phi, psi])]), np.concatenate([y - half, -y - half])
 
@@ -492,249 +465,6 @@ class Row:
         H[self.r :, self.r :] = gram + 1e-13 * np.diag(diagonal)
         return H, np.concatenate([-weight * self.target, linear])
 
-    # --- programmes of this row on its working set ---
-
-    def _solve(
-        self,
-        kind: str,
-        objective: Callable[[float, float], tuple[Array, Array]],
-        G: Array,
-        h: Array,
-        lower: Array,
-        upper: Array,
-        any_solver: bool = False,
-    ) -> tuple[Array, str]:
-        """Solve a programme whose rows are some for each sample of the pool, from where the last of its kind ended.
-
-        objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
-        """
-        feasible = FEASIBLE if self.refined else ROUGH
-        last, per_sample = self._last.get(kind), len(h) // max(len(self.pool), 1)
-        start = None
-        if last is not None and last.active is not None and per_sample:
-            known = last.active[len(lower) : len(last.active) - len(self.asked)].reshape(per_sample, -1)
-            known = known[:, : len(self.pool)]  # the pool grows, but for discards
-            start = np.zeros(len(lower) + len(h) + len(self.asked), dtype=np.int32)
-            start[: len(lower)] = last.active[: len(lower)]
-            there = start[len(lower) : len(lower) + len(h)].reshape(per_sample, -1)
-            there[:, : known.shape[1]] = known
-        begin = np.zeros(len(lower)) if last is None else last.xi
-        if last is None and self.basis is None:
-            begin[: self.r] = self.scaled()[0]
-        G, h = self._asked(G, h)
-        for self.attempt in _ATTEMPTS:
-            try:
-                answer = solve_near(*objective(*self.attempt), G, h, lower, upper, begin, start, feasible)
-                break
-            except FitError:
-                continue
-        else:
-            if not any_solver:
-                raise FitError("DAQP could not solve the quadratic programme")
-            answer = solve_qp(*objective(*self.attempt), G, h, lower, upper, feasible=feasible)
-        self._last[kind] = answer
-        return answer.xi, answer.solver
-
-    def _asked(self, G: Array, h: Array) -> tuple[Array, Array]:
-        """Rows G ξ >= h, and what the structure asks of θ if that is no bound of an unknown."""
-        if not len(self.asked):
-            return G, h
-        rows = np.hstack([self.asked, np.zeros((len(self.asked), G.shape[1] - self.r))])
-        return np.vstack([G, rows]), np.concatenate([h, self.asked_limits])
-
-    def solve_quadratic(self) -> str:
-        """Solve (10) on the working set."""
-        answer, solver = self._solve(
-            "quadratic",
-            lambda factor, ridge: self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge),
-            *self.containment(self.pool),
-            self.lower,
-            self.upper,
-            any_solver=True,
-        )
-        self.store(answer)
-        return solver
-
-    def solve_regularised(self) -> str:
-        """Solve (11) with a little of the squared widths on the working set."""
-        size = self.r + self.q
-
-        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
-            H, f = self.hessian(self.plain, self.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
-            whole = REGULARISATION * np.eye(size + 1)
-            whole[:size, :size] = REGULARISATION * H
-            return whole, np.append(REGULARISATION * f, 1.0)
-
-        answer, solver = self._solve(
-            "regularised",
-            objective,
-            *self._rows(self.pool),
-            np.append(self.lower, 0.0),
-            np.append(self.upper, np.inf),
-        )
-        self._store_limited(answer)
-        return solver
-
-    def solve_linear(self) -> str:
-        """Solve (11) on the working set, by the simplex method."""
-        box = self.box
-        if box is not None and self._simplex is None:
-            self._unit = float(np.median(self.width[self.pool] if len(self.pool) else self.width))
-        G, h = self._rows(self.pool) if box is None else self._distances(self.pool)
-        kinds = 3 if box is None else 2
-        number = kinds * np.tile(self.samples.index[self.pool], kinds) + np.repeat(np.arange(kinds), len(self.pool))
-        there = np.zeros((kinds, len(self.samples)), dtype=bool)  # rows that the simplex method has
-        if self._simplex is None:  # of each sample the side that it is on, and its width
-            self._simplex = self._minimax() if box is None else self._nearest()
-            theta, d = self.scaled()
-            away = self.plain_phi[self.pool] @ theta - self.y[self.pool]
-            half = self.psi[self.pool] @ d + self.half[self.pool]
-            outside = np.concatenate([away + half, half - away]) < 0.0
-            width = outside.reshape(2, -1).any(axis=0)
-            wanted = np.concatenate([outside, width]) if box is None else outside
-        else:
-            wanted = G @ self._simplex.solution() - h < -TOLERANCE
-            idle = self._simplex.idle(_HELD * (G.shape[1] - 1))
-            idle = idle[idle >= len(self.asked)]  # those come first, and stay
-            if len(idle):
-                self._simplex.drop(idle)
-                self._known = np.delete(self._known, idle - len(self.asked))
-        there[self._known % kinds, np.searchsorted(self.samples.index, self._known // kinds)] = True
-        others = ~there[:, self.pool].ravel()
-        while True:  # of a sample few have more than one row that matters
-            wanted &= others
-            if wanted.any():
-                self._simplex.add(G[wanted], h[wanted])
-                self._known = np.concatenate([self._known, number[wanted]])
-                others &= ~wanted
-            answer = self._simplex.solve()
-            wanted = G @ answer - h < -TOLERANCE
-            if not (wanted & others).any():
-                break
-        if box is not None:
-            delta = answer[-1] * self._unit
-            answer = np.concatenate([answer[:-1], box * delta, [delta]])
-        self.least = float(answer[-1])
-        self._store_limited(answer)
-        return "HiGHS simplex"
-
-    @property
-    def box(self) -> Array | None:
-        """Scaled half-widths with which every sample is as wide as any other, by 1 in units of the limit.
-
-        With them the largest distance of a recorded next sample from the centre is all that (11) has to make small:
-        where half-widths exceed it nowhere, those of one size do so nowhere either. So the nominal elements are the
-        only unknowns of δ, and what other half-widths are among its optima is left to the ties. None where the
-        structure or the recordings have no such half-widths.
-        """
-        sums, columns = self.sums, self._columns
-        least_known = self.fixed_d.any() or (self.lower[self.r :] > 0.0).any()
-        if least_known or sums.gram is not None or sums.coupled is not None or not len(self.samples):
-            return None
-        for k, term in enumerate(columns.half, start=len(sums.low)):
-            wanted, found = np.zeros((columns.count, len(self.d) // columns.count)), np.zeros(len(self.d))
-            wanted[:, k] = 1.0
-            unknown = wanted.ravel()[self.free_psi]
-            self.psi_columns.put(found, unknown)
-            there = self.size_unit > 0.0  # the others are 0 in every sample
-            constant = not term.times_dt or sums.dt_min == sums.dt_max
-            all_of_it = np.array_equal(found[there], wanted.ravel()[there])
-            if constant and all_of_it and np.isinf(self.upper[self.r :][unknown > 0.0]).all():
-                box = unknown / (self.unit_psi * self.scale)
-                return np.asarray(box / (self.width[0] * float(self.psi[0] @ box)))
-        return None
-
-    def _distances(self, pool: Index) -> tuple[Array, Array]:
-        """G [θ δ] >= h: the centre of samples of the pool is no further from the next sample than δ allows.
-
-        δ is in units of order one, whatever the weights are.
-        """
-        width = self.width[pool] / self._unit
-        unit = np.minimum(1.0, 1.0 / width)
-        phi, y = self._along(pool) * (width * unit)[:, None], self.y[pool] * width * unit
-        sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
-        return np.vstack(sides), np.concatenate([y, -y])
-
-    def _nearest(self) -> Simplex:
-        """As `_minimax`, of the nominal elements alone."""
-        cost = np.append(np.zeros(self.r), 1.0)
-        simplex = Simplex(cost, np.append(self.lower[: self.r], 0.0), np.append(self.upper[: self.r], np.inf))
-        simplex.add(*self._asked(np.empty((0, len(cost))), np.empty(0)))
-        return simplex
-
-    def least_width(self) -> float:
-        """A lower bound of δ, in units of scale: by multipliers, or the optimum on the samples that decide it."""
-        assert self.limit is not None
-        xi = np.concatenate([*self.scaled(), [self.limit]])
-        cost = np.append(np.zeros(len(xi) - 1), 1.0)
-        low, high = np.append(self.lower, 0.0), np.append(self.upper, np.inf)
-        bound = linear_bound(cost, *self._rows(self.pool), low, high, xi)
-        if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
-            return bound
-        inside, room = self.slacks()
-        assert room is not None
-        few = 2 * (self.r + self.q)
-        inside, room = inside[self.pool], room[self.pool]
-        least = np.argpartition(room, few)[:few] if len(room) > few else np.arange(len(room))
-        decisive = np.union1d(np.flatnonzero(inside < 1e-7), least)
-        bound = max(bound, 0.0)
-        for pool in (self.pool[decisive], self.pool):
-            simplex = self._minimax()
-            simplex.add(*self._rows(pool))
-            bound = max(bound, float(simplex.solve()[-1]))
-            if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
-                break
-        return bound
-
-    def _minimax(self) -> Simplex:
-        """Minimise δ, the last unknown."""
-        cost = np.append(np.zeros(self.r + self.q), 1.0)
-        simplex = Simplex(cost, np.append(self.lower, 0.0), np.append(self.upper, np.inf))
-        simplex.add(*self._asked(np.empty((0, len(cost))), np.empty(0)))
-        return simplex
-
-    def duality_gap(self) -> float:
-        """How far the squared widths of this row are above the optimum at most, relative to it, by the dual objective.
-
-        The programme that is solved adds the tie-break and the ridge to the squared widths; both are bounded. inf
-        where the columns are so collinear that the ridge is not.
-        """
-        if not self.unknown:
-            return 0.0
-        theta, d = self.scaled()
-        factor, ridge = self.attempt
-        if self.basis is not None:
-            theta = np.linalg.lstsq(self.basis, theta, rcond=None)[0].astype(np.float64)
-        H, f = self.hessian(self.gram, self.linear, factor * TIE_BREAK, ridge)
-        xi = np.concatenate([theta, d])
-        bound = dual_bound(H, f, *self._asked(*self.containment(self.pool)), self.lower, self.upper, xi)
-        value = max(self.value(d), self.least_value())
-        weight = factor * TIE_BREAK * float(np.diagonal(self.gram).min(initial=1.0))
-        spread = max(float(d @ self.plain @ d), 0.0)
-        smallest = self._least_effect()
-        largest = (self.rms_step / self.scale + np.sqrt(spread) + float(np.abs(self.half).max(initial=0.0))) ** 2
-        lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
-        ties = factor * TIE_BREAK * (1.0 if self.sums.gram is None else float(len(d)))
-        return float(max(0.5 * xi @ H @ xi + f @ xi - bound, 0.0) + lifted) / value + ties
-
-    def _least_effect(self) -> float:
-        """Least mean square effect that unknowns of unit length have on the centre, but for those that have none.
-
-        A state or control that schedules the model moves with the drift of all knots: some elements can change
-        together without moving any sample, and of those no one needs to be large.
-        """
-        free = np.isinf(self.lower[: self.r]) & np.isinf(self.upper[: self.r])
-        values, directions = np.linalg.eigh(self.centre)
-        for value, direction in zip(values.tolist(), directions.T, strict=True):
-            if value > 1e-13 or not free[np.abs(direction) > COLLINEAR].all():
-                return float(value)
-            if (
-                np.abs(self.plain_phi @ (direction if self.basis is None else self.basis @ direction)).max(initial=0.0)
-                > COLLINEAR
-            ):
-                return float(value)
-        return 1.0
-
     def among(self, coupled: Array, widths: list[Array]) -> None:
         """Take the row's part of (10) with full weights, given the other rows, as its own.
 
@@ -750,29 +480,6 @@ class Row:
         self.gram = gram / self.largest
         self.linear = self.psi_columns.take(coupled[mine] @ fixed) * unit / self.largest
 
-    def solve_among(self) -> str:
-        """(10) with full weights, of this row given the others.
-
-        If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
-        row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
-        """
-        try:
-            return self.solve_quadratic()
-        except FitError:
-            steep = float(np.abs(self.linear).max(initial=0.0))
-            if steep <= 1.0:
-                raise
-        G, h = self._asked(*self.containment(self.pool))
-        if -self.linear.min() >= self.linear.max():
-            H, f = self.hessian(self.gram, self.linear, TIE_BREAK)
-            answer = solve_qp(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep)
-            self.store(answer.xi * steep)
-            return answer.solver
-        simplex = Simplex(np.concatenate([np.zeros(self.r), self.linear / steep]), self.lower, self.upper)
-        simplex.add(G, h)
-        self.store(simplex.solve())
-        return "HiGHS simplex"
-
     def value(self, d: Array) -> float:
         """Return half the mean of the squared half-widths of all samples, in scaled units.
 
@@ -783,10 +490,6 @@ class Row:
     def least_value(self) -> float:
         """Return the `value` of an envelope so narrow that it is rounding."""
         return 0.125 * (LEAST * self.rms_step / self.scale) ** 2
-
-    def collinear(self) -> bool:
-        """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope."""
-        return self.r > 0 and not self.refined and self._least_effect() < 1e-8
 
     @property
     def rms_step(self) -> float:
@@ -811,34 +514,9 @@ class Row:
         """
         self.theta, self.d, self.kept = answer
 
-    def least_linear(self, cost: Array, most: Array | None = None) -> float:
-        """Minimise costᵀ d over scaled half-widths that contain the working set.
-
-        `cost` (q,): of the free half-widths; `most` (q,): they are no larger than this.
-        """
-        upper = self.upper.copy()
-        if most is not None:
-            upper[self.r :] = np.minimum(upper[self.r :], most)
-        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, upper)
-        simplex.add(*self._asked(*self.containment(self.pool)))
-        return float(cost @ simplex.solve()[self.r :])
-
-    def linear_gap(self) -> float:
-        """As `duality_gap`, by the simplex method.
-
-        (10) is convex, so its optimum is no less than its linearisation here at any elements that contain
-        the working set. It needs neither multipliers nor a Hessian that can be inverted.
-        """
-        _, d = self.scaled()
-        slope = self.gram @ d + self.linear
-        largest = float(np.abs(slope).max(initial=0.0))
-        if largest == 0.0:
-            return 0.0
-        try:
-            least = self.least_linear(slope / largest) * largest
-        except FitError:
-            return np.inf
-        return max(float(slope @ d) - least, 0.0) / max(self.value(d), self.least_value())
+    def take(self, theta: Array, d: Array, limit: float | None = None) -> None:
+        """Take elements, and what (11) allows, as they are."""
+        self.theta, self.d, self.limit = theta, d, limit
 
     def lifted_loss(self) -> float:
         """Estimate what lifting the half-widths over the violation that is left adds to the optimum."""
@@ -851,107 +529,3 @@ class Row:
             return outside * slope / max(self.value(d), self.least_value())
         least = LEAST * self.rms_step / self.limit_unit * float(self.samples.root_weight.max(initial=0.0))
         return outside * float(self.width.max(initial=0.0)) / max(self.limit, least, 1e-300)
-
-    def _rows(self, pool: Index) -> tuple[Array, Array]:
-        """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
-        G, h = self.containment(pool)
-        width = self.width[pool]
-        unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
-        rows = np.hstack([np.zeros((len(pool), self.r)), -width[:, None] * self.psi[pool], np.ones((len(pool), 1))])
-        return (
-            np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]),
-            np.concatenate([h, width * self.half[pool] * unit[:, 0]]),
-        )
-
-    def solve_bounded(self) -> str:
-        """Least squared widths, then the centre, among what is as good by (11), sought from an optimum of it.
-
-        The set is so thin that a solver finds its way only if the step is held back at first; and if it finds none,
-        containment gets some room, which the repair covers.
-        """
-        assert self.limit is not None and self._simplex is not None
-        (point, box), pool = (self._simplex.solution(), self.box), self.pool
-        point = point[:-1] if box is None else np.concatenate([point[:-1], box * (point[-1] * self._unit)])
-        G, h = self.containment(pool)
-        width = self.width[pool]
-        unit = np.minimum(1.0, 1.0 / width)
-        rows = np.hstack([np.zeros((len(pool), self.r)), -(width * unit)[:, None] * self.psi[pool]])
-        limits = (width * self.half[pool] - self.allowed) * unit
-        G, h = self._asked(np.vstack([G, rows]), np.concatenate([h, limits]))
-        h = np.minimum(h - G @ point, 0.0)  # the point satisfies them, but for rounding
-        H, f = self.hessian(self.plain, self.plain_linear, BOUNDED_TIE_BREAK)
-        f, largest = f + H @ point, float(np.diagonal(H).max())
-        step, solver, contained = np.zeros(len(point)), "HiGHS simplex", 2 * len(pool)
-        around, active = h[:contained].copy(), None
-        for room in _ROOM:
-            h[:contained] -= room
-            for share in _HOLD:
-                hold = share * largest
-                try:
-                    held = H + hold * np.eye(len(step)), f - hold * step
-                    low, high = self.lower - point, self.upper - point
-                    feasible = _ROOM[-1] if self.refined else FEASIBLE
-                    answer = solve_near(*held, G, h, low, high, step, active, feasible, any_solver=True)
-                except FitError:
-                    break
-                left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
-                d = (point + answer.xi)[self.r :]
-                if (width * (self.psi[pool] @ d + self.half[pool] + left)).max(initial=0.0) > (
-                    1.0 + GOOD
-                ) * self.allowed:
-                    break
-                step, solver, active = answer.xi, answer.solver, answer.active
-            if step.any():
-                break
-        self.attempt = _ATTEMPTS[0]
-        self._store_limited(np.append(point + step, self.allowed))
-        return solver
-
-    def polish(self) -> None:
-        """Solve for the centre again, with the half-widths as they are: the tie-break on its own.
-
-        Beside the squared widths it weighs so little that their rounding shows in the elements.
-        """
-        if self.r == 0:
-            return
-        phi, psi = self._along(self.pool), self.psi[self.pool]
-        half = psi @ (self.d[self.free_psi] / (self.unit_psi * self.scale)) + self.half[self.pool]
-        y = self.y[self.pool]
-        try:
-            answer = solve_qp(
-                self.centre + self.attempt[1] * np.eye(self.r),
-                -self.target,
-                *self._asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
-                self.lower[: self.r],
-                self.upper[: self.r],
-                any_solver=False,
-                feasible=FEASIBLE if self.refined else ROUGH,
-            )
-        except FitError:  # the half-widths leave no room at all
-            return
-        self._store_theta(answer.xi)
-
-    def contradiction(self) -> tuple[int, float, int] | None:
-        """A sample that no elements within the structure can contain, alone or with others."""
-
-        def least(pool: Index) -> tuple[Array, Array, Array]:
-            simplex = self._minimax()
-            G, h = self.containment(pool)
-            simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
-            answer = simplex.solve()
-            prices = np.abs(simplex.duals()[len(self.asked) :]).reshape(2, -1).sum(axis=0)
-            return answer, (h - G @ answer[:-1]).reshape(2, -1).max(axis=0), prices
-
-        answer, short, prices = least(self.pool)
-        if answer[-1] <= 1e-9:
-            return None
-        against = np.flatnonzero(prices > 1e-9 * prices.max(initial=0.0))  # they prove that there is no answer
-        worst = int(against[np.argmax(short[against])]) if len(against) else int(np.argmax(short))
-        distance, together = float(answer[-1]), len(against) - 1
-        for position in against[np.argsort(-short[against])]:
-            alone = float(least(self.pool[[position]])[0][-1])
-            if alone > 1e-9:
-                worst, distance, together = int(position), alone, 0
-                break
-        sample = int(self.pool[worst])
-        return int(self.samples.index[sample]), distance * float(self._sizes(sample)) * self.scale, max(together, 0)

@@ -22,21 +22,12 @@ from uncertain_lti.base.cores import on_cores, one_by_one
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.identification.coupled import Coupled
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Samples
+from uncertain_lti.identification.programmes import GOOD, WIDTH_SLACK, Programmes
 from uncertain_lti.identification.regimes import tied_blocks
-from uncertain_lti.identification.row import (
-    GOOD,
-    JOIN,
-    LEAST,
-    ROUGH,
-    TIE_BREAK,
-    WIDTH_SLACK,
-    Chosen,
-    InfeasibleError,
-    Row,
-)
-from uncertain_lti.identification.solvers import dual_bound, solve_qp
+from uncertain_lti.identification.row import JOIN, LEAST, InfeasibleError, Row
 from uncertain_lti.identification.structure import Structure, narrowed
 
 _FURTHER = 2.5
@@ -111,14 +102,14 @@ class WorkingSet:
             Row(i, self.sums, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
             for i in range(fleet.n)
         ]
+        self.programmes = [Programmes(row) for row in self.rows]
         self.solvers: set[str] = set()
         self.rounds, self.passes = 0, 1
+        self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
-        self._together = False  # (10) with full weights: the rows share a programme
-        self._coupled_gap = np.inf
+        self._coupled: Coupled | None = None  # (10) with full weights: the rows share a programme
         self._like: Row | None = None  # the row that held samples last
-        self._least_eigenvalue: float | None = None  # of the full weights, once it is needed
 
     def quadratic(self) -> Solution:
         """Solve (10)."""
@@ -126,15 +117,15 @@ class WorkingSet:
             return self._coupled_quadratic()
         self._start(self._settle_quadratic)
         self._prove(self._settle_quadratic)
-        gaps = np.array(on_cores(Row.duality_gap, [(row,) for row in self.rows]))
+        gaps = np.array(on_cores(Programmes.duality_gap, [(own,) for own in self.programmes]))
         again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
         if again:
             before = {row.i: (row.answer(), self._lifted(row)) for row in again}
             self._again(again, self._settle_quadratic)
             for row in again:
-                gaps[row.i] = row.duality_gap()
+                gaps[row.i] = self.programmes[row.i].duality_gap()
                 if not gaps[row.i] + row.lifted_loss() <= GOOD:
-                    gaps[row.i] = min(gaps[row.i], row.linear_gap())
+                    gaps[row.i] = min(gaps[row.i], self.programmes[row.i].linear_gap())
                 answer, value = before[row.i]
                 now = self._lifted(row) if row.outside() <= max(1e-6, row.tolerance) else np.inf
                 if value <= now * (1.0 + GOOD):  # nothing gained: the elements stay
@@ -152,7 +143,7 @@ class WorkingSet:
             except InfeasibleError:
                 raise
             except FitError:
-                row.theta, row.d, row.limit = theta, d, limit
+                row.take(theta, d, limit)
 
         for group in self._groups(rows):
             on_cores(self._refine, [(row,) for row in group if not row.refined])
@@ -163,22 +154,22 @@ class WorkingSet:
         """Refine a row with the first samples at hand, which it may have released."""
         if not self.whole:
             self._hold(row, self._first[row.i])
-        row.refine()
+        self.programmes[row.i].refine()
 
     def _settle_quadratic(self, row: Row) -> None:
-        self._settle_or_refine(row, Row.solve_quadratic, polish=True)
+        self._settle_or_refine(row, Programmes.quadratic, polish=True)
 
-    def _settle_or_refine(self, row: Row, solve: Callable[[Row], str], polish: bool = False) -> None:
+    def _settle_or_refine(self, row: Row, solve: Callable[[Programmes], str], polish: bool = False) -> None:
         """Settle a row, in refined coordinates if it does not settle in those of its steps."""
         if not row.refined:
             try:
-                self._settle(row, solve, polish)
+                self._settle(self.programmes[row.i], solve, polish)
                 return
             except InfeasibleError:
                 raise
             except FitError:
-                row.refine()
-        self._settle(row, solve, polish)
+                self.programmes[row.i].refine()
+        self._settle(self.programmes[row.i], solve, polish)
 
     def _lifted(self, row: Row) -> float:
         """Part of the row in the objective of (10), with the half-widths lifted over what is violated."""
@@ -188,24 +179,23 @@ class WorkingSet:
 
     def _coupled_quadratic(self) -> Solution:
         """(10) with full weights: all rows in one programme, then one row after the other if that is not good."""
-        self._together = True
+        self._coupled = coupled = Coupled(self.fleet, self.sums, self.programmes, self.shared is not None)
         try:
             self._start(self._settle_coupled)
             self._prove(self._settle_coupled)
-            if not self._coupled_gap <= GOOD:
-                self._coupled_gap = min(self._coupled_gap, self._coupled_linear_gap())
-            if self._coupled_gap + self._coupled_loss() <= GOOD:
-                return replace(self._solution(), gap=self._coupled_gap)
+            gap = coupled.gap if coupled.gap <= GOOD else min(coupled.gap, coupled.linear_gap())
+            if gap + coupled.loss() <= GOOD:
+                return replace(self._solution(), gap=gap)
         except InfeasibleError:
             raise
         except FitError:
             pass
         for row in self.rows:
             if not row.refined:
-                row.refine()
+                self.programmes[row.i].refine()
         self._settle_in_turn(self.rows[0])
         self._prove(self._settle_in_turn)
-        return replace(self._solution(), gap=self._coupled_linear_gap())
+        return replace(self._solution(), gap=coupled.linear_gap())
 
     def _settle_in_turn(self, _: Row) -> None:
         """(10) with full weights by one row at a time, the others as they are.
@@ -219,7 +209,7 @@ class WorkingSet:
             for row in self.rows:
                 if row.unknown:
                     row.among(self.sums.coupled, [other.d for other in self.rows])
-                self._settle(row, Row.solve_among, polish=True)
+                self._settle(self.programmes[row.i], Programmes.among, polish=True)
             flat = np.concatenate([row.d for row in self.rows])
             value = float(flat @ self.sums.coupled @ flat)
             if value >= before * (1.0 - 1e-11):
@@ -231,23 +221,22 @@ class WorkingSet:
         deltas = np.zeros(self.fleet.n)
 
         def settle(row: Row) -> None:
-            if not row.exact:
+            if not self.programmes[row.i].exact:
                 try:
-                    self._settle(row, Row.solve_regularised, polish=True)
+                    self._settle(self.programmes[row.i], Programmes.regularised, polish=True)
                 except InfeasibleError:
                     raise
                 except FitError:
-                    row.exact = True
-            if row.exact:
-                row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
-                self._settle_or_refine(row, Row.solve_linear)
+                    self.programmes[row.i].to_simplex()
+            if self.programmes[row.i].exact:
+                row.bound(None if row.limit is None else float(deltas[row.i]) / row.limit_unit)
+                self._settle_or_refine(row, Programmes.linear)
             if row.limit is None:  # nothing unknown: the structure fixes the widths
-                row.limit = float((row.width * row.half).max(initial=0.0))
-            deltas[row.i] = row.limit * row.limit_unit
-            row.limit *= 1.0 + WIDTH_SLACK
-            row.allowed = row.limit
-            if row.exact:
-                self._settle(row, Row.solve_bounded, polish=True)
+                row.bound(float((row.width * row.half).max(initial=0.0)))
+            deltas[row.i] = (row.limit or 0.0) * row.limit_unit
+            self.programmes[row.i].allow()
+            if self.programmes[row.i].exact:
+                self._settle(self.programmes[row.i], Programmes.bounded, polish=True)
 
         self._start(settle)
         self._prove(settle)
@@ -255,21 +244,23 @@ class WorkingSet:
         bounds = deltas.copy()
         bounds[[row.i for row in unknown]] = on_cores(self._least_width, [(row,) for row in unknown])
         above = deltas > (1.0 + WIDTH_SLACK) * bounds + 1e-13 * np.array([row.scale for row in self.rows])
-        again = [row for row in unknown if above[row.i] and not row.exact]
+        again = [row for row in unknown if above[row.i] and not self.programmes[row.i].exact]
         for row in again:
-            row.exact = True
+            self.programmes[row.i].to_simplex()
         if again:  # the weight relative to δ was too large for these rows
             self._each(again, settle)
             self._prove(settle, again)
         again = [
             row
             for row in self.rows
-            if row.unknown and (row.collinear() or not self._above(row, bounds) <= GOOD) and not row.refined
+            if row.unknown
+            and (self.programmes[row.i].collinear() or not self._above(row, bounds) <= GOOD)
+            and not row.refined
         ]
         if again:
             before = {row.i: (row.answer(), self._largest_width(row)) for row in again}
             for row in again:
-                row.exact = True
+                self.programmes[row.i].to_simplex()
             self._again(again, settle)
             for row in again:
                 bounds[row.i] = self._least_width(row)
@@ -280,11 +271,11 @@ class WorkingSet:
 
     def _least_width(self, row: Row) -> float:
         """A lower bound of δ."""
-        if row.exact:
-            return row.least * row.limit_unit
+        if self.programmes[row.i].exact:
+            return self.programmes[row.i].least * row.limit_unit
         self.solvers.add("HiGHS simplex")
         try:
-            return row.least_width() * row.limit_unit
+            return self.programmes[row.i].least_width() * row.limit_unit
         except FitError:
             return -np.inf
 
@@ -312,7 +303,7 @@ class WorkingSet:
         violated.
         """
         for row in self.rows:
-            row.theta, row.d, row.limit = theta[:, row.i], d[:, row.i], None
+            row.take(theta[:, row.i], d[:, row.i])
         everything = np.full(self.fleet.n, np.inf)
         found = self.fleet.scan(self._candidate(everything, everything, 1, self.rows))
         for row, (samples, _) in zip(self.rows, found, strict=True):
@@ -321,14 +312,14 @@ class WorkingSet:
 
     def _solution(self, delta: Array | None = None) -> Solution:
         for row in self.rows:  # a solver may stop close to what cannot be
-            if row.outside() > 1e-8 and (found := row.contradiction()):
+            if row.outside() > 1e-8 and (found := self.programmes[row.i].contradiction()):
                 raise InfeasibleError(row.i, *found)
         return Solution(
             np.column_stack([row.theta for row in self.rows]),
             np.column_stack([row.d for row in self.rows]),
             np.array([row.outside() * row.scale if row.kept is None else row.kept for row in self.rows]),
             delta,
-            self.rounds + sum(row.rounds for row in self.rows),
+            self.rounds + int(self._row_rounds.sum()),
             self.passes,
             [len(row.pool) for row in self.rows],
             self.solvers,
@@ -346,7 +337,7 @@ class WorkingSet:
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
         """Settle rows on all cores, which the solvers do without the lock; those that share a programme at once."""
-        if self._together:
+        if self._coupled is not None:
             settle(rows[0])
             return
         began = said = perf_counter()
@@ -359,7 +350,7 @@ class WorkingSet:
 
     def _groups(self, rows: list[Row]) -> list[list[Row]]:
         """Rows whose samples fit in memory together; with full weights, all."""
-        if self._together or self.whole:
+        if self._coupled is not None or self.whole:
             return [rows]
         columns, count = self.fleet.columns, self.fleet.columns.count
         each = 8 * SUBSAMPLE * (3 * self.fleet.p + len(columns.nominal) + len(columns.half)) * count
@@ -411,7 +402,7 @@ class WorkingSet:
             ]
             if not again:
                 return
-            rows = self.rows if self._together else again
+            rows = self.rows if self._coupled is not None else again
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
     def _candidate(self, reach: Array, room: Array, most: int, rows: list[Row]) -> Candidate:
@@ -471,17 +462,18 @@ class WorkingSet:
 
     # --- held samples ---
 
-    def _settle(self, row: Row, solve: Callable[[Row], str], polish: bool = False) -> None:
+    def _settle(self, own: Programmes, solve: Callable[[Programmes], str], polish: bool = False) -> None:
+        row = own.row
         for number in range(MAX_ROUNDS if row.refined else FEW_ROUNDS):
             if row.unknown:
-                self._guarded(row, solve)
-            row.rounds += 1
+                self._guarded(own, solve)
+            self._row_rounds[row.i] += 1
             # most rows settle in 15 rounds; where rounding makes nearly every sample active, all of them may join
             most = None if number < 40 else max(JOIN, 2 * (row.r + row.q)) * 2 ** min(number - 40, 20)
             if row.unknown and row.widen_pool(most):
                 continue
             if polish and row.unknown:
-                row.polish()
+                own.polish()
             if not polish or not row.unknown or not row.widen_pool(most):
                 break
         else:
@@ -489,152 +481,28 @@ class WorkingSet:
         if not row.unknown:
             self._known_row(row)
 
-    def _guarded(self, row: Row, solve: Callable[[Row], str]) -> None:
+    def _guarded(self, own: Programmes, solve: Callable[[Programmes], str]) -> None:
         try:
-            self.solvers.add(solve(row))
+            self.solvers.add(solve(own))
         except FitError:
-            found = row.contradiction()
+            found = own.contradiction()
             if found is None:
                 raise
-            raise InfeasibleError(row.i, *found) from None
+            raise InfeasibleError(own.row.i, *found) from None
 
     def _known_row(self, row: Row) -> None:
         """A row that the structure fixes altogether must contain every sample but for rounding."""
         slack = row.slack() if row.limit is None else row.half - np.abs(row.y)
         worst = int(np.argmin(slack)) if len(slack) else 0
         if len(slack) and slack[worst] < -1e-9:
-            distance = float(-slack[worst] * row._sizes(worst) * row.scale)
+            distance = float(-slack[worst] * row.sizes(worst) * row.scale)
             raise InfeasibleError(row.i, int(row.samples.index[worst]), distance)
 
     def _settle_coupled(self, _: Row) -> None:
+        assert self._coupled is not None
         for _number in range(MAX_ROUNDS):
-            self._solve_coupled()
+            self.solvers.add(self._coupled.solve())
             self.rounds += 1
             if not any([row.widen_pool() for row in self.rows]):
                 return
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} rounds; scale the signals to order one")
-
-    def _solve_coupled(self) -> None:
-        """(10) with full weights, which couple the rows."""
-        assert self.sums.coupled is not None
-        rows, q_all = self.rows, len(self.sums.psi_scale)
-        kept = self._kept(q_all)
-        unit = np.concatenate([row.unit_psi * row.scale for row in rows])
-        fixed = np.concatenate([row.fixed_d for row in rows])
-        gram = kept.square(self.sums.coupled) * np.outer(unit, unit)
-        linear = kept.take(self.sums.coupled @ fixed) * unit
-        largest = float(np.diagonal(gram).max(initial=1e-300))
-        starts = np.concatenate([[0], np.cumsum([row.r + row.q for row in rows])])
-        where_d = np.concatenate([np.arange(starts[k] + row.r, starts[k + 1]) for k, row in enumerate(rows)])
-        H, f = np.zeros((starts[-1], starts[-1])), np.zeros(starts[-1])
-        parts = [row.containment(row.pool) for row in rows]
-        G = np.zeros((sum(len(h) for _, h in parts), starts[-1]))
-        line = 0
-        for k, (row, (block, _)) in enumerate(zip(rows, parts, strict=True)):
-            mine = slice(starts[k], starts[k + 1])
-            mine_psi = slice(row.i * q_all, (row.i + 1) * q_all)
-            diagonal = np.diagonal(row.psi_columns.square(self.sums.coupled[mine_psi, mine_psi]))
-            own = diagonal * (row.unit_psi * row.scale) ** 2 / largest
-            H[mine, mine], f[mine] = row.hessian(np.diag(own), np.zeros(row.q), TIE_BREAK)
-            G[line : line + len(block), mine] = block
-            line += len(block)
-        H[np.ix_(where_d, where_d)] = gram / largest + 1e-13 * np.diag(np.diagonal(gram) / largest)
-        f[where_d] = linear / largest
-        lower, upper = (np.concatenate([getattr(row, side) for row in rows]) for side in ("lower", "upper"))
-        h = np.concatenate([h for _, h in parts])
-        try:
-            answer = solve_qp(H, f, G, h, lower, upper, feasible=ROUGH)
-        except FitError:
-            for row in rows:
-                if found := row.contradiction():
-                    raise InfeasibleError(row.i, *found) from None
-            raise
-        self.solvers.add(answer.solver)
-        for k, row in enumerate(rows):
-            row.store(answer.xi[starts[k] : starts[k + 1]])
-        xi, d = answer.xi, answer.xi[where_d]
-        above = float(0.5 * xi @ H @ xi + f @ xi) - dual_bound(H, f, G, h, lower, upper, xi)
-        known = 0.5 * float(fixed @ self.sums.coupled @ fixed) / largest
-        value = 0.5 * float(d @ gram @ d) / largest + float(linear @ d) / largest + known
-        least = sum(row.least_value() * row.scale**2 * self._weight(row) for row in rows) / largest
-        lifted = 0.0
-        for row, mine in zip(rows, starts[:-1], strict=True):
-            smallest = float(np.linalg.eigvalsh(row.centre)[0]) if row.r else 1.0
-            weight = float(np.diagonal(H)[mine : mine + row.r].max(initial=0.0))
-            size = (row.rms_step / row.scale + float(np.abs(row.half).max(initial=0.0))) ** 2
-            lifted += 0.5 * weight * 1e-10 * 16.0 * size / smallest if smallest > 1e-13 else np.inf
-        # a tie-break per row, of full weights: no part of the squared widths, so measured against them
-        ties = TIE_BREAK * float(len(d))
-        self._coupled_gap = (max(above, 0.0) + lifted) / max(value, least, 1e-300) + ties
-        self._coupled_slope: Array = (gram @ d + linear) / largest
-        self._coupled_value = max(value, least, 1e-300)
-
-    def _kept(self, q: int) -> Chosen:
-        """The unknown half-widths of all rows among those of all, q per row."""
-        first = np.concatenate([row.i * q + row.free_psi for row in self.rows])
-        if self.shared is None:
-            return Chosen(first, None)
-        members, before = [], 0
-        for row in self.rows:
-            own = row.psi_columns.members
-            assert own is not None
-            members.append(np.where(own >= 0, own + before, -1))
-            before += row.q
-        return Chosen(first, np.concatenate(members))
-
-    def _at_most(self, row: Row) -> Array:
-        """Largest scaled half-widths that the optimum of (10) with full weights can have, (q,) of the free ones.
-
-        Σ w' W w over the samples is at least λ Σ w_ii w_i², with λ the least eigenvalue of any W whose diagonal is
-        scaled to ones; and no product of two half-widths of a row is negative, so that each alone is bounded. What
-        the row is now, lifted over what it violates, is no less than the optimum on the samples held.
-        """
-        assert self.sums.coupled is not None
-        if self._least_eigenvalue is None:
-            self._least_eigenvalue = self.fleet.least_eigenvalue()
-        flat = np.concatenate([other.d + other.outside() * other.size_unit * other.scale for other in self.rows])
-        square = 4.0 * float(flat @ self.sums.coupled @ flat)  # some room for what the structure does not let be lifted
-        mine = slice(row.i * len(row.d), (row.i + 1) * len(row.d))
-        own = row.psi_columns.take(np.diagonal(self.sums.coupled)[mine]) * (row.unit_psi * row.scale) ** 2
-        return np.asarray(np.sqrt(square / (max(self._least_eigenvalue, 1e-300) * np.maximum(own, 1e-300))))
-
-    def _weight(self, row: Row) -> float:
-        """Sum of w_ii over the transitions, about."""
-        assert self.sums.coupled is not None
-        q, scale = len(self.sums.psi_scale), self.sums.psi_scale
-        own = np.diagonal(self.sums.coupled)[row.i * q : (row.i + 1) * q]
-        there = scale > 0
-        return float(np.max(own[there] / scale[there] ** 2, initial=0.0))
-
-    def _coupled_loss(self) -> float:
-        """What lifting the half-widths over what is violated adds to the optimum, relative, about."""
-        lifts = np.concatenate([np.full(row.q, row.outside()) for row in self.rows])
-        return float(np.abs(self._coupled_slope) @ lifts) / self._coupled_value
-
-    def _coupled_linear_gap(self) -> float:
-        """As `Row.linear_gap`; the rows meet in the objective alone.
-
-        Unlike without full weights, the objective may fall as a half-width grows, by rounding at least: there the
-        linearisation has no minimum but for what the squared widths themselves allow (`_at_most`).
-        """
-        assert self.sums.coupled is not None
-        flat = np.concatenate([row.d for row in self.rows])
-        slopes = (self.sums.coupled @ flat).reshape(len(self.rows), -1)
-        least = sum(row.least_value() * row.scale**2 * self._weight(row) for row in self.rows)
-        value = max(0.5 * float(flat @ slopes.ravel()), least, 1e-300)
-        above = 0.0
-        for row, own in zip(self.rows, slopes, strict=True):
-            if not row.unknown:
-                continue
-            slope = row.psi_columns.take(own) * row.unit_psi * row.scale
-            largest = float(np.abs(slope).max(initial=0.0))
-            _, d = row.scaled()
-            falls = bool((slope < 0.0).any())
-            if not falls and largest * (float(d.sum()) + 1.0) <= 1e-12 * value:  # nothing to gain
-                continue
-            try:
-                most = self._at_most(row) if falls else np.full(row.q, np.inf)
-                above += float(slope @ d) - row.least_linear(slope / largest, most) * largest
-            except FitError:
-                return np.inf
-        return max(above, 0.0) / value

@@ -1,0 +1,536 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""The small programmes of a row on its working set: (10), (11), their ties, and what bounds them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
+from uncertain_lti.identification.solvers import (
+    FEASIBLE,
+    Answer,
+    Simplex,
+    dual_bound,
+    linear_bound,
+    solve_near,
+    solve_qp,
+)
+
+TIE_BREAK = 1e-8
+"""Weight of the squared distance of the centre relative to the squared half-widths.
+
+|rate - centre| <= half-width for every sample, so the sum of squared distances is at most that of squared half-widths,
+and the optimum of the sum is within TIE_BREAK (relative) of the optimum of (10) alone, with the centre that the stated
+tie-break asks for.
+"""
+ROUGH = 1e-4
+"""Violation, in scaled units, up to which a first answer is worth judging: how good it is, is measured at the end."""
+WIDTH_SLACK = 2e-8
+"""Relative room above δ of (11) in which its ties are broken: closer to δ, what they are is rounding."""
+BOUNDED_TIE_BREAK = 1e-5
+"""The same as TIE_BREAK among the optima of (11), a set so thin that the active-set solver needs the larger weight."""
+REGULARISATION = 1e-4
+"""Weight of the squared widths relative to δ in (11), for a solver of strictly convex programmes.
+
+With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
+of the squared widths. Whether it was is seen from the optimum of δ alone, at the end. With the unknowns of many blocks
+it seldom is small enough, so they are left to the simplex method at once.
+"""
+_ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
+_HELD = 12
+"""Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
+_HOLD = (1e-2, 1e-4, 1e-6)
+"""Shares of the largest weight with which the ties of (11) are held back to where they were, one after the other."""
+_ROOM = (1e-10, 1e-9, 1e-8)
+"""Violation, in scaled units, that they may leave, tried in turn: the set of optima can be as thin as that."""
+GOOD = 1e-7
+"""Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
+coordinates of its residual."""
+
+
+class Programmes:
+    """What solvers start from for a row, and its programmes; answers go to the row by its own methods.
+
+    `row`: whose samples and scaled unknowns they are; `like`: programmes of a row that is nearly the same.
+    """
+
+    def __init__(self, row: Row, like: Programmes | None = None) -> None:
+        self.row = row
+        self._unit = 1.0  # of the δ that the nominal elements alone decide, in units of the row's limit
+        self.allowed = 0.0  # δ that the ties may have, in the same units
+        self.exact = row.sums.visits.size > 1  # (11) by the simplex method
+        self.least = 0.0  # δ of (11) that it found, in the same units as the limit
+        self.attempt = _ATTEMPTS[0]
+        self._last: dict[str, Answer] = {}  # to the last programme of a kind
+        if like is not None:
+            self.attempt, self._last = like.attempt, dict(like._last)
+        self.drop_simplex()
+
+    def forget(self) -> None:
+        """Start solvers afresh: the coordinates are others."""
+        self.attempt, self._last = _ATTEMPTS[0], {}
+        self.drop_simplex()
+
+    def drop_simplex(self) -> None:
+        """Start the simplex method afresh: samples are gone."""
+        self._simplex: Simplex | None = None
+        self._known: Index = np.empty(0, dtype=np.intp)
+
+    def refine(self) -> None:
+        """Go over to refined coordinates of the row."""
+        self.row.refine()
+        self.forget()
+
+    def drop(self, index: int) -> None:
+        """Take a transition out of what the row holds."""
+        self.row.drop(index)
+        self.drop_simplex()
+
+    def trial(self) -> Programmes:
+        """Those of a copy of the row, which can be solved on its own."""
+        return Programmes(self.row.trial(), self)
+
+    def to_simplex(self) -> None:
+        """Solve (11) by the simplex method from now on."""
+        self.exact = True
+
+    def allow(self) -> None:
+        """Let the ties of (11) be broken a little above the δ that was found."""
+        row = self.row
+        assert row.limit is not None
+        self.allowed = row.limit * (1.0 + WIDTH_SLACK)
+        row.bound(self.allowed)
+
+    def _solve(
+        self,
+        kind: str,
+        objective: Callable[[float, float], tuple[Array, Array]],
+        G: Array,
+        h: Array,
+        lower: Array,
+        upper: Array,
+        any_solver: bool = False,
+    ) -> tuple[Array, str]:
+        """Solve a programme whose rows are some for each sample of the pool, from where the last of its kind ended.
+
+        objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
+        """
+        row = self.row
+        feasible = FEASIBLE if row.refined else ROUGH
+        last, per_sample = self._last.get(kind), len(h) // max(len(row.pool), 1)
+        start = None
+        if last is not None and last.active is not None and per_sample:
+            known = last.active[len(lower) : len(last.active) - len(row.asked)].reshape(per_sample, -1)
+            known = known[:, : len(row.pool)]  # the pool grows, but for discards
+            start = np.zeros(len(lower) + len(h) + len(row.asked), dtype=np.int32)
+            start[: len(lower)] = last.active[: len(lower)]
+            there = start[len(lower) : len(lower) + len(h)].reshape(per_sample, -1)
+            there[:, : known.shape[1]] = known
+        begin = np.zeros(len(lower)) if last is None else last.xi
+        if last is None and row.basis is None:
+            begin[: row.r] = row.scaled()[0]
+        G, h = self._with_asked(G, h)
+        for self.attempt in _ATTEMPTS:
+            try:
+                answer = solve_near(*objective(*self.attempt), G, h, lower, upper, begin, start, feasible)
+                break
+            except FitError:
+                continue
+        else:
+            if not any_solver:
+                raise FitError("DAQP could not solve the quadratic programme")
+            answer = solve_qp(*objective(*self.attempt), G, h, lower, upper, feasible=feasible)
+        self._last[kind] = answer
+        return answer.xi, answer.solver
+
+    def quadratic(self) -> str:
+        """Solve (10) on the working set."""
+        row = self.row
+        answer, solver = self._solve(
+            "quadratic",
+            lambda factor, ridge: row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge),
+            *row.containment(row.pool),
+            row.lower,
+            row.upper,
+            any_solver=True,
+        )
+        row.store(answer)
+        return solver
+
+    def regularised(self) -> str:
+        """Solve (11) with a little of the squared widths on the working set."""
+        row = self.row
+        size = row.r + row.q
+
+        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
+            H, f = row.hessian(row.plain, row.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
+            whole = REGULARISATION * np.eye(size + 1)
+            whole[:size, :size] = REGULARISATION * H
+            return whole, np.append(REGULARISATION * f, 1.0)
+
+        answer, solver = self._solve(
+            "regularised",
+            objective,
+            *self.rows(row.pool),
+            np.append(row.lower, 0.0),
+            np.append(row.upper, np.inf),
+        )
+        row.store_limited(answer)
+        return solver
+
+    def linear(self) -> str:
+        """Solve (11) on the working set, by the simplex method."""
+        row = self.row
+        box = self.box
+        if box is not None and self._simplex is None:
+            self._unit = float(np.median(row.width[row.pool] if len(row.pool) else row.width))
+        G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
+        kinds = 3 if box is None else 2
+        number = kinds * np.tile(row.samples.index[row.pool], kinds) + np.repeat(np.arange(kinds), len(row.pool))
+        there = np.zeros((kinds, len(row.samples)), dtype=bool)  # rows that the simplex method has
+        if self._simplex is None:  # of each sample the side that it is on, and its width
+            self._simplex = self.minimax() if box is None else self._nearest()
+            theta, d = row.scaled()
+            away = row.plain_phi[row.pool] @ theta - row.y[row.pool]
+            half = row.psi[row.pool] @ d + row.half[row.pool]
+            outside = np.concatenate([away + half, half - away]) < 0.0
+            width = outside.reshape(2, -1).any(axis=0)
+            wanted = np.concatenate([outside, width]) if box is None else outside
+        else:
+            wanted = G @ self._simplex.solution() - h < -TOLERANCE
+            idle = self._simplex.idle(_HELD * (G.shape[1] - 1))
+            idle = idle[idle >= len(row.asked)]  # those come first, and stay
+            if len(idle):
+                self._simplex.drop(idle)
+                self._known = np.delete(self._known, idle - len(row.asked))
+        there[self._known % kinds, np.searchsorted(row.samples.index, self._known // kinds)] = True
+        others = ~there[:, row.pool].ravel()
+        while True:  # of a sample few have more than one row that matters
+            wanted &= others
+            if wanted.any():
+                self._simplex.add(G[wanted], h[wanted])
+                self._known = np.concatenate([self._known, number[wanted]])
+                others &= ~wanted
+            answer = self._simplex.solve()
+            wanted = G @ answer - h < -TOLERANCE
+            if not (wanted & others).any():
+                break
+        if box is not None:
+            delta = answer[-1] * self._unit
+            answer = np.concatenate([answer[:-1], box * delta, [delta]])
+        self.least = float(answer[-1])
+        row.store_limited(answer)
+        return "HiGHS simplex"
+
+    @property
+    def box(self) -> Array | None:
+        """Scaled half-widths with which every sample is as wide as any other, by 1 in units of the limit.
+
+        With them the largest distance of a recorded next sample from the centre is all that (11) has to make small:
+        where half-widths exceed it nowhere, those of one size do so nowhere either. So the nominal elements are the
+        only unknowns of δ, and what other half-widths are among its optima is left to the ties. None where the
+        structure or the recordings have no such half-widths.
+        """
+        row = self.row
+        sums, columns = row.sums, row._columns
+        least_known = row.fixed_d.any() or (row.lower[row.r :] > 0.0).any()
+        if least_known or sums.gram is not None or sums.coupled is not None or not len(row.samples):
+            return None
+        for k, term in enumerate(columns.half, start=len(sums.low)):
+            wanted, found = np.zeros((columns.count, len(row.d) // columns.count)), np.zeros(len(row.d))
+            wanted[:, k] = 1.0
+            unknown = wanted.ravel()[row.free_psi]
+            row.psi_columns.put(found, unknown)
+            there = row.size_unit > 0.0  # the others are 0 in every sample
+            constant = not term.times_dt or sums.dt_min == sums.dt_max
+            all_of_it = np.array_equal(found[there], wanted.ravel()[there])
+            if constant and all_of_it and np.isinf(row.upper[row.r :][unknown > 0.0]).all():
+                box = unknown / (row.unit_psi * row.scale)
+                return np.asarray(box / (row.width[0] * float(row.psi[0] @ box)))
+        return None
+
+    def _distances(self, pool: Index) -> tuple[Array, Array]:
+        """G [θ δ] >= h: the centre of samples of the pool is no further from the next sample than δ allows.
+
+        δ is in units of order one, whatever the weights are.
+        """
+        row = self.row
+        width = row.width[pool] / self._unit
+        unit = np.minimum(1.0, 1.0 / width)
+        phi, y = row.along(pool) * (width * unit)[:, None], row.y[pool] * width * unit
+        sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
+        return np.vstack(sides), np.concatenate([y, -y])
+
+    def _nearest(self) -> Simplex:
+        """As `minimax`, of the nominal elements alone."""
+        row = self.row
+        cost = np.append(np.zeros(row.r), 1.0)
+        simplex = Simplex(cost, np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf))
+        simplex.add(*self._with_asked(np.empty((0, len(cost))), np.empty(0)))
+        return simplex
+
+    def least_width(self) -> float:
+        """A lower bound of δ, in units of scale: by multipliers, or the optimum on the samples that decide it."""
+        row = self.row
+        assert row.limit is not None
+        xi = np.concatenate([*row.scaled(), [row.limit]])
+        cost = np.append(np.zeros(len(xi) - 1), 1.0)
+        low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
+        bound = linear_bound(cost, *self.rows(row.pool), low, high, xi)
+        if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+            return bound
+        inside, room = row.slacks()
+        assert room is not None
+        few = 2 * (row.r + row.q)
+        inside, room = inside[row.pool], room[row.pool]
+        least = np.argpartition(room, few)[:few] if len(room) > few else np.arange(len(room))
+        decisive = np.union1d(np.flatnonzero(inside < 1e-7), least)
+        bound = max(bound, 0.0)
+        for pool in (row.pool[decisive], row.pool):
+            simplex = self.minimax()
+            simplex.add(*self.rows(pool))
+            bound = max(bound, float(simplex.solve()[-1]))
+            if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+                break
+        return bound
+
+    def minimax(self) -> Simplex:
+        """Minimise δ, the last unknown."""
+        row = self.row
+        cost = np.append(np.zeros(row.r + row.q), 1.0)
+        simplex = Simplex(cost, np.append(row.lower, 0.0), np.append(row.upper, np.inf))
+        simplex.add(*self._with_asked(np.empty((0, len(cost))), np.empty(0)))
+        return simplex
+
+    def duality_gap(self) -> float:
+        """How far the squared widths of this row are above the optimum at most, relative to it, by the dual objective.
+
+        The programme that is solved adds the tie-break and the ridge to the squared widths; both are bounded. inf
+        where the columns are so collinear that the ridge is not.
+        """
+        row = self.row
+        if not row.unknown:
+            return 0.0
+        theta, d = row.scaled()
+        factor, ridge = self.attempt
+        if row.basis is not None:
+            theta = np.linalg.lstsq(row.basis, theta, rcond=None)[0].astype(np.float64)
+        H, f = row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
+        xi = np.concatenate([theta, d])
+        bound = dual_bound(H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper, xi)
+        value = max(row.value(d), row.least_value())
+        weight = factor * TIE_BREAK * float(np.diagonal(row.gram).min(initial=1.0))
+        spread = max(float(d @ row.plain @ d), 0.0)
+        smallest = self._least_effect()
+        largest = (row.rms_step / row.scale + np.sqrt(spread) + float(np.abs(row.half).max(initial=0.0))) ** 2
+        lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
+        ties = factor * TIE_BREAK * (1.0 if row.sums.gram is None else float(len(d)))
+        return float(max(0.5 * xi @ H @ xi + f @ xi - bound, 0.0) + lifted) / value + ties
+
+    def _least_effect(self) -> float:
+        """Least mean square effect that unknowns of unit length have on the centre, but for those that have none.
+
+        A state or control that schedules the model moves with the drift of all knots: some elements can change
+        together without moving any sample, and of those no one needs to be large.
+        """
+        row = self.row
+        free = np.isinf(row.lower[: row.r]) & np.isinf(row.upper[: row.r])
+        values, directions = np.linalg.eigh(row.centre)
+        for value, direction in zip(values.tolist(), directions.T, strict=True):
+            if value > 1e-13 or not free[np.abs(direction) > COLLINEAR].all():
+                return float(value)
+            if (
+                np.abs(row.plain_phi @ (direction if row.basis is None else row.basis @ direction)).max(initial=0.0)
+                > COLLINEAR
+            ):
+                return float(value)
+        return 1.0
+
+    def among(self) -> str:
+        """(10) with full weights, of this row given the others.
+
+        If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
+        row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
+        """
+        row = self.row
+        try:
+            return self.quadratic()
+        except FitError:
+            steep = float(np.abs(row.linear).max(initial=0.0))
+            if steep <= 1.0:
+                raise
+        G, h = self._with_asked(*row.containment(row.pool))
+        if -row.linear.min() >= row.linear.max():
+            H, f = row.hessian(row.gram, row.linear, TIE_BREAK)
+            answer = solve_qp(H, f / steep, G, h / steep, row.lower / steep, row.upper / steep)
+            row.store(answer.xi * steep)
+            return answer.solver
+        simplex = Simplex(np.concatenate([np.zeros(row.r), row.linear / steep]), row.lower, row.upper)
+        simplex.add(G, h)
+        row.store(simplex.solve())
+        return "HiGHS simplex"
+
+    def collinear(self) -> bool:
+        """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope."""
+        return self.row.r > 0 and not self.row.refined and self._least_effect() < 1e-8
+
+    def least_linear(self, cost: Array, most: Array | None = None) -> float:
+        """Minimise costᵀ d over scaled half-widths that contain the working set.
+
+        `cost` (q,): of the free half-widths; `most` (q,): they are no larger than this.
+        """
+        row = self.row
+        upper = row.upper.copy()
+        if most is not None:
+            upper[row.r :] = np.minimum(upper[row.r :], most)
+        simplex = Simplex(np.concatenate([np.zeros(row.r), cost]), row.lower, upper)
+        simplex.add(*self._with_asked(*row.containment(row.pool)))
+        return float(cost @ simplex.solve()[row.r :])
+
+    def linear_gap(self) -> float:
+        """As `duality_gap`, by the simplex method.
+
+        (10) is convex, so its optimum is no less than its linearisation here at any elements that contain
+        the working set. It needs neither multipliers nor a Hessian that can be inverted.
+        """
+        row = self.row
+        _, d = row.scaled()
+        slope = row.gram @ d + row.linear
+        largest = float(np.abs(slope).max(initial=0.0))
+        if largest == 0.0:
+            return 0.0
+        try:
+            least = self.least_linear(slope / largest) * largest
+        except FitError:
+            return np.inf
+        return max(float(slope @ d) - least, 0.0) / max(row.value(d), row.least_value())
+
+    def rows(self, pool: Index) -> tuple[Array, Array]:
+        """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
+        row = self.row
+        G, h = row.containment(pool)
+        width = row.width[pool]
+        unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
+        rows = np.hstack([np.zeros((len(pool), row.r)), -width[:, None] * row.psi[pool], np.ones((len(pool), 1))])
+        return (
+            np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]),
+            np.concatenate([h, width * row.half[pool] * unit[:, 0]]),
+        )
+
+    def bounded(self) -> str:
+        """Least squared widths, then the centre, among what is as good by (11), sought from an optimum of it.
+
+        The set is so thin that a solver finds its way only if the step is held back at first; and if it finds none,
+        containment gets some room, which the repair covers.
+        """
+        row = self.row
+        assert row.limit is not None and self._simplex is not None
+        (point, box), pool = (self._simplex.solution(), self.box), row.pool
+        point = point[:-1] if box is None else np.concatenate([point[:-1], box * (point[-1] * self._unit)])
+        G, h = row.containment(pool)
+        width = row.width[pool]
+        unit = np.minimum(1.0, 1.0 / width)
+        rows = np.hstack([np.zeros((len(pool), row.r)), -(width * unit)[:, None] * row.psi[pool]])
+        limits = (width * row.half[pool] - self.allowed) * unit
+        G, h = self._with_asked(np.vstack([G, rows]), np.concatenate([h, limits]))
+        h = np.minimum(h - G @ point, 0.0)  # the point satisfies them, but for rounding
+        H, f = row.hessian(row.plain, row.plain_linear, BOUNDED_TIE_BREAK)
+        f, largest = f + H @ point, float(np.diagonal(H).max())
+        step, solver, contained = np.zeros(len(point)), "HiGHS simplex", 2 * len(pool)
+        around, active = h[:contained].copy(), None
+        for room in _ROOM:
+            h[:contained] -= room
+            for share in _HOLD:
+                hold = share * largest
+                try:
+                    held = H + hold * np.eye(len(step)), f - hold * step
+                    low, high = row.lower - point, row.upper - point
+                    feasible = _ROOM[-1] if row.refined else FEASIBLE
+                    answer = solve_near(*held, G, h, low, high, step, active, feasible, any_solver=True)
+                except FitError:
+                    break
+                left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
+                d = (point + answer.xi)[row.r :]
+                if (width * (row.psi[pool] @ d + row.half[pool] + left)).max(initial=0.0) > (1.0 + GOOD) * self.allowed:
+                    break
+                step, solver, active = answer.xi, answer.solver, answer.active
+            if step.any():
+                break
+        self.attempt = _ATTEMPTS[0]
+        row.store_limited(np.append(point + step, self.allowed))
+        return solver
+
+    def polish(self) -> None:
+        """Solve for the centre again, with the half-widths as they are: the tie-break on its own.
+
+        Beside the squared widths it weighs so little that their rounding shows in the elements.
+        """
+        row = self.row
+        if row.r == 0:
+            return
+        phi, psi = row.along(row.pool), row.psi[row.pool]
+        half = psi @ (row.d[row.free_psi] / (row.unit_psi * row.scale)) + row.half[row.pool]
+        y = row.y[row.pool]
+        try:
+            answer = solve_qp(
+                row.centre + self.attempt[1] * np.eye(row.r),
+                -row.target,
+                *self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
+                row.lower[: row.r],
+                row.upper[: row.r],
+                any_solver=False,
+                feasible=FEASIBLE if row.refined else ROUGH,
+            )
+        except FitError:  # the half-widths leave no room at all
+            return
+        row.store_theta(answer.xi)
+
+    def contradiction(self) -> tuple[int, float, int] | None:
+        """A sample that no elements within the structure can contain, alone or with others."""
+        row = self.row
+
+        def least(pool: Index) -> tuple[Array, Array, Array]:
+            simplex = self.minimax()
+            G, h = row.containment(pool)
+            simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
+            answer = simplex.solve()
+            prices = np.abs(simplex.duals()[len(row.asked) :]).reshape(2, -1).sum(axis=0)
+            return answer, (h - G @ answer[:-1]).reshape(2, -1).max(axis=0), prices
+
+        answer, short, prices = least(row.pool)
+        if answer[-1] <= 1e-9:
+            return None
+        against = np.flatnonzero(prices > 1e-9 * prices.max(initial=0.0))  # they prove that there is no answer
+        worst = int(against[np.argmax(short[against])]) if len(against) else int(np.argmax(short))
+        distance, together = float(answer[-1]), len(against) - 1
+        for position in against[np.argsort(-short[against])]:
+            alone = float(least(row.pool[[position]])[0][-1])
+            if alone > 1e-9:
+                worst, distance, together = int(position), alone, 0
+                break
+        sample = int(row.pool[worst])
+        return (
+            int(row.samples.index[sample]),
+            distance * float(row.sizes(sample)) * row.scale,
+            max(together, 0),
+        )
+
+    def _with_asked(self, G: Array, h: Array) -> tuple[Array, Array]:
+        """Rows G ξ >= h, and what the structure asks of θ if that is no bound of an unknown."""
+        row = self.row
+        if not len(row.asked):
+            return G, h
+        rows = np.hstack([row.asked, np.zeros((len(row.asked), G.shape[1] - row.r))])
+        return np.vstack([G, rows]), np.concatenate([h, row.asked_limits])
