@@ -1,0 +1,66 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Machines of many states: `fit()` with noise and its containment alarm against lstsq, CPU time of all threads.
+
+OPENBLAS_NUM_THREADS=1 python benchmarks/large.py            # n = 40, m = 8, 2*10^4 transitions
+OPENBLAS_NUM_THREADS=1 python benchmarks/large.py 100 20 20000
+"""
+
+import argparse
+import time
+
+import numpy as np
+from measure import peak_memory, table
+
+from uncertain_lti import Transient, fit
+
+
+def plant(n, m, count):
+    """A recording of a random stable plant whose steps are disturbed within a box."""
+    rng = np.random.default_rng(0)
+    dt = 0.01
+    A, B = rng.normal(size=(n, n)) / np.sqrt(n) - 2 * np.eye(n), rng.normal(size=(n, m))
+    x, u = np.zeros((count + 1, n)), np.zeros((count + 1, m))
+    moves, noise = rng.normal(size=(count, m)), rng.uniform(-1, 1, size=(count, n))
+    for k in range(count):
+        u[k + 1] = 0.95 * u[k] + 0.3 * moves[k]
+        x[k + 1] = x[k] + dt * (A @ x[k] + B @ u[k]) + 0.002 * noise[k]
+    return Transient(np.arange(count + 1) * dt, x, u)
+
+
+def seconds(function):
+    """CPU and wall time of a call, and its result."""
+    cpu, wall = time.process_time(), time.perf_counter()
+    result = function()
+    return time.process_time() - cpu, time.perf_counter() - wall, result
+
+
+def main():
+    """Print a row for (10) and one for (11)."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("size", type=int, nargs="*", default=[40, 8, 20_000], help="states, controls, transitions")
+    n, m, count = parser.parse_args().size
+    options = {"additive": "noise", "alarm": "containment"}
+    for criterion in ("qp", "lp"):  # imports
+        fit(plant(4, 2, 2000), criterion, **options)
+    run = plant(n, m, count)
+    z, step = np.hstack([run.x, run.u])[:-1], np.diff(run.x, axis=0)
+    least = min(seconds(lambda: np.linalg.lstsq(z, step, rcond=None))[0] for _ in range(3))
+    rows = []
+    for criterion, name in (("qp", "(10)"), ("lp", "(11)")):
+        cpu, wall, model = seconds(lambda criterion=criterion: fit(run, criterion, **options))
+        gap, memory = model.fit_summary["optimality_gap"], peak_memory() / 2**20
+        rows.append([name, f"{cpu:.1f} s", f"{wall:.1f} s", f"{cpu / least:.0f}", f"{gap:.1g}", f"{memory:.0f} MiB"])
+    header = ["criterion", "CPU", "wall", "CPU over lstsq", "gap", "peak memory"]
+    table(f"n = {n}, m = {m}, {count} transitions; lstsq {least:.3f} s", header, rows)
+
+
+if __name__ == "__main__":
+    main()
