@@ -126,6 +126,8 @@ def _scan(path: Path) -> Foreign:
     try:
         with _reader(path, magic) as reader:
             stated = _declare(found, reader, chunks)
+            if magic == _DATABASE and (said := _integrity(reader)) != "ok":
+                found.warnings.append(f"{path}: is damaged ({one_line(said)}); {_remedy(path, magic)}")
             if trouble := _walk(found, reader):
                 of = f"{found.count} of {count(stated, 'message')} before that count"
                 found.warnings.append(f"{path}: is cut or damaged ({trouble}); {of}; {_remedy(path, magic)}")
@@ -144,6 +146,11 @@ def _scan(path: Path) -> Foreign:
         what = "ROS 1 bag" if magic == _BAG else "recording of ROS 2"
         raise BagError(f"{path}: is cut or damaged or no {what} ({one_line(error)}); {_remedy(path, magic)}") from None
     return found
+
+
+def _integrity(reader: Any) -> str:
+    """What SQLite finds wrong first: an index that lacks rows hides them from whoever reads in order of time."""
+    return str(reader.dbconn.execute("PRAGMA integrity_check(1)").fetchone()[0])
 
 
 def _remedy(path: Path, magic: bytes) -> str:
