@@ -24,10 +24,10 @@ import pytest
 def test_damage_gives_a_clear_error_or_a_correct_reading(kind: str) -> None:
     if kind == "messages":
         pytest.importorskip("rclpy", reason="rclpy, whose reading layouts are held against, is not installed")
-    outcome = fuzz.run(kind, first=20_000, count=150)
+    outcome = fuzz.run(kind, first=20_000, count=40)
     assert not outcome.failures, "\n".join(outcome.failures)
-    assert sum(outcome.counts.values()) == 150
-    assert outcome.counts["read"] > 30 and outcome.counts["refused"] > 5, "the damage is too small or too great"
+    assert sum(outcome.counts.values()) == 40
+    assert outcome.counts["read"] > 8 and outcome.counts["refused"] > 1, "the damage is too small or too great"
 
 
 def framed(
@@ -174,7 +174,7 @@ def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:
     program = tmp_path / "wrong.py"
     program.write_text("""
 import os, time, fuzz
-fuzz.LIMIT_CPU_S, fuzz.LIMIT_S = 0.5, 20.0
+fuzz.LIMIT_CPU_S, fuzz.LIMIT_S = 0.5, 6.0
 def wrong(rng, folder):
     kind = next(kinds)
     if kind == "raise":

@@ -475,7 +475,7 @@ def hold_against(reference: Reference, signals: SignalMap, messages: list[Sent])
     assert counted == wanted_counts
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(cases(tame=True))
 def test_tame_streams_follow_the_letter_of_the_rules(case: tuple[SignalMap, list[Sent]]) -> None:
     """Several topics, late and out of order, equal stamps, gaps, NaN, stale, delayed: nothing is left to memory."""
@@ -486,7 +486,7 @@ def test_tame_streams_follow_the_letter_of_the_rules(case: tuple[SignalMap, list
     hold_against(Reference(signals, messages, forgets=resets or jumps), signals, messages)
 
 
-@settings(max_examples=600)
+@settings(max_examples=200)
 @given(cases())
 def test_wild_streams_follow_the_rules_too(case: tuple[SignalMap, list[Sent]]) -> None:
     """With zero stamps, jumps of one topic or of all, a node clock that jumps back, in any combination."""
@@ -727,7 +727,7 @@ def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older(
     assert sampler.counters["missing u"] == 1
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(case=cases() | cases(tame=True), room=st.integers(4, 8))
 def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap, list[Sent]], room: int) -> None:
     signals, messages = case

@@ -53,7 +53,7 @@ def both(signals: SignalMap, messages: Sequence[Sent]) -> tuple[Samples | None, 
     return sample_arrays(signals, **data), sample_by_message(stream, signals)
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(cases() | cases(tame=True) | loops())
 def test_the_same_as_the_sampler_or_left_to_it(case: tuple[SignalMap, list[Sent]]) -> None:
     at_once, by_message = both(*case)
@@ -76,7 +76,7 @@ def goes_back(signals: SignalMap, messages: Sequence[Sent]) -> bool:
     return False
 
 
-@settings(max_examples=300)
+@settings(max_examples=150)
 @given(cases(tame=True))
 def test_what_goes_forward_is_not_left_to_the_sampler(case: tuple[SignalMap, list[Sent]]) -> None:
     """Late and out of order by up to max_gap, equal stamps, gaps, NaN, stale, delayed controls, angles."""
