@@ -48,7 +48,7 @@ def aside(function: Callable[[Path], Any], path: Path, what: str) -> Any:
     return found
 
 
-def one_line(error: BaseException) -> str:
+def one_line(error: BaseException | str) -> str:
     """What an error of a library says, short enough for a sentence."""
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= 120 else text[:120] + " ..."
