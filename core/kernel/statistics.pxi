@@ -57,8 +57,9 @@ cdef class Statistic:
     cdef long long* end
     cdef long long* total  # ns
     cdef double spread  # variance of the moving average of mewma, that of a verdict being 1; 0 before the first
-    cdef arrays.array queue  # of one state after another: terms of the newer half, sums of the older one
-    cdef arrays.array steps  # likewise, ns
+    cdef arrays.array _queue, _steps
+    cdef double* queue  # of one state after another: terms of the newer half, sums of the older one
+    cdef long long* steps  # likewise, ns
     cdef Py_ssize_t capacity
 
     def __init__(
@@ -85,8 +86,12 @@ cdef class Statistic:
         self.begin, self.middle = self.given + n, self.given + 2 * n
         self.end, self.total = self.given + 3 * n, self.given + 4 * n
         self.capacity = 64
-        self.queue, self.steps = array("d", bytes(8 * size * 64)), array("q", bytes(8 * size * 64))
+        self.hold(array("d", bytes(8 * size * 64)), array("q", bytes(8 * size * 64)))
         self.reset()
+
+    cdef void hold(self, arrays.array queue, arrays.array steps):
+        self._queue, self._steps = queue, steps
+        self.queue, self.steps = queue.data.as_doubles, steps.data.as_longlongs
 
     def reset(self):
         """Forget every verdict."""
@@ -119,19 +124,22 @@ cdef class Statistic:
         cdef Py_ssize_t i, k, count = len(dt)
         if np.shape(rows) != (count, self.n):
             raise ValueError("the numbers of the verdicts do not fit the states")
-        cdef const double[:, ::1] table = np.ascontiguousarray(rows, dtype=np.float64)
+        if rows.dtype != np.float64 or rows.strides[1] != 8:
+            rows = np.ascontiguousarray(rows, dtype=np.float64)
+        cdef const double[:, :] table = rows  # a row of numbers, however far from the next
         cdef const double[::1] times = np.ascontiguousarray(dt, dtype=np.float64)
         found, raised = np.empty((count, self.size)), np.empty(count, dtype=bool)
         cdef double[:, ::1] values = found
         cdef unsigned char[::1] alarm = raised.view(np.uint8)
-        for k in range(count):
-            self.push(times[k], &table[k, 0])
-            alarm[k] = self.alarm
-            for i in range(self.size):
-                values[k, i] = self.now[i]
+        with nogil:
+            for k in range(count):
+                self.push(times[k], &table[k, 0])
+                alarm[k] = self.alarm
+                for i in range(self.size):
+                    values[k, i] = self.now[i]
         return raised, found
 
-    cdef int push(self, double dt, const double* row) except -1:
+    cdef int push(self, double dt, const double* row) except -1 nogil:
         """Take one verdict."""
         cdef Py_ssize_t i
         cdef double value, weight, kept, down
@@ -175,14 +183,15 @@ cdef class Statistic:
                 weight = self.window if self.total[i] <= self.window_ns else dt
                 value = self.up[i]
                 if self.begin[i] < self.middle[i]:
-                    value = self.queue.data.as_doubles[i * self.capacity + self.begin[i]] + value
+                    value = self.queue[i * self.capacity + self.begin[i]] + value
                 self.now[i] = value / weight / self.thresholds[i]
         self.alarm = False
         for i in range(self.size):
-            self.alarm |= self.counted[i] and (self.now[i] > 1.0 or self.now[i] < -1.0)
+            if self.counted[i] and (self.now[i] > 1.0 or self.now[i] < -1.0):
+                self.alarm = True
         return 0
 
-    cdef bint take(self, const double* row) noexcept:
+    cdef bint take(self, const double* row) noexcept nogil:
         """What the verdict adds, to `terms`, for the states that are `given`; false if there is none."""
         cdef Py_ssize_t i, j, n = self.n
         cdef double value, total, limit, square = 0.0
@@ -213,13 +222,14 @@ cdef class Statistic:
             self.terms[i] = value * value if self.kind == _ENERGY else value
         return there
 
-    cdef int move(self, Py_ssize_t i, double dt) except -1:
+    cdef int move(self, Py_ssize_t i, double dt) except -1 nogil:
         """Add the term of a state to its window, and drop what is older than it."""
         cdef Py_ssize_t k
         if self.end[i] == self.capacity:
-            self.make_room(i)
-        cdef double* queue = self.queue.data.as_doubles + i * self.capacity
-        cdef long long* steps = self.steps.data.as_longlongs + i * self.capacity
+            with gil:
+                self.make_room(i)
+        cdef double* queue = self.queue + i * self.capacity
+        cdef long long* steps = self.steps + i * self.capacity
         cdef Py_ssize_t end = self.end[i]
         queue[end] = self.terms[i] * dt
         steps[end] = <long long>(dt * 1e9 + 0.5)
@@ -239,18 +249,20 @@ cdef class Statistic:
     cdef make_room(self, Py_ssize_t i):
         """Move the window of a state to the front of its part of the queue; if it fills half, double all first."""
         cdef Py_ssize_t j, k, begin = self.begin[i], count = self.end[i] - self.begin[i], before = self.capacity
-        cdef arrays.array queue = self.queue, steps = self.steps
+        cdef arrays.array queue = self._queue, steps = self._steps
         if 2 * count > before:
             self.capacity *= 2
-            self.queue = arrays.clone(queue, self.size * self.capacity, True)
-            self.steps = arrays.clone(steps, self.size * self.capacity, True)
+            self.hold(
+                arrays.clone(queue, self.size * self.capacity, True),
+                arrays.clone(steps, self.size * self.capacity, True),
+            )
             for j in range(self.size):
                 for k in range(before):
-                    self.queue.data.as_doubles[j * self.capacity + k] = queue.data.as_doubles[j * before + k]
-                    self.steps.data.as_longlongs[j * self.capacity + k] = steps.data.as_longlongs[j * before + k]
+                    self.queue[j * self.capacity + k] = queue.data.as_doubles[j * before + k]
+                    self.steps[j * self.capacity + k] = steps.data.as_longlongs[j * before + k]
         for k in range(i * self.capacity, i * self.capacity + count):
-            self.queue.data.as_doubles[k] = self.queue.data.as_doubles[k + begin]
-            self.steps.data.as_longlongs[k] = self.steps.data.as_longlongs[k + begin]
+            self.queue[k] = self.queue[k + begin]
+            self.steps[k] = self.steps[k + begin]
         self.middle[i] -= begin
         self.begin[i], self.end[i] = 0, count
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.cores import on_cores
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -318,7 +319,7 @@ class Alarm:
         alarm after each; Returns (K, rules): which rules raise it; Returns (K, statistics): `values` after each.
         """
         self.reset()
-        found = [part.push_all(dt, violated, table) for part in self.parts]
+        found = on_cores(lambda part: part.push_all(dt, violated, table), [(part,) for part in self.parts])
         self.reset()
         each = np.stack([after for after, _ in found], axis=1)
         return np.asarray(each.any(axis=1)), each, np.concatenate([values for _, values in found], axis=1)

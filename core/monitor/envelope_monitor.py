@@ -431,16 +431,17 @@ class EnvelopeMonitor:
         carried = np.asarray(np.max(sizes, axis=0) <= LARGEST)
         if not carried.all():
             steps = steps.take(carried)
-        listed, unknown = model.regime(model.normalised_columns(steps))
+        with np.errstate(over="ignore", invalid="ignore"):  # a value far beyond its bounds is beyond all numbers
+            z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
+        listed, unknown = model.regime(z)
         if not listed.all():
             unlisted_mode[steps.k[~listed] + 1] = True
-            steps, unknown = steps.take(listed), unknown[listed]
+            steps, unknown, z, x_next = steps.take(listed), unknown[listed], z[:, listed], x_next[listed]
         arrival = steps.k + 1
         flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
         upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
         judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        with np.errstate(over="ignore", invalid="ignore"):  # a value far beyond its bounds is beyond all numbers
-            z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
+        with np.errstate(over="ignore", invalid="ignore"):
             flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
             lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
         frozen, withheld, repeating, why = self._look_all(transient, steps, z, lower, upper)
@@ -475,7 +476,9 @@ class EnvelopeMonitor:
             table[arrival, half], table[:, half + 1 :] = residual, longer_residual
         for start, stop in _alarm_spans(transient.t_ns, armed):
             part = slice(start, stop)
-            on = np.flatnonzero(judged[part]) + start
+            on: Any = np.flatnonzero(judged[part]) + start
+            if len(on) and on[-1] - on[0] + 1 == len(on):
+                on = slice(on[0], on[-1] + 1)  # without a copy
             after, by_rule, statistics[on] = alarms.over(dt[on], violated[on], table[on])
             held = np.cumsum(judged[part])  # without a verdict the alarm stays as it was
             alarm[part] = np.concatenate([[False], after])[held]
