@@ -23,6 +23,8 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.monitor.alarm import Alarm, Nearest
+from uncertain_lti.monitor.arming import back_and_restarts, steps_back
 
 ZEROS = np.zeros((2, 2))
 RULES = (
@@ -214,3 +216,25 @@ def test_the_fit_stores_mean_and_covariance_of_its_utilisation(scheduled: bool) 
 def test_labels_of_one_alarm_are_all_different() -> None:
     rule = StatisticRule("mean", 1.0, 1.0)
     assert labels([rule, replace(rule, window_s=2.0), replace(rule, horizon=9)]) == ("mean", "mean#2", "mean@9")
+
+
+def test_the_nearest_statistic_is_the_one_with_the_largest_share_of_its_threshold() -> None:
+    model = two_states()
+    rule = StatisticRule("mean", 0.0, (2.0, 0.5))
+    alarm = Alarm([rule], model, np.ones(2, dtype=bool))
+    assert alarm.nearest(alarm.values()) == {}
+    alarm.push(0.1, False, np.array([1.0, -0.4, 0.0, 0.0]))
+    assert alarm.nearest(alarm.values()) == {"mean": Nearest("x2", pytest.approx(-0.4), 0.5)}
+
+
+def test_time_has_stepped_back_where_an_instant_is_not_after_the_one_before_the_last() -> None:
+    """One stamp ahead, and one behind, end nothing."""
+    assert [steps_back(t, 20, 10) for t in (9, 10, 11, 20, 21)] == [True, True, False, False, False]
+    for stamps, back, restarts in (
+        ((0, 10, 20, 10, 20), [3], [4]),
+        ((0, 10, 99, 20, 30), [], []),
+        ((0, 10, 20, 5, 30), [3], []),
+        ((0, 10, 20, 5, 6, 7), [3], [4]),
+    ):
+        found = back_and_restarts(np.array(stamps))
+        assert [np.flatnonzero(each).tolist() for each in found] == [back, restarts], stamps

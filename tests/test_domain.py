@@ -25,7 +25,8 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import Judge
-from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy
+from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for
+from uncertain_lti.model.jumps import jumps
 
 
 def levels(values: list[float], rng: np.random.Generator, count: int = 1000) -> Transient:
@@ -141,3 +142,28 @@ def test_a_measure_that_is_none_is_refused_by_name(tmp_path: Path, change: dict[
     del data["frozen"]
     with pytest.raises(ModelError, match=r"domain\.measure"):
         UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
+
+
+def test_far_beyond_is_more_than_a_tenth_of_the_range() -> None:
+    one = np.ones(1)
+    domain = Domain(-1 * one, 4 * one, 0 * one, 10 * one)
+    inside, far = [[-1.5, 4.5], [-1.0, 11.0]], [[-1.6, 0.0, 4.6, 0.0], [0.0, -1.1, 0.0, 11.1]]
+    assert not domain.beyond(np.array(inside)).any() and domain.beyond(np.array(far)).all()
+
+
+@pytest.mark.parametrize(("count", "cells"), [(16 * 16 - 1, 0), (16 * 16, 4), (16 * 100, 10), (10**6, MOST_CELLS)])
+def test_a_range_has_as_many_cells_as_samples_can_fill(count: int, cells: int) -> None:
+    assert cells_for(count) == cells
+
+
+def test_a_jump_is_a_change_beyond_the_largest_of_the_fit() -> None:
+    rng = np.random.default_rng(4)
+    run = levels([0.0, 1.0, 2.0], rng)
+    model = fit([run], "qp", additive="noise")
+    assert model.domain.step_max is not None
+    most = np.abs(np.diff(run.x, axis=0)).max(axis=0)
+    before = run.x[10]
+    for change, said in ((most, 0.0), (-most, 0.0), (1.01 * most, 1.01 * most), (-2 * most, -2 * most)):
+        found, limit = jumps(model, before, before + change)
+        np.testing.assert_allclose(found, said, rtol=1e-9)
+        np.testing.assert_allclose(limit, most)

@@ -19,6 +19,7 @@ from tanks import Tanks
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
+from uncertain_lti.validation.false_alarms import false_alarms
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import CONFIDENCE, Panel, learn, promises, rules_for, worth
@@ -109,6 +110,24 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
         assert math.sqrt(sample.thresholds(2)[i]) == pytest.approx(expected, rel=1e-9)
         window = [np.convolve(p.utilisation[:, i] ** 2, np.ones(10) / 10, "valid").max() for p in parts]
         assert energy.thresholds(2)[i] > max(window) * (1 - 0.06)  # a window of 10.5 steps
+    weights = [part.judged for part in parts]
+    half = np.average([part.usual_width for part in parts], axis=0, weights=weights) / 2
+    np.testing.assert_allclose(panel.biases, half * np.sqrt(energy.thresholds(2)), rtol=1e-12)
+
+
+def test_false_alarms_are_counted_per_hour_of_verdicts(runs):
+    """A margin that some verdicts of the left-out recordings exceed, counted in numpy."""
+    parts = validate(runs, criterion="lp", additive="noise").parts
+    sizes = [np.abs(part.utilisation).max(axis=1) for part in parts]
+    rule = AlarmRule(margin=float(np.quantile(np.concatenate(sizes), 0.995)))
+    over = [size > rule.margin for size in sizes]
+    alarms = sum(int(np.count_nonzero(np.diff(each.astype(int), prepend=0) == 1)) for each in over)
+    hours = DT * sum(map(len, sizes)) / 3600
+    found = false_alarms(parts, [rule], 0.9)
+    assert found["alarms"] == alarms > 5 and found["parts_with_alarm"] == sum(each.any() for each in over)
+    assert found["per_hour"] == pytest.approx(alarms / hours)
+    assert found["raised_share"] == pytest.approx(np.concatenate(over).mean())
+    assert found["interval"][0] < found["per_hour"] < found["interval"][1]
 
 
 def full_utilisation(model: UncertainLTI, run: Transient) -> np.ndarray:
