@@ -179,7 +179,7 @@ def test_a_stream_gives_the_bits_of_its_transient(case: tuple[UncertainLTI, Tran
             assert getattr(verdict, name).tobytes() == getattr(whole, name)[row].tobytes(), name
         assert (verdict.judged, verdict.outside_domain) == (whole.judged[row], whole.outside_domain[row])
         assert verdict.alarm == whole.alarm[row]
-        assert bool((verdict.flags == 1.0).any()) == whole.violated[row]
+        assert verdict.violated == bool((verdict.flags == 1.0).any()) == whole.violated[row]
         assert verdict.state.tobytes() == transient.x[row].tobytes() and verdict.t_ns == transient.t_ns[row]
         row += 1
     assert row == len(transient)
