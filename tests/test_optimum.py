@@ -53,7 +53,8 @@ def test_with_knots_where_the_first_centre_contains_every_sample(seed):
     """Of `python benchmarks/optimum.py --knots`: the simplex method starts from no sample at all in some row."""
     found = optimum.compare(optimum.with_knots(seed), "lp")
     known = np.isfinite(found.excess)
-    assert found.error is None and known.any() and (found.excess[known] <= 1e-6).all()
+    allowed = np.where(found.optimum < 1e-15, 1e-4, 1e-6)  # squares of widths that rounding makes, and BLAS with it
+    assert found.error is None and known.any() and (found.excess[known] <= allowed[known]).all()
     assert found.gap >= found.true_gap - 2 * optimum.AGREE
 
 
