@@ -186,13 +186,13 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
             transients.append(Transient(t, x, u, state_names=names[: x.shape[1]], control_names=names[x.shape[1] :]))
         except TransientError:
             continue
-    found = choose_memories(transients, additive="noise") if transients else None
-    if found is None or not found.chosen:
+    if not transients:
         return []
-    gain = f"with it, mean width x {found.facts['width']:.2g} on left-out data"
-    lines = ["  # known before the step, so without a row of its own and without a verdict"]
+    chosen, width = choose_memories(transients, "noise")
+    gain = f"with it, mean width x {width:.2g} on left-out data"
+    lines = ["  # known before the step, so without a row of its own and without a verdict"] if chosen else []
     by_name = {c.name: c for c in group}
-    for one in found.chosen:
+    for one in chosen:
         of = by_name[one.of]
         memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
         lag, rate = memory.kind == "lag", memory.kind == "rate"

@@ -283,21 +283,23 @@ def knots_of(model: UncertainLTI, signal: str) -> list[float]:
     return [value for axis, values in at if axis.signal == signal for value in values.tolist()]
 
 
-def fold_of(transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI) -> Fold:
-    """What is left out at a time."""
+def fold_of(
+    transients: Sequence[Transient], groups: Sequence[Any] | str | None, base: UncertainLTI, folds: int = FOLDS
+) -> Fold:
+    """What is left out at a time, at most so many times."""
     names, _ = resolve_groups(transients, groups)
     if not names and len(transients) == 1:
         usable = int(transients[0].usable.sum())
-        blocks = max(2, min(BLOCKS, FOLDS, usable // 2))
+        blocks = max(2, min(BLOCKS, folds, usable // 2))
         spans = [(transients[0], *span) for span in block_spans(transients[0], blocks)]
         return Fold(None, blocks, guard_interval(base, spans), "block")
     what = "group" if names else "recording"
     each = names or [str(i) for i in range(len(transients))]
     units = list(dict.fromkeys(each))
-    if len(units) <= FOLDS:
+    if len(units) <= folds:
         return Fold(names or None, None, None, what)
-    joined = {units[k]: str(i) for i, part in enumerate(np.array_split(np.arange(len(units)), FOLDS)) for k in part}
-    return Fold([joined[name] for name in each], None, None, f"{FOLDS}th part of the {what}s")
+    joined = {units[k]: str(i) for i, part in enumerate(np.array_split(np.arange(len(units)), folds)) for k in part}
+    return Fold([joined[name] for name in each], None, None, f"{folds}th part of the {what}s")
 
 
 def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation) -> Candidate:

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -31,6 +31,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.scheduling import Fold, fold_of
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.additive import Additive
 from uncertain_lti.signals.memory import Memory
 from uncertain_lti.validation.left_out import validate
 
@@ -44,6 +45,8 @@ PIECE = 200
 """... of so many transitions."""
 PAYS, ALLOWED = 0.8, 0.02
 """Memories pay whose mean width on left-out data is at most this share, with at most so much more outside."""
+FOLDS = 5
+"""Times that something is left out to choose memories, at most."""
 FEWEST_STEPS, MOST_STEPS = 3, 0.05
 """A control whose steps are events changes in at least so many transitions, and in at most this share of them."""
 LONGEST = 64
@@ -133,7 +136,7 @@ def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[S
 def memories(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
     """Lags and rates of states whose residuals follow from sample to sample, and of controls that seldom change."""
     delayed = replace(best, memories=()).prepared(transients)
-    for some in memory_candidates(delayed, str(best.options.get("additive", "noise"))):
+    for some in memory_candidates(delayed, best.options.get("additive", "noise")):
         yield best.beside(f"with {', '.join(one.name for one in some)}", memories=some)
 
 
@@ -152,7 +155,7 @@ def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) ->
     return [with_memories(t, {one.name: (one.of, one.memory) for one in memories}) for t in transients]
 
 
-def memory_candidates(transients: Sequence[Transient], additive: str = "noise") -> list[tuple[Remembered, ...]]:
+def memory_candidates(transients: Sequence[Transient], additive: Additive = "noise") -> list[tuple[Remembered, ...]]:
     """Sets of memories that may narrow the envelope, by what least squares leaves unexplained.
 
     Of the states whose residual follows from sample to sample (`Autocorrelation.follows`) the rates (the
@@ -162,7 +165,7 @@ def memory_candidates(transients: Sequence[Transient], additive: str = "noise") 
     first = transients[0]
     point = operating_point(first)
     try:
-        problem = assemble(transients, point, None, additive)  # type: ignore[arg-type]
+        problem = assemble(transients, point, None, additive)
     except FitError:
         return []
     taken = {*first.state_names, *first.control_names, *first.scheduling_names}
@@ -185,70 +188,45 @@ def memory_candidates(transients: Sequence[Transient], additive: str = "noise") 
     return [chosen for chosen in sets if not taken & {one.name for one in chosen}]
 
 
-@dataclass(frozen=True)
-class ChosenMemories:
-    """Memories that pay, and what was tried.
-
-    `chosen`: empty where none pays; `facts`: plain data: `memories` that were tried, the share `inside` without, the
-    names `suggested`, and with them `width` and the share `inside_with`.
-    """
-
-    chosen: tuple[Remembered, ...]
-    facts: dict[str, Any]
-
-
-def choose_memories(
-    transients: Sequence[Transient],
-    groups: Sequence[Any] | str | None = None,
-    progress: Callable[[str], None] | None = None,
-    **options: Any,
-) -> ChosenMemories:
-    """Which lags, rates or differences narrow the envelope of left-out data, and what that gains.
+def choose_memories(transients: Sequence[Transient], additive: Additive) -> tuple[tuple[Remembered, ...], float]:
+    """Which lags, rates or differences narrow the envelope of left-out data, and the mean width over that without.
 
     Of the sets of `memory_candidates` those for the states are tried on about TRANSITIONS transitions, leaving out in
     turn, then, beside the best of them, those for the controls.
     """
-    sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), options.get("additive") or "noise")
+    sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), additive)
     if not sets:
-        return ChosenMemories((), {"memories": []})
+        return (), 1.0
     base = thinned(transients, TRANSITIONS)
     try:
-        model = fit(base, schedule={}, describe_data=False, **options)
-        fold = fold_of(base, groups, model)
-        before = _judged(base, model, fold, options)
-    except FitError as error:
-        return ChosenMemories((), {"not_done": str(error)})
-    tried: list[dict[str, Any]] = []
+        model = fit(base, schedule={}, describe_data=False, additive=additive)
+        fold = fold_of(base, None, model, FOLDS)
+        before = best = _judged(base, model, fold, additive)
+    except FitError:
+        return (), 1.0
     states = {*transients[0].state_names}
     chosen: tuple[Remembered, ...] = ()
-    best = before
     for kind in (True, False):
         beside, widths = chosen, best
         for some in (s for s in sets if (s[0].of in states) is kind):
-            if progress is not None:
-                progress(f"with {', '.join(one.name for one in some)}")
             more = thinned(remember(transients, (*beside, *some)), TRANSITIONS)
             try:
-                after = _judged(more, fit(more, schedule={}, describe_data=False, **options), fold, options)
-            except FitError as error:
-                tried.append({"added": [one.name for one in some], "refused": str(error)})
+                model = fit(more, schedule={}, describe_data=False, additive=additive)
+                after = _judged(more, model, fold, additive)
+            except FitError:
                 continue
             ratio = math.exp(float(np.mean(np.log(after[0] / widths[0]))))
             pays = ratio <= PAYS and after[1] >= before[1] - ALLOWED
-            tried.append({"added": [one.name for one in some], "width": ratio, "inside": after[1], "pays": pays})
             if pays and np.mean(np.log(after[0] / best[0])) < 0:
                 best, chosen = after, (*beside, *some)
-    facts: dict[str, Any] = {"memories": tried, "inside": before[1], "suggested": [one.name for one in chosen]}
-    if chosen:
-        facts |= {"width": math.exp(float(np.mean(np.log(best[0] / before[0])))), "inside_with": best[1]}
-    return ChosenMemories(chosen, facts)
+    return chosen, math.exp(float(np.mean(np.log(best[0] / before[0]))))
 
 
 def _judged(
-    transients: Sequence[Transient], model: UncertainLTI, fold: Fold, options: dict[str, Any]
-) -> tuple[Any, float]:
+    transients: Sequence[Transient], model: UncertainLTI, fold: Fold, additive: Additive
+) -> tuple[Array, float]:
     """Mean width of each state on left-out data, in recorded units, and the share inside."""
-    left = validate(transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, **options)
+    left = validate(transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, additive=additive)
     judged = np.array([part.judged for part in left.parts], dtype=np.float64)
     if not judged.sum():
         raise FitError("nothing that was left out can be judged")
