@@ -155,7 +155,7 @@ def watch(model: str, executor: str) -> None:
         sys.modules["rclpy.experimental"] = None  # type: ignore[assignment]
     from uncertain_lti.monitor.session import Session
     from uncertain_lti_ros.envelope_monitor import main
-    from uncertain_lti_ros.subscriptions import MatchedSubscription
+    from uncertain_lti_ros.topics import MatchedSubscription
 
     received, judged = [], []
     take, judge = MatchedSubscription._take, Session.take

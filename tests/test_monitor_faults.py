@@ -849,14 +849,14 @@ def test_a_pipe_or_a_device_is_refused_as_a_model_and_the_node_lives_on(world: W
 
 
 def test_a_file_that_cannot_be_read_in_time_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from uncertain_lti_ros import sessions
+    from uncertain_lti_ros import parameters
 
     waiting = threading.Event()
-    monkeypatch.setattr(sessions.UncertainLTI, "load", lambda file: waiting.wait())
-    monkeypatch.setattr(sessions, "_PATIENCE", 0.05)
+    monkeypatch.setattr(parameters.UncertainLTI, "load", lambda file: waiting.wait())
+    monkeypatch.setattr(parameters, "_PATIENCE", 0.05)
     (tmp_path / "m.json").touch()
     with pytest.raises(ModelError, match="cannot be read within 0.05 s"):
-        sessions.make_session(str(tmp_path / "m.json"), Rule(), None)  # type: ignore[arg-type]
+        parameters.make_session(str(tmp_path / "m.json"), Rule(), None)  # type: ignore[arg-type]
     waiting.set()
 
 

@@ -56,7 +56,7 @@ from test_live import (
 
 from uncertain_lti_ros.parameters import PARAMETERS
 from uncertain_lti_ros.process import spare_the_middleware
-from uncertain_lti_ros.subscriptions import MatchedSubscription
+from uncertain_lti_ros.topics import MatchedSubscription
 
 NODE = "/envelope_monitor"
 

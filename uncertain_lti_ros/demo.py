@@ -36,8 +36,7 @@ from uncertain_lti.reports.check_text import check_text
 from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
 from uncertain_lti.reports.fit_text import alarm_text, fit_text, headline_text
 from uncertain_lti.sampling.reading import read_as_fitted
-from uncertain_lti_ros.process import Life, living
-from uncertain_lti_ros.terminal import say, speed
+from uncertain_lti_ros.process import Life, living, say, speed
 
 FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
 CHECK = "turbofan_fan_damage.mcap"

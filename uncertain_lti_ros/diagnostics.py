@@ -20,7 +20,7 @@ from rclpy.node import Node
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.monitor.session import Report
-from uncertain_lti_ros.subscriptions import MatchedSubscription
+from uncertain_lti_ros.topics import MatchedSubscription
 
 _UNHEARD = 2.0  # s without a first message although there are publishers
 

@@ -38,14 +38,10 @@ from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti_ros.arguments import BAD_USAGE, declare, run_node, whole_to_real
 from uncertain_lti_ros.diagnostics import Diagnostics, input_values
 from uncertain_lti_ros.messages import message_class
-from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE
-from uncertain_lti_ros.polled_events import POLL
+from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import living, spare_the_middleware
-from uncertain_lti_ros.publishers import Outputs
-from uncertain_lti_ros.sessions import make_session
-from uncertain_lti_ros.settings import Settings
 from uncertain_lti_ros.snapshots import Snapshots
-from uncertain_lti_ros.subscriptions import MatchedSubscription
+from uncertain_lti_ros.topics import POLL, MatchedSubscription, Outputs
 
 NAME = "envelope_monitor"
 _SUMMARY = (

@@ -7,13 +7,34 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Parameters of envelope_monitor: what each means, its default, its range, and whether it can be set while running."""
+"""Parameters of envelope_monitor in one table, and what they make: the alarm rule, quality of service, the session."""
 
 from __future__ import annotations
 
+import os
+import threading
+import time
+from collections.abc import Sequence
+from concurrent.futures import Future
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from rclpy.exceptions import InvalidTopicNameException
+from rclpy.node import Node
+from rclpy.serialization import deserialize_message
+from rclpy.validate_topic_name import validate_topic_name
+
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.arming import Arming
 from uncertain_lti.monitor.catch_up import WINDOW
+from uncertain_lti.monitor.session import Rule, Session, topic_types
+from uncertain_lti.recordings.message_reader import MessageReader
+from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti_ros.arguments import Declared
-from uncertain_lti_ros.subscriptions import DEPTH, DURABILITY, RELIABILITY
+from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.topics import DEPTH, DURABILITY, RELIABILITY, RequestedQos, sendable
 
 _RESTARTS = "Changing it restarts the alarm, unless it is latched."
 RULE = ("violations", "window", "margin", "masked", "enable", "enable_type", "grace", "latch")
@@ -124,3 +145,110 @@ PARAMETERS = (
 )  # fmt: skip
 DEFAULTS = {parameter.name: parameter.default for parameter in PARAMETERS}
 """Name -> default, which gives the type."""
+_type_fields = cache(live_fields)
+_PATIENCE = 10.0  # s that a file may take to be read, as on a network that is down
+MIB = 1 << 20
+"""Bytes; parameters of size are in MiB."""
+
+
+class Settings:
+    """What the parameters of a node are set to.
+
+    `node`: its parameters are declared; `largest_message`: bytes of the largest message that is read.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._reals: dict[str, float] = {}
+        self.largest_message = self.size("largest_message")
+
+    def value(self, name: str) -> Any:
+        """A parameter as it is set."""
+        return self._node.get_parameter(name).value
+
+    def real(self, name: str) -> float:
+        """A parameter that is a number."""
+        if name not in self._reals:  # a call of rclpy takes 10 µs
+            self._reals[name] = float(self._node.get_parameter(name).value)
+        return self._reals[name]
+
+    def size(self, name: str) -> int:
+        """A parameter that is a size in MiB."""
+        return round(self.real(name) * MIB)
+
+    def changed(self) -> None:
+        """Read the parameters again: some were set."""
+        self._reals.clear()
+        self.largest_message = self.size("largest_message")
+
+    def rule(self, changes: dict[str, Any]) -> Rule:
+        """The alarm rule that the parameters define."""
+        return Rule(**{name: changes.get(name, self.value(name)) for name in RULE})
+
+    def requested_qos(self) -> RequestedQos:
+        """The quality of service that the parameters request."""
+        chosen: dict[str, Any] = {}
+        for name, known in (("reliability", RELIABILITY), ("durability", DURABILITY)):
+            text = self.value(f"qos.{name}")
+            if text != "match" and text not in known:
+                raise ModelError(f"parameter qos.{name} is {text!r}; choose match, {' or '.join(known)}")
+            chosen[name] = known.get(text)
+        return RequestedQos(self.value("qos.depth"), **chosen)
+
+    def topic_prefix(self) -> str:
+        """What is put before every topic of the model."""
+        prefix = str(self.value("topic_prefix")).rstrip("/")
+        try:
+            if prefix:
+                validate_topic_name(prefix)
+        except InvalidTopicNameException:
+            raise ModelError(
+                f"parameter topic_prefix is {prefix!r}; names consist of letters, digits, _ and /, as in /robot1"
+            ) from None
+        return prefix
+
+    def check_snapshots(self, on_alarm: bool) -> None:
+        """Refuse snapshots on an alarm without a folder for them."""
+        if on_alarm and not self.value("snapshot.folder"):
+            raise ModelError(
+                "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the "
+                "node with the other"
+            )
+
+
+def _load(file: Path) -> UncertainLTI:
+    """Read a model file in a thread of its own, so that a file that cannot be read does not hold up the node."""
+    loaded: Future[UncertainLTI] = Future()
+
+    def load() -> None:
+        try:
+            loaded.set_result(UncertainLTI.load(file))
+        except Exception as error:
+            loaded.set_exception(error)
+
+    threading.Thread(target=load, name="model file", daemon=True).start()
+    try:
+        return loaded.result(_PATIENCE)
+    except TimeoutError:
+        raise ModelError(f"{file}: cannot be read within {_PATIENCE:g} s; copy it to a disk of this machine") from None
+
+
+def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | None = None) -> Session:
+    """Load a model file, and start a session with it."""
+    if not path:
+        raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
+    file = Path(path).expanduser()  # no shell does that behind :=
+    if not (file.is_absolute() or os.path.exists(file)):
+        raise ModelError(f"{path}: there is no such model file in {Path.cwd()}; give the whole path")
+    model = _load(file)
+    types = topic_types(model, path, _type_fields)
+    for names in (model.state_names, model.control_names):
+        sendable(names)
+
+    def make_reader(type_name: str, paths: Sequence[FieldPath]) -> MessageReader:
+        kind = message_class(type_name)
+        return MessageReader(
+            type_name, paths, _type_fields, lambda data: deserialize_message(data, kind), settings.largest_message
+        )
+
+    return Session(model, rule, types, _type_fields, make_reader, time.monotonic(), arming, settings.real("catch_up"))

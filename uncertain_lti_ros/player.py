@@ -36,8 +36,7 @@ from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.raw_messages import RawMessage
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
-from uncertain_lti_ros.process import Life, living
-from uncertain_lti_ros.terminal import Progress, hush, say, seconds, speed, tell
+from uncertain_lti_ros.process import Life, Progress, hush, living, say, seconds, speed, tell
 
 CLOCK = "/clock"
 _DEPTH = 1000

@@ -20,22 +20,23 @@ _BAD_USAGE, _FAULT, _INTERRUPTED = 2, 70, 130
 
 def envelope_monitor() -> int:
     """The live monitor."""
-    return _run("envelope_monitor")
+    return _run("envelope_monitor", "main")
 
 
 def plant() -> int:
     """The published engine."""
-    return _run("plant")
+    return _run("plant", "plant")
 
 
 def turbofan() -> int:
     """The nonlinear engine."""
-    return _run("turbofan")
+    return _run("plant", "turbofan")
 
 
-def _run(name: str) -> int:
+def _run(module: str, function: str) -> int:
+    name = module if function == "main" else function
     try:
-        main = import_module(f"uncertain_lti_ros.{name}").main
+        main = getattr(import_module(f"uncertain_lti_ros.{module}"), function)
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         absent = isinstance(error, ModuleNotFoundError) and package

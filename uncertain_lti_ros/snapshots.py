@@ -21,7 +21,7 @@ from uncertain_lti.monitor.outputs import RECORDED
 from uncertain_lti.monitor.session import Session
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.messages import definition
-from uncertain_lti_ros.settings import Settings
+from uncertain_lti_ros.parameters import Settings
 
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 

@@ -7,30 +7,91 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Subscription that takes the quality of service its publishers offer, and follows them when they change."""
+"""Topics of the node: subscriptions that take the quality of service offered, publishers of outputs, who listens.
+
+Events of the middleware are polled instead of handed to the executor: one that arrives while the executor removes its
+handler makes the events executor of Jazzy run Python without Python's lock, and the process dies (ros2/rclpy, issue
+1644). So what is destroyed while the process lives has its handlers taken out of the node, and a timer polls them.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from sensor_msgs.msg import JointState
 
-from uncertain_lti_ros.messages import full_name
-from uncertain_lti_ros.polled_events import PolledEvents
+from uncertain_lti.base.errors import ModelError
+from uncertain_lti.monitor.catch_up import MOST
+from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
+from uncertain_lti.monitor.sender import Sender
+from uncertain_lti.monitor.session import Session
+from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages
+from uncertain_lti_ros.messages import full_name, message_class
 
+POLL = 0.1
+"""s between two polls: who listens, and publishers that changed, are known that late at most."""
 DEPTH = 1000
 """Messages kept until they are taken: the graph does not show the depth of the publishers' queues."""
 RELIABILITY = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
 DURABILITY = {"volatile": DurabilityPolicy.VOLATILE, "transient_local": DurabilityPolicy.TRANSIENT_LOCAL}
 _NEVER_NS = 2**62
 """A deadline of this or more means none."""
+_OUTPUT_DEPTH = MOST // 5  # samples that a start or a stall may send at once; what readers have is kept no longer
+_LAST_WORDS = 1.0  # s that the end waits until readers have the last messages
+
+
+class PolledEvents:
+    """Event handlers of one publisher or subscription, outside the executor.
+
+    `node`: owner of the entity; `entity`: just created: the executor has not seen it yet.
+    """
+
+    def __init__(self, node: Node, entity: Publisher | Subscription) -> None:
+        handlers: Any = entity.event_handlers  # a list
+        self._handlers: list[Any] = list(handlers)
+        handlers.clear()  # the node no longer destroys them with the entity
+        for handler in self._handlers:
+            node.remove_waitable(handler)
+            handler.add_to_wait_set(_EVERY)
+
+    def poll(self) -> None:
+        """Call the callbacks of what has changed since the last poll."""
+        for handler in self._handlers:
+            handler.is_ready(_EVERY)
+            status = handler.take_data()
+            changes = (getattr(status, name, 0) for name in ("total_count_change", "current_count_change"))
+            if status is not None and any(changes):
+                handler.callback(status)
+
+    def destroy(self) -> None:
+        """Destroy the handlers; before their entity."""
+        for handler in self._handlers:
+            handler.destroy()
+        self._handlers.clear()
+
+
+class _WaitSet:
+    """A wait set in which everything is ready; a status without changes costs nothing."""
+
+    def add_event(self, _: Any) -> int:
+        return 0
+
+    def is_ready(self, _kind: str, _index: int) -> bool:
+        return True
+
+
+_EVERY = _WaitSet()
 
 
 @dataclass(frozen=True)
@@ -218,3 +279,96 @@ class MatchedSubscription:
 
     def _lost(self, event: Any) -> None:
         self._reported_lost += event.total_count_change
+
+
+def sendable(names: Sequence[str], velocities: bool = False) -> NamedVector:
+    """Messages with some names, checked against what the middleware reads from them."""
+    vector = NamedVector(names, velocities)
+    numbers = [0.0] * len(names)
+    same = JointState(name=list(names), position=numbers, velocity=numbers if velocities else [])
+    if deserialize_message(vector.template, JointState) != same:
+        raise ModelError(f"the names {', '.join(names)} cannot be sent as sensor_msgs/msg/JointState; rename them")
+    return vector
+
+
+class OutputPublisher:
+    """One topic of the node, and how many listen to it; takes serialised messages.
+
+    `node`: the node; `kind`: message class; `name`: of the topic, below the node's; `qos`: what is offered; `changed`:
+    called when there are more or fewer listeners; `send`: publishes the bytes of a message; `poll`: reads the events of
+    the middleware.
+    """
+
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
+        events = PublisherEventCallbacks(matched=self._matched)
+        self._node = node
+        self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
+        self._events = PolledEvents(node, self._publisher)
+        self.poll = self._events.poll
+        self._changed = changed
+        self.listeners = 0
+        # Past the check of the lifecycle state: the node publishes only while it is active.
+        self.send = self._publisher.handle.publish_raw
+
+    @property
+    def listeners(self) -> int:
+        """Subscriptions at the last poll."""
+        return self._listeners
+
+    @listeners.setter
+    def listeners(self, count: int) -> None:
+        """Take another number."""
+        self._listeners = count
+        self._changed()
+
+    def _matched(self, event: Any) -> None:
+        self.listeners = event.current_count
+
+    def destroy(self, patience: float) -> None:
+        """Stop publishing, once every reliable reader has everything."""
+        if self._listeners:
+            self._publisher.wait_for_all_acked(Duration(seconds=patience))
+        self._events.destroy()
+        self._node.destroy_lifecycle_publisher(self._publisher)
+
+
+class Outputs:
+    """The publishers of all `OUTPUTS`.
+
+    `node`: the node; `now`: steady time, s; `sender`: publishes on them; `publishers`: by name of the output; empty
+    while the node is not configured.
+    """
+
+    def __init__(self, node: LifecycleNode, now: float) -> None:
+        self._node = node
+        self.sender = Sender(now)
+        self.publishers: dict[str, OutputPublisher] = {}
+
+    def open(self, heartbeat: float) -> None:
+        """Make the publishers."""
+        qos = QoSProfile(depth=_OUTPUT_DEPTH)
+        beat = QoSProfile(depth=_OUTPUT_DEPTH, deadline=Duration(seconds=heartbeat))
+        kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        offers = {VIOLATION: beat, REASON: kept}
+        for output in OUTPUTS:
+            offered = offers.get(output, qos)
+            kind = message_class(output.type)
+            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered, self.sender.changed)
+        self.sender.open(self.publishers)
+
+    def prepare(self, session: Session) -> None:
+        """Lay out the messages of a model and its alarm."""
+        model = session.model
+        self.sender.prepare(VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names))
+
+    def poll(self) -> None:
+        """Update the numbers of listeners."""
+        for publisher in self.publishers.values():
+            publisher.poll()
+
+    def close(self) -> None:
+        """Stop publishing, once readers have what was published last."""
+        end = time.monotonic() + _LAST_WORDS
+        for publisher in self.publishers.values():
+            publisher.destroy(max(0.0, end - time.monotonic()))
+        self.publishers.clear()
