@@ -15,7 +15,7 @@
 Models and streams are those of `tests/perturbed.py`, by seed; every topic has header stamps, as of arrivals the node
 and a recording know different ones. A stream is published message by message as it would have been recorded, a pause
 of more than 0.4 s in 0.4 s. Compared are all outputs of each sample that `check` judges, to the last bit, and the
-changes of ~/violation.
+changes of ~/violation where no condition ends an alarm between samples.
 """
 
 from __future__ import annotations
@@ -79,6 +79,8 @@ def lagging(messages: Sequence[Message], lag_ns: int) -> list[Message]:
     found, newest = [], messages[0].log_time
     for one in messages:
         data = one.data
+        if len(data) < 4:
+            continue  # Fast DDS gives a reader nothing more of a topic on which a message of no bytes came
         if one.topic != GEAR and len(data) > 12 and not stamp_of(data):
             continue  # of those without one the time of receipt stands in, which a recording knows as another
         if one.topic == STATE and len(data) > 12:
@@ -172,7 +174,8 @@ def one_stream(world: World, folder: Path, seed: int, lag: int, steps: int) -> C
         if got != wanted and not (missing - more or more - missing or differs):
             found["out of order"] += 1
     found["differing"] = len(differs)
-    if changes([m.data for m in alarm.messages]) != changes([row["alarm"] for row in expected]):
+    # by a condition the alarm may be off for a moment between two samples, of which a check knows nothing
+    if not rule.enable and changes([m.data for m in alarm.messages]) != changes([row["alarm"] for row in expected]):
         found["other alarms"] += 1
     if found["withheld"] or found["differing"] or found["unexpected"] or found["other alarms"]:
         print(f"seed {seed}, lag {lag}: {dict(found)}; {'; '.join(parts_unlike)}", flush=True)

@@ -88,7 +88,8 @@ def _run(name: str, what: str, make: Callable[..., Callable[[], Transient]], arg
     def started(args: list[str]) -> int:
         with living(lambda: Plant(name), args) as life:
             node = life.node
-            return publish(life, make(node.given, lambda: node.get_clock().now().nanoseconds))
+            assert isinstance(node, Plant)
+            return publish(life, node, make(node.given, lambda: node.get_clock().now().nanoseconds))
 
     summary = f"Publishes {what} on {STATE_TOPIC} and {CONTROL_TOPIC}, once both have subscribers; then it ends."
     return run_node(name, summary, PARAMETERS[name], started, args)
@@ -104,10 +105,8 @@ class Plant(Node):
         self.outputs = tuple(self.create_publisher(JointState, topic, qos) for topic in (STATE_TOPIC, CONTROL_TOPIC))
 
 
-def publish(life: Life, make: Callable[[], Transient]) -> int:
+def publish(life: Life, node: Plant, make: Callable[[], Transient]) -> int:
     """Publish a transient once both topics have subscribers, and wait until it has been received."""
-    node = life.node
-    assert isinstance(node, Plant)
     publishers, wait = node.outputs, node.given["wait"]
     if not _subscribed(life, publishers, wait):
         if life.alive:
