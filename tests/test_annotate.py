@@ -299,6 +299,7 @@ def test_everything_recorded_is_in_the_copy(engine, tmp_path, compression, chunk
         assert len(summary.attachment_indexes) == 1 and len(summary.metadata_indexes) == 3
         assert [a.data for a in reader.iter_attachments()] == [b"\x00\x01" * 700_000]
         times = [m.log_time for _, _, m in reader.iter_messages(log_time_order=True)]
+        assert times == sorted(m[2] for m in held(tmp_path / "out.mcap").messages)
         assert times == sorted(times) and len(times) == summary.statistics.message_count
     with open(tmp_path / "out.mcap", "rb") as stream:
         assert len(list(NonSeekingReader(stream, validate_crcs=True).iter_messages())) == len(times)

@@ -112,9 +112,13 @@ class Scene:
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
-            inputs = {t: writer.channel(t, kind, self.definition(kind)) for t, kind in self.inputs.items()}
+
+            def declare(topic: str, kind: str) -> int:
+                return writer.channel(writer.schema(kind, "ros2msg", self.definition(kind).encode()), topic)
+
+            inputs = {topic: declare(topic, kind) for topic, kind in self.inputs.items()}
             outputs = {
-                output: writer.channel(self.outputs[output.name], output.type, self.definition(output.type))
+                output: declare(self.outputs[output.name], output.type)
                 for output in RECORDED
                 if output.name in self.outputs and (not output.position or output.name in encode)
             }

@@ -10,7 +10,7 @@
 """McapWriter: MCAP files with the standard library alone, for machines that only monitor.
 
 Chunked, indexed and with a summary (https://mcap.dev/spec), so that the usual tools open them; compressed where
-zstandard is installed, or as another file is.
+zstandard is installed.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from __future__ import annotations
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import BinaryIO
 
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC
 
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _CHUNK_INDEX = range(1, 9)
@@ -46,18 +47,6 @@ def _record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
-def schema_record(number: int, name: str, encoding: str, data: bytes) -> bytes:
-    """A schema as it is in a file."""
-    body = struct.pack("<H", number) + _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
-    return _record(_SCHEMA, body)
-
-
-def channel_record(number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> bytes:
-    """A channel as it is in a file."""
-    body = struct.pack("<HH", number, schema) + _text(topic) + _text(encoding) + _map(metadata)
-    return _record(_CHANNEL, body)
-
-
 def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
     if name == "lz4":
         import lz4.frame  # type: ignore[import-untyped]
@@ -75,18 +64,16 @@ def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
 class McapWriter:
     """Records to an open binary file, one after the other; `finish` ends it.
 
-    `stream`: open for writing; it stays open; `library`: who writes; `profile`: MCAP profile of the file;
-    `compression`: of the chunks made here: zstd, lz4 or "" for none; default zstd where it is installed.
+    `stream`: open for writing; it stays open; `library`: who writes; `compression`: of the chunks: zstd, lz4 or "" for
+    none; default zstd where it is installed.
     """
 
-    def __init__(self, stream: BinaryIO, library: str, profile: str = "ros2", compression: str | None = None) -> None:
+    def __init__(self, stream: BinaryIO, library: str, compression: str | None = None) -> None:
         self._stream, self._at, self._sum = stream, 0, 0
         self._name, self._compress = _compressor(compression)
-        self._schemas: dict[int, bytes] = {}
-        self._channels: dict[int, bytes] = {}
-        self._metadata: list[bytes] = []
-        self._attachments: list[bytes] = []
-        self._chunks: list[bytes] = []
+        self._numbers: dict[object, int] = {}  # of schemas and channels, by what they say
+        self._summary: dict[int, list[bytes]] = {_SCHEMA: [], _CHANNEL: [], _STATISTICS: []}
+        self._summary |= {_CHUNK_INDEX: [], _ATTACHMENT_INDEX: [], _METADATA_INDEX: []}
         self._counts: Counter[int] = Counter()
         self._parts: list[bytes] = []
         self._length = 0
@@ -94,28 +81,17 @@ class McapWriter:
         self._first: int | None = None
         self._last = 0
         self._begin_of_chunk, self._end_of_chunk = 0, 0
-        self._write(MAGIC + _record(_HEADER, _text(profile) + _text(library)))
+        self._write(MAGIC + _record(_HEADER, _text("ros2") + _text(library)))
 
-    def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
-        """Add named texts."""
-        self.copied_metadata(_text(name) + _map(pairs), name)
+    def schema(self, name: str, encoding: str, data: bytes) -> int:
+        """Number of a schema in the file, which has it or gets it."""
+        body = _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
+        return self._declare(_SCHEMA, body)
 
-    def channel(self, topic: str, type_name: str, definition: str) -> int:
-        """Declare a topic with CDR messages of a type that is defined as in .msg files."""
-        schema, number = max(self._schemas, default=0) + 1, max(self._channels, default=0) + 1
-        self.declare_schema(schema, type_name, "ros2msg", definition.encode())
-        self.declare_channel(number, schema, topic, "cdr", {})
-        return number
-
-    def declare_schema(self, number: int, name: str, encoding: str, data: bytes) -> None:
-        """Declare a schema."""
-        self._schemas[number] = schema_record(number, name, encoding, data)
-        self._write(self._schemas[number])
-
-    def declare_channel(self, number: int, schema: int, topic: str, encoding: str, metadata: Mapping[str, str]) -> None:
-        """Declare a channel."""
-        self._channels[number] = channel_record(number, schema, topic, encoding, metadata)
-        self._write(self._channels[number])
+    def channel(self, schema: int, topic: str, encoding: str = "cdr", metadata: Mapping[str, str] | None = None) -> int:
+        """Number of a channel in the file, which has it or gets it; schema 0 is none."""
+        body = struct.pack("<H", schema) + _text(topic) + _text(encoding) + _map(metadata or {})
+        return self._declare(_CHANNEL, body)
 
     def message(self, channel: int, log_time: int, data: bytes) -> None:
         """Add one message."""
@@ -131,36 +107,20 @@ class McapWriter:
         if self._length >= _CHUNK_BYTES:
             self._end_chunk()
 
-    def chunk(
-        self,
-        records: bytes,
-        index: Mapping[int, bytes | bytearray],
-        span: tuple[int, int],
-        packed: tuple[str, bytes] | None = None,
-    ) -> None:
-        """Add a chunk of records that stand as they are."""
+    def chunk(self, records: bytes, index: Mapping[int, bytes | bytearray], span: tuple[int, int]) -> None:
+        """Add a chunk of messages: their records, `INDEX_ENTRY` of each by channel, and first and last log time."""
         self._end_chunk()
-        self._write_chunk(records, index, span, packed)
+        self._write_chunk(records, index, span)
 
-    def copied_metadata(self, body: bytes, name: str) -> None:
-        """Add a metadata record."""
-        self._end_chunk()
-        record = _record(_METADATA, body)
-        self._metadata.append(_record(_METADATA_INDEX, struct.pack("<QQ", self._at, len(record)) + _text(name)))
-        self._write(record)
+    def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
+        """Add named texts."""
+        self._indexed(_METADATA, _text(name) + _map(pairs), _METADATA_INDEX, b"", _text(name))
 
-    def copied_attachment(self, pieces: Iterable[bytes], length: int, head: tuple[int, int, int, str, str]) -> None:
-        """Add an attachment."""
-        self._end_chunk()
-        start = self._at
-        self._write(struct.pack("<BQ", _ATTACHMENT, length))
-        for piece in pieces:
-            self._write(piece)
-        log_time, create_time, size, name, media_type = head
-        body = struct.pack("<QQQQQ", start, self._at - start, log_time, create_time, size)
-        self._attachments.append(_record(_ATTACHMENT_INDEX, body + _text(name) + _text(media_type)))
+    def attachment(self, body: bytes, about: bytes, name: str, media_type: str) -> None:
+        """Add an attachment as another file has it; `about`: its log time, time of creation and size of data."""
+        self._indexed(_ATTACHMENT, body, _ATTACHMENT_INDEX, about, _text(name) + _text(media_type))
 
-    def copied_record(self, opcode: int, body: bytes) -> None:
+    def record(self, opcode: int, body: bytes) -> None:
         """Add a record that no index knows, for example a private one."""
         self._end_chunk()
         self._write(_record(opcode, body))
@@ -170,17 +130,13 @@ class McapWriter:
         self._end_chunk()
         self._write(_record(_DATA_END, struct.pack("<I", self._sum)))
         counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
-        sizes = (len(self._schemas), len(self._channels), len(self._attachments), len(self._metadata))
-        statistics = struct.pack("<QHIIII", sum(self._counts.values()), *sizes, len(self._chunks))
+        kinds = (_SCHEMA, _CHANNEL, _ATTACHMENT_INDEX, _METADATA_INDEX, _CHUNK_INDEX)
+        statistics = struct.pack("<QHIIII", sum(self._counts.values()), *(len(self._summary[kind]) for kind in kinds))
         statistics += struct.pack("<QQI", self._first or 0, self._last, len(counts)) + counts
+        self._summary[_STATISTICS].append(_record(_STATISTICS, statistics))
         summary, offsets = self._at, b""
         self._sum = 0
-        groups = {
-            _SCHEMA: list(self._schemas.values()), _CHANNEL: list(self._channels.values()),
-            _STATISTICS: [_record(_STATISTICS, statistics)], _CHUNK_INDEX: self._chunks,
-            _ATTACHMENT_INDEX: self._attachments, _METADATA_INDEX: self._metadata,
-        }  # fmt: skip
-        for opcode, records in groups.items():
+        for opcode, records in self._summary.items():
             if records:
                 group = b"".join(records)
                 offsets += _record(_SUMMARY_OFFSET, struct.pack("<BQQ", opcode, self._at, len(group)))
@@ -189,20 +145,31 @@ class McapWriter:
         self._write(offsets + struct.pack("<BQQQ", _FOOTER, 20, summary, start))
         self._write(struct.pack("<I", self._sum) + MAGIC)
 
+    def _declare(self, opcode: int, body: bytes) -> int:
+        number = self._numbers.get((opcode, body), 0)
+        if not number:
+            number = self._numbers[opcode, body] = len(self._summary[opcode]) + 1
+            if number >= 1 << 16:
+                raise BagError(f"an MCAP file has at most {number - 1} topics and as many types; write fewer of them")
+            record = _record(opcode, struct.pack("<H", number) + body)
+            self._summary[opcode].append(record)
+            self._write(record)
+        return number
+
+    def _indexed(self, opcode: int, body: bytes, index: int, about: bytes, names: bytes) -> None:
+        self._end_chunk()
+        place = struct.pack("<QQ", self._at, len(body) + 9)
+        self._write(_record(opcode, body))
+        self._summary[index].append(_record(index, place + about + names))
+
     def _end_chunk(self) -> None:
         if self._parts:
             parts, index = self._parts, self._index
             self._parts, self._length, self._index = [], 0, {}
-            self._write_chunk(b"".join(parts), index, (self._begin_of_chunk, self._end_of_chunk), None)
+            self._write_chunk(b"".join(parts), index, (self._begin_of_chunk, self._end_of_chunk))
 
-    def _write_chunk(
-        self,
-        records: bytes,
-        index: Mapping[int, bytes | bytearray],
-        span: tuple[int, int],
-        packed: tuple[str, bytes] | None,
-    ) -> None:
-        name, data = (self._name, self._compress(records)) if packed is None else packed
+    def _write_chunk(self, records: bytes, index: Mapping[int, bytes | bytearray], span: tuple[int, int]) -> None:
+        name, data = self._name, self._compress(records)
         times = struct.pack("<QQ", *span)
         self._first = span[0] if self._first is None else min(self._first, span[0])
         self._last = max(self._last, span[1])
@@ -219,7 +186,7 @@ class McapWriter:
         self._write(indexes)
         body = times + struct.pack("<QQI", start, length + 9, len(places)) + places
         body += struct.pack("<Q", len(indexes)) + _text(name) + struct.pack("<QQ", len(data), len(records))
-        self._chunks.append(_record(_CHUNK_INDEX, body))
+        self._summary[_CHUNK_INDEX].append(_record(_CHUNK_INDEX, body))
 
     def _write(self, data: bytes) -> None:
         self._stream.write(data)

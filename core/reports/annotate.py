@@ -19,7 +19,8 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, repeat
 from pathlib import Path
@@ -41,7 +42,7 @@ from uncertain_lti.monitor.verdict_records import VerdictRecords
 from uncertain_lti.monitor.verdicts import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.containers import scan
-from uncertain_lti.recordings.mcap_copy import Copier, profile_of
+from uncertain_lti.recordings.mcap_copy import copy, declare
 from uncertain_lti.recordings.mcap_records import LATEST, Contents, count
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
@@ -129,14 +130,12 @@ def annotate(
         raise BagError(f"{output.parent}: cannot be made: {error.strerror}; choose another folder") from None
     try:
         with whole_file(output) as stream:
-            profile = "ros2" if contents[0].converted else profile_of(contents[0].path)
-            writer = McapWriter(stream, f"uncertain-lti {__version__}", profile, _compression(contents))
-            copier = Copier(writer)
-            numbers = [copier.declare(part) for part in contents]
+            writer = McapWriter(stream, f"uncertain-lti {__version__}", _compression(contents))
+            numbers = [declare(writer, part) for part in contents]
             base = _base({c.topic for part in contents for c in part.channels.values()})
             there = names_of(model.state_names, model.steps, verdicts.statistic_names)
             channels = {
-                output.name: copier.channel(_schema(copier, contents, output.type), f"{base}/{output.name}", "cdr", {})
+                output.name: writer.channel(_schema(writer, contents, output.type), f"{base}/{output.name}")
                 for output in RECORDED
                 if there[output.of]
             }
@@ -145,36 +144,35 @@ def annotate(
             reasons = over_recording(verdicts, model)
             verdict_stream = _VerdictStream(writer, records, verdicts, decisions, reasons, channels[REASON.name])
             total = sum(part.count for part in contents)
-            counted: Iterable[object] = _weave(copier, contents, numbers, verdict_stream)
+            left_out, notes = Counter[Path](), list[str]()
+
+            def weave() -> Iterator[int]:
+                """Copy block after block, verdicts in between; yields the messages of each block."""
+                horizon = 0
+                for part, renumbered in zip(contents, numbers, strict=True):
+                    for there, copied, last in copy(writer, part, renumbered, notes):
+                        left_out[part.path] += there - copied
+                        horizon = min(max(horizon, last), LATEST)  # of other topics it may be anything
+                        verdict_stream.until(horizon)
+                        yield there
+                verdict_stream.finish()
+
+            steps: Iterable[object] = weave()
             if progress is not None:
-                counts = _weave(copier, contents, numbers, verdict_stream)
-                counted = progress(chain.from_iterable(repeat(None, count) for count in counts), total)
-            for _ in counted:
+                steps = progress(chain.from_iterable(repeat(None, number) for number in weave()), total)
+            for _ in steps:
                 pass
             writer.finish()
     except OSError as error:
         why = error.strerror or error
         raise BagError(f"{output}: cannot be written: {why}; make room or choose another place") from None
-    notes = list(copier.notes)
-    for part, number in copier.unconverted.items():
-        total -= number
-        notes.append(f"{part}: {count(number, 'message')} that cannot be converted to CDR not copied")
+    for path, number in left_out.items():
+        if number:
+            notes.append(f"{path}: {count(number, 'message')} that cannot be converted to CDR not copied")
+    total -= left_out.total()
     if base != NODE:
         notes.append(f"{output}: the recording has topics below {NODE}, so the verdicts are below {base}")
     return Annotated(output, total, len(verdict_stream), base, tuple(notes))
-
-
-def _weave(
-    copier: Copier, contents: Sequence[Contents], numbers: Sequence[Mapping[int, int]], verdict_stream: _VerdictStream
-) -> Iterator[int]:
-    """Copy block after block, verdicts in between; yields the messages of each block."""
-    horizon = 0
-    for part, renumbered in zip(contents, numbers, strict=True):
-        for messages, last in copier.copy(part, renumbered):
-            horizon = min(max(horizon, last), LATEST)  # of other topics it may be anything
-            verdict_stream.until(horizon)
-            yield messages
-    verdict_stream.finish()
 
 
 class _VerdictStream:
@@ -262,15 +260,15 @@ def _base(topics: set[str]) -> str:
     return base
 
 
-def _schema(copier: Copier, contents: Sequence[Contents], type_name: str) -> int:
+def _schema(writer: McapWriter, contents: Sequence[Contents], type_name: str) -> int:
     """The recording's own schema of a type where it is that of ROS 2 Jazzy; two texts of one type confuse readers."""
     ours = define(type_name, "ros2msg", jazzy_text(type_name).encode())
     for schema in (schema for part in contents for schema in part.schemas.values()):
         if schema.name == type_name and schema.data.strip():
             theirs = define(schema.name, schema.encoding, schema.data)
             if not theirs.reason and _fields(theirs.types) == _fields(ours.types):
-                return copier.schema(schema.name, schema.encoding, schema.data)
-    return copier.schema(type_name, "ros2msg", jazzy_text(type_name).encode())
+                return writer.schema(schema.name, schema.encoding, schema.data)
+    return writer.schema(type_name, "ros2msg", jazzy_text(type_name).encode())
 
 
 def _fields(types: object) -> str:
