@@ -36,10 +36,9 @@ COMPILED = {
     "kernel.arithmetic": "-O3",  # its loops are vectorised
     "monitor.envelope_monitor": "-O1",
     "monitor.intake": "-O1",
-    "monitor.sender": "-O1",
+    "monitor.outputs": "-O1",
     "monitor.stream": "-O1",
     "monitor.verdict": "-O1",
-    "monitor.verdict_messages": "-O1",
     "recordings.mcap_walk": "-O2",
     "recordings.message_reader": "-O3",
     "sampling.sampler": "-O2",

@@ -148,7 +148,7 @@ def publish(n: int, rate: float, seconds: float, left: float, stamps: str, await
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
 
-    from uncertain_lti.monitor.verdict_messages import NamedVector
+    from uncertain_lti.monitor.outputs import NamedVector
 
     rclpy.init()
     node = rclpy.create_node("publisher")
@@ -214,7 +214,7 @@ def relay(n: int, names: list[str]) -> None:
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Bool
 
-    from uncertain_lti.monitor.verdict_messages import FALSE, NamedVector
+    from uncertain_lti.monitor.outputs import FALSE, NamedVector
     from uncertain_lti_ros.process import spare_the_middleware
 
     spare_the_middleware()  # as the monitor does
@@ -330,7 +330,7 @@ def digest(file: str) -> None:
 def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any]:
     """The same checksums of a check of every sample sent, and how often the alarm was raised."""
     from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-    from uncertain_lti.monitor.verdict_records import VerdictRecords
+    from uncertain_lti.monitor.outputs import VerdictRecords
     from uncertain_lti.recordings.mcap_records import MESSAGE
 
     model = UncertainLTI.load(model_path)

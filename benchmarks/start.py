@@ -79,7 +79,7 @@ def publish_rclpy(rate: float, reliability: str, topics: list[str]) -> None:
     from rclpy.qos import QoSProfile, ReliabilityPolicy
     from sensor_msgs.msg import JointState
 
-    from uncertain_lti.monitor.verdict_messages import NamedVector
+    from uncertain_lti.monitor.outputs import NamedVector
 
     rclpy.init()
     node = rclpy.create_node("publisher")

@@ -34,7 +34,7 @@ from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
-from uncertain_lti.monitor.arming import Condition
+from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.deployed import DeployedMonitor
 from uncertain_lti.monitor.session import Rule, Session, listed_states, topic_types
 from uncertain_lti.recordings.bag import Bag

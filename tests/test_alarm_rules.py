@@ -23,8 +23,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
-from uncertain_lti.monitor.alarm import Alarm, Nearest
-from uncertain_lti.monitor.arming import back_and_restarts, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Nearest, back_and_restarts, steps_back
 
 ZEROS = np.zeros((2, 2))
 RULES = (

@@ -37,10 +37,8 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor import outputs
-from uncertain_lti.monitor.outputs import NODE, RECORDED
+from uncertain_lti.monitor.outputs import FALSE, NODE, RECORDED, TRUE, NamedVector, VerdictRecords
 from uncertain_lti.monitor.reason import over_recording
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, NamedVector
-from uncertain_lti.monitor.verdict_records import VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings

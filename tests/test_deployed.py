@@ -20,7 +20,7 @@ from uncertain_lti import EnvelopeMonitor, read_transients
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
-from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.monitor.alarm import Arming, Condition
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
 from uncertain_lti.recordings.bag import Bag

@@ -29,8 +29,7 @@ from rclpy.serialization import deserialize_message
 from ros_processes import World, open_world
 from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, Plant, by_hand, joint_state, saved, vector
 
-from uncertain_lti.monitor.event_log import EventLog
-from uncertain_lti.monitor.session import OK, STALE, WARN, Rule, Session, topic_types
+from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti_ros.messages import live_fields, message_class
 

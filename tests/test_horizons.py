@@ -28,7 +28,7 @@ from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
 from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
-from uncertain_lti.monitor.foreseen import Foreseen
+from uncertain_lti.monitor.verdict import Foreseen
 from uncertain_lti.monitor.verdict import place as place_of
 from uncertain_lti.sampling.sampler import Sampler, Step
 from uncertain_lti.sampling.status import Status

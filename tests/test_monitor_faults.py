@@ -33,10 +33,10 @@ from conftest import ROOT
 from uncertain_lti import UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.monitor.live_rule import Rule
-from uncertain_lti.monitor.sender import Sender
+from uncertain_lti.monitor.deployed import Rule
+from uncertain_lti.monitor.intake import Sender
+from uncertain_lti.monitor.outputs import TRUE
 from uncertain_lti.monitor.verdict import Verdict
-from uncertain_lti.monitor.verdict_messages import TRUE
 from uncertain_lti.sampling.status import Status
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")

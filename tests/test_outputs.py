@@ -19,10 +19,19 @@ from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.terms import ARRAYS
-from uncertain_lti.monitor.outputs import OUTPUTS, REASON, RECORDED, VECTOR_TYPE, VIOLATION, Output, names_of
+from uncertain_lti.monitor.outputs import (
+    OUTPUTS,
+    REASON,
+    RECORDED,
+    VECTOR_TYPE,
+    VIOLATION,
+    NamedVector,
+    Output,
+    VerdictMessages,
+    VerdictRecords,
+    names_of,
+)
 from uncertain_lti.monitor.verdict import NUMBERS, place
-from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages
-from uncertain_lti.monitor.verdict_records import VerdictRecords
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status

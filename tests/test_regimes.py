@@ -28,7 +28,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.figures import matrices_figure, save
 from uncertain_lti.reports.regimes import block_facts, check_regimes, unknown_in_words
 from uncertain_lti.reports.reliance import CARE, UNKNOWN

@@ -27,7 +27,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.monitor.arming import back_and_restarts
+from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.reports.validation_text import validation_text
 from uncertain_lti.validation.blocks import cut, remaining_spans
 from uncertain_lti.validation.false_alarms import raised_on

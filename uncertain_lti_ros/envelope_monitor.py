@@ -29,11 +29,9 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.arming import Condition
-from uncertain_lti.monitor.event_log import EventLog
-from uncertain_lti.monitor.failures import Failures
+from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
-from uncertain_lti.monitor.session import ERROR, STALE, WARN, Report, Rule, Session
+from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti_ros.arguments import BAD_USAGE, declare, run_node, whole_to_real
 from uncertain_lti_ros.diagnostics import Diagnostics, input_values

@@ -27,7 +27,7 @@ from rclpy.validate_topic_name import validate_topic_name
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.arming import Arming
+from uncertain_lti.monitor.alarm import Arming
 from uncertain_lti.monitor.catch_up import WINDOW
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader

@@ -33,10 +33,9 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.catch_up import MOST
-from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION
-from uncertain_lti.monitor.sender import Sender
+from uncertain_lti.monitor.intake import Sender
+from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION, NamedVector, VerdictMessages
 from uncertain_lti.monitor.session import Session
-from uncertain_lti.monitor.verdict_messages import NamedVector, VerdictMessages
 from uncertain_lti_ros.messages import full_name, message_class
 
 POLL = 0.1

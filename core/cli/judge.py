@@ -39,7 +39,7 @@ from uncertain_lti.cli.command import (
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
     from uncertain_lti.monitor.deployed import DeployedMonitor
-    from uncertain_lti.monitor.verdicts import Verdicts
+    from uncertain_lti.monitor.verdict import Verdicts
     from uncertain_lti.recordings.recording import Progress, Recording
     from uncertain_lti.reports.interactive import Plotted
     from uncertain_lti.sampling.sampler_arrays import Decisions
@@ -74,9 +74,8 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
     """The monitor that the options of `add_rule_arguments` describe."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.model.file import read_rules
-    from uncertain_lti.monitor.arming import Condition
-    from uncertain_lti.monitor.deployed import DeployedMonitor
-    from uncertain_lti.monitor.live_rule import listed_states
+    from uncertain_lti.monitor.alarm import Condition
+    from uncertain_lti.monitor.deployed import DeployedMonitor, listed_states
 
     if options.rules is not None:
         rules = read_rules(options.rules)

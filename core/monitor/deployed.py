@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""DeployedMonitor: judges a recording as the node would, with everything that keeps its alarm quiet or raised."""
+"""A monitor as it is deployed: the rule that parameters give, and a recording judged as the node would judge it."""
 
 from __future__ import annotations
 
@@ -19,14 +19,46 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.alarm import Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.transient import Transient
 
 LONGEST_GRACE = 86400.0
 """s; that of the node's parameter."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rule:
+    """Alarm rule as the parameters give it; 0 means that of the model.
+
+    `violations`: m of the rule; `window`: n of the rule, in verdicts; `margin`: multiplies the half-widths; `masked`:
+    states that do not count, separated by commas; `enable`: see `Condition`; empty for none; `enable_type`: message
+    type of its topic; empty for that of the model or of the graph; `grace`: time of grace, s; `latch`: whether an alarm
+    lasts until it is reset.
+    """
+
+    violations: int = 0
+    window: int = 0
+    margin: float = 0.0
+    masked: str = ""
+    enable: str = ""
+    enable_type: str = ""
+    grace: float = 0.0
+    latch: bool = False
+
+    def monitor(self, model: UncertainLTI) -> EnvelopeMonitor:
+        """Monitor of a model under this rule."""
+        return EnvelopeMonitor(
+            model, self.violations or None, self.window or None, self.margin or None, listed_states(self.masked)
+        )
+
+
+def listed_states(text: str) -> list[str]:
+    """Names of states, separated by commas."""
+    return [name.strip() for name in text.split(",") if name.strip()]
 
 
 @dataclasses.dataclass(frozen=True)

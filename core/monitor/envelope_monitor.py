@@ -29,12 +29,9 @@ from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.repeats import walk
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Alarm, residual_row
-from uncertain_lti.monitor.arming import Armed, back_and_restarts, steps_back
-from uncertain_lti.monitor.foreseen import Foreseen
+from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, residual_row, steps_back
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
-from uncertain_lti.monitor.verdict import Verdict
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
 from uncertain_lti.sampling.sampler import Step, all_finite
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient, Transitions, controls_as

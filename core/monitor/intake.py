@@ -7,22 +7,241 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What a live monitor does with each message: it is accepted, judged, remembered, and what follows is published."""
+"""What a live monitor does with each message: it is accepted, judged, remembered, and what follows is published.
+
+Messages are laid out for outputs with subscribers, then sent together.
+"""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Protocol
 
 import cython
 
 from uncertain_lti.monitor.catch_up import Waiting
-from uncertain_lti.monitor.sender import Sender
+from uncertain_lti.monitor.outputs import FALSE, FLAGS, REASON, TRUE, VIOLATION, Encoder, VerdictMessages, text_message
 from uncertain_lti.monitor.snapshot import Entry
+from uncertain_lti.monitor.stream import Stream
 from uncertain_lti.monitor.verdict import Verdict
 
 _AT_ONCE, _PAUSE = 200, 0.01  # messages that had waited are taken so many at once, with so many s in between
+_SLOW = 0.0001  # s of processor time for one message; 3 to 40 µs, unless Fast DDS makes the way to a reader anew
+_PATIENCE = 60  # messages of one topic that are sent so slowly, less those that are not
+_REST_OF_FLAGS, _REST = 1.5, 6.0  # times its processor time pass after a slow message; of others, for each slow topic
+_FORGET = 1.0  # s without a message of a topic, and how slow it was is found out again
+
+
+class Publisher(Protocol):
+    """What sends the bytes of messages on one topic, and how many listen to it."""
+
+    listeners: int
+    send: Any
+
+
+@cython.cclass
+class _Way:
+    """The way to the readers of one topic, and how slow it is.
+
+    `tried`: steady time of the last message, s; `until`: no further message before this steady time.
+    """
+
+    name: str
+    send: Any
+    slow: cython.Py_ssize_t
+    tried: cython.double
+    until: cython.double
+
+    def __init__(self, name: str, publisher: Publisher) -> None:
+        self.name, self.send = name, publisher.send
+        self.slow, self.tried, self.until = 0, -math.inf, -math.inf
+
+    @cython.cfunc
+    def is_slow(self, now: cython.double) -> cython.bint:
+        """Whether sending has been slow lately."""
+        return self.slow >= _PATIENCE and now - self.tried < _FORGET
+
+
+@cython.cclass
+class _Heard:
+    """Ways to the readers of vectors that somebody listens to, and what makes their messages of a verdict."""
+
+    ways: list[Any]
+    encoder: Encoder
+
+    def __init__(self, ways: Sequence[Any], encoder: Encoder) -> None:
+        self.ways, self.encoder = list(ways), encoder
+
+    @cython.cfunc
+    def lay_out(self, verdict: Any, ways: list[Any], messages: list[bytes]) -> None:
+        """Add the messages of a verdict, or of what is predicted, and the way that each goes."""
+        ways += self.ways
+        messages += self.encoder(verdict)
+
+
+@cython.cclass
+class Sender:
+    """Sends what is published of verdicts.
+
+    `now`: steady time, s; `alarm_sent`: when ~/violation was last published, steady time in s; `held_back`: messages
+    that were not published, as sending on their topic took so long that inputs would have been lost.
+    """
+
+    alarm_sent: float = cython.declare(cython.double, visibility="readonly")
+    held_back: int = cython.declare(cython.Py_ssize_t, visibility="readonly")
+    _ways: dict[str, Any]
+    _publishers: Mapping[str, Publisher] = cython.declare(object)
+    _messages: VerdictMessages = cython.declare(object)
+    _reason_sent: str = cython.declare(object)
+    _known: cython.bint  # who listens; otherwise it must be found out
+    _given: Any  # None where nobody listens, for a message without a verdict, one with, and what is predicted
+    _judged: Any
+    _predicted: Any
+    _foreseen: Any
+    _violation: Any
+    _reason: Any
+    _alarm_heard: cython.bint
+    _reason_heard: cython.bint
+
+    def __init__(self, now: float) -> None:
+        self.alarm_sent, self.held_back = now, 0
+        self._ways = {}
+        self._known = self._alarm_heard = self._reason_heard = False
+        self._reason_sent = ""
+        self._given = self._judged = self._predicted = self._foreseen = None
+
+    def open(self, publishers: Mapping[str, Publisher]) -> None:
+        """Send through other publishers from now on."""
+        self._publishers = publishers
+        self._violation, self._reason = publishers[VIOLATION.name], publishers[REASON.name]
+        self._reason_sent, self._known = "", False
+
+    def prepare(self, messages: VerdictMessages) -> None:
+        """Lay out other messages from now on."""
+        self._messages, self._known = messages, False
+
+    def changed(self) -> None:
+        """There are more or fewer listeners, or nothing is sent for now; which ways are slow is found out again."""
+        self._known, self._ways = False, {}
+
+    def _heard(self, *when: str) -> Any:
+        outputs = self._messages.outputs
+        names = [name for name in outputs if outputs[name].when in when and self._publishers[name].listeners]
+        return _Heard([self._ways[name] for name in names], self._messages.encoder(names)) if names else None
+
+    def _listen(self) -> None:
+        """Choose the vectors that somebody listens to, and lay out their messages."""
+        self._ways = {name: _Way(name, publisher) for name, publisher in self._publishers.items()}
+        self._given, self._judged = self._heard("message"), self._heard("message", "judged")
+        self._predicted, self._foreseen = self._heard("predicted"), self._heard("predicted over")
+        self._alarm_heard, self._reason_heard = self._violation.listeners > 0, self._reason.listeners > 0
+        self._known = True
+
+    def publish(self, session: Stream, verdicts: Sequence[Verdict], opened: bool, now: float, turned: bool) -> None:
+        """Publish on the topics that have subscribers.
+
+        First all messages are laid out, then all are sent together: threads of the middleware that are woken by
+        one message then find the others too, and need not be woken again.
+
+        A subscriber that stands still can make sending on its topics a hundred times slower, so that inputs would be
+        lost. Then messages of these topics are held back as far as they would take too much of the processor.
+        """
+        heard: _Heard
+        if not self._known:
+            self._listen()
+        ways: list[Any] = []
+        messages: list[bytes] = []
+        beats: cython.bint = False
+        for verdict in verdicts:
+            judged: cython.bint = verdict.judged
+            heard = self._judged if judged else self._given
+            if heard is not None:
+                heard.lay_out(verdict, ways, messages)
+            beats = beats or judged
+        if beats and self._alarm_heard and not turned:
+            self.alarm_sent = now
+            ways.append(self._ways[VIOLATION.name])
+            messages.append(TRUE if session.alarm else FALSE)
+        if opened and self._predicted is not None and (expected := session.predict()) is not None:
+            heard = self._predicted
+            heard.lay_out(expected, ways, messages)
+        if opened and self._foreseen is not None and (foreseen := session.foresee()) is not None:
+            heard = self._foreseen
+            heard.lay_out(foreseen, ways, messages)
+        if messages:
+            self._send(ways, messages)
+        if turned:
+            self.send_alarm(session.alarm, now)
+        if self._reason_heard:
+            self.send_reason(session.reasons.text)
+
+    @cython.cfunc
+    def _send(self, ways: list[Any], messages: list[bytes]) -> None:
+        i: cython.Py_ssize_t
+        way: _Way
+        began: cython.double = time.thread_time()  # not by the steady clock: the processor may be busy with others
+        for i in range(len(messages)):
+            way = ways[i]
+            if way.slow >= _PATIENCE and self._rests(way):
+                continue
+            way.send(messages[i])
+            ended: cython.double = time.thread_time()
+            if ended - began > _SLOW:
+                self._was_slow(way, ended - began)
+            elif way.slow > 0:
+                way.slow -= 1
+            began = ended
+
+    @cython.cfunc
+    def _rests(self, way: _Way) -> cython.bint:
+        """Whether a message is held back on a slow way."""
+        now: cython.double = time.monotonic()
+        if now - way.tried >= _FORGET:
+            way.slow = 0
+            return False
+        if now >= way.until:
+            return False
+        self.held_back += 1
+        return True
+
+    @cython.cfunc
+    def _was_slow(self, way: _Way, took: cython.double) -> None:
+        now: cython.double = time.monotonic()
+        if now - way.tried >= _FORGET:
+            way.slow = 0
+        way.slow, way.tried = min(way.slow + 1, 2 * _PATIENCE), now
+        rest: cython.double = _REST_OF_FLAGS if way.name == FLAGS.name else _REST * len(self.slow_topics())
+        way.until = now + rest * took
+
+    def slow_topics(self) -> list[str]:
+        """Outputs whose messages are held back in part, as sending them takes too long."""
+        now, found = time.monotonic(), []
+        for way in self._ways.values():
+            known: _Way = way
+            if known.is_slow(now):
+                found.append(known.name)
+        return found
+
+    @property
+    def problems(self) -> list[str]:
+        """On which outputs messages are held back, one sentence; none if there are none."""
+        if not (names := self.slow_topics()):
+            return []
+        topics = ", ".join(f"~/{name}" for name in names)
+        return [f"a subscriber of {topics} stands still: sending to it takes so long that messages are held back there"]
+
+    def send_alarm(self, alarm: bool, now: float) -> None:
+        """Publish ~/violation."""
+        self.alarm_sent = now
+        self._violation.send(TRUE if alarm else FALSE)
+
+    def send_reason(self, text: str) -> None:
+        """Publish ~/reason if it has changed."""
+        if text != self._reason_sent:
+            self._reason_sent = text
+            self._reason.send(text_message(text))
 
 
 @cython.cclass

@@ -21,8 +21,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
 from uncertain_lti.model.jumps import jumps, jumps_in_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, row_of
-from uncertain_lti.monitor.verdict import Verdict
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdict, Verdicts
 from uncertain_lti.sampling.status import Status
 
 WHY = {

@@ -22,10 +22,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.outputs import FLAG_TYPE, REASON, RECORDED
+from uncertain_lti.monitor.outputs import FALSE, FLAG_TYPE, REASON, RECORDED, TRUE, VerdictMessages, text_message
 from uncertain_lti.monitor.reason import Reasons
 from uncertain_lti.monitor.verdict import Verdict
-from uncertain_lti.monitor.verdict_messages import FALSE, TRUE, VerdictMessages, text_message
 from uncertain_lti.recordings.mcap_writer import McapWriter
 
 _OVERHEAD = 800  # bytes that one kept message takes besides its data, a verdict on it included

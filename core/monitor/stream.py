@@ -22,14 +22,13 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.arming import Arming, Condition
+from uncertain_lti.monitor.alarm import Arming, Condition
 from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Lags, Waiting
+from uncertain_lti.monitor.deployed import Rule
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.monitor.foreseen import Foreseen
 from uncertain_lti.monitor.likeness import Explainer
-from uncertain_lti.monitor.live_rule import Rule
 from uncertain_lti.monitor.reason import QUIET, Reasons
-from uncertain_lti.monitor.verdict import Verdict
+from uncertain_lti.monitor.verdict import Foreseen, Verdict
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
 from uncertain_lti.sampling.counters import LATE
 from uncertain_lti.sampling.instants import to_ns

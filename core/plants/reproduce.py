@@ -28,7 +28,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.plants.turbofan import engine
 from uncertain_lti.plants.turbofan_control import operating_point, trim

@@ -35,11 +35,9 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, names_of
+from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, VerdictRecords, names_of, text_message
 from uncertain_lti.monitor.reason import over_recording
-from uncertain_lti.monitor.verdict_messages import text_message
-from uncertain_lti.monitor.verdict_records import VerdictRecords
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.containers import scan
 from uncertain_lti.recordings.mcap_copy import copy, declare

@@ -29,7 +29,7 @@ from uncertain_lti.base.english import plural, shortlist, times
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 
 PIXELS = 1200
 """Columns of an image."""

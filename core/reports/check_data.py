@@ -23,7 +23,7 @@ from uncertain_lti.model.jumps import jump_words, jumps
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
 from uncertain_lti.reports.regimes import check_regimes, sample_blocks, unknown_in_words
 from uncertain_lti.sampling.reading import unused

@@ -30,7 +30,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import FEW, Chart, Columns, Map, Panel
 from uncertain_lti.reports.tables import shortened

@@ -24,7 +24,7 @@ from uncertain_lti.base.english import plural, times
 from uncertain_lti.base.files import sha256
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check_data import check_data
 from uncertain_lti.reports.detectable_text import detectable_data
 from uncertain_lti.reports.regimes import block_facts, blocks_in_words

@@ -33,7 +33,7 @@ from markupsafe import Markup, escape
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Chart, Columns, Map, Panel

@@ -28,7 +28,7 @@ from markupsafe import Markup
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Series, Spans
 from uncertain_lti.reports.html import asset, environment

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.tables import list_of, numbers_of
 
 MOST_REGIMES = 24

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.arming import back_and_restarts
+from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.validation.extrapolation import Reach

@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.signature import Signature, closeness
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.likeness import AHEAD, LEAST, MATCH, Pattern, scaled
-from uncertain_lti.monitor.verdicts import Verdicts
+from uncertain_lti.monitor.verdict import Verdicts
 
 
 @dataclass(frozen=True)
