@@ -209,14 +209,26 @@ class Verdict:
         return list[float](self._judgement.numbers(_OF_JUDGEMENT[name]).tolist())
 
     def packed(self) -> bytes:
-        """All numbers as bytes, one kind after another, as little-endian doubles; `place` says where each is."""
+        """All numbers, one kind after another; `place` says where each is.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles.
+        """
         n = len(self._after)
         state = _packer(n)(*self._after)
         numbers = _nothing(n) if self._judgement is None else self._judgement.packed()
         return state + numbers if self._longer is None else state + numbers + bytes(self._longer.tobytes())
 
     def packed_statistics(self) -> bytes:
-        """`statistics` as little-endian doubles."""
+        """`statistics` as bytes.
+
+        Returns
+        -------
+        bytes
+            Little-endian doubles.
+        """
         found = self.statistics if self._statistics is None else self._statistics
         return bytes(found.tobytes())
 
