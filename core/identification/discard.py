@@ -148,7 +148,7 @@ def _value(row: Row, criterion: str, weights: Array | None) -> float:
         return (row.limit or 0.0) * row.limit_unit
     d = row.d[row.free_psi] / (row.unit_psi * row.scale)
     weight = 1.0 if weights is None else float(weights[row.i])
-    return weight * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.linear @ d)
+    return weight * row.largest * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.linear @ d)
 
 
 def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:

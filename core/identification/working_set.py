@@ -22,7 +22,6 @@ from uncertain_lti.base.cores import on_cores, one_by_one
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.identification.coupled import Coupled
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Samples
 from uncertain_lti.identification.programmes import GOOD, WIDTH_SLACK, Programmes
@@ -108,7 +107,8 @@ class WorkingSet:
         self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
-        self._coupled: Coupled | None = None  # (10) with full weights: the rows share a programme
+        self._together = False  # (10) with full weights: the rows meet in the objective
+        self._least_eigenvalue: float | None = None  # of full weights, once it is needed
         self._like: Row | None = None  # the row that held samples last
 
     def quadratic(self) -> Solution:
@@ -178,24 +178,24 @@ class WorkingSet:
         return scaled * row.scale**2 + row.least_value() * row.scale**2
 
     def _coupled_quadratic(self) -> Solution:
-        """(10) with full weights: all rows in one programme, then one row after the other if that is not good."""
-        self._coupled = coupled = Coupled(self.fleet, self.sums, self.programmes, self.shared is not None)
+        """(10) with full weights: one row after the other, in refined coordinates if that is not good."""
+        self._together, gap = True, np.inf
         try:
-            self._start(self._settle_coupled)
-            self._prove(self._settle_coupled)
-            gap = coupled.gap if coupled.gap <= GOOD else min(coupled.gap, coupled.linear_gap())
-            if gap + coupled.loss() <= GOOD:
-                return replace(self._solution(), gap=gap)
+            self._start(self._settle_in_turn)
+            self._prove(self._settle_in_turn)
+            gap = self.coupled_gap()
         except InfeasibleError:
             raise
         except FitError:
             pass
-        for row in self.rows:
-            if not row.refined:
-                self.programmes[row.i].refine()
-        self._settle_in_turn(self.rows[0])
-        self._prove(self._settle_in_turn)
-        return replace(self._solution(), gap=coupled.linear_gap())
+        if not gap <= GOOD:
+            for own in self.programmes:
+                if not own.row.refined:
+                    own.refine()
+            self._settle_in_turn(self.rows[0])
+            self._prove(self._settle_in_turn)
+            gap = self.coupled_gap()
+        return replace(self._solution(), gap=gap)
 
     def _settle_in_turn(self, _: Row) -> None:
         """(10) with full weights by one row at a time, the others as they are.
@@ -215,6 +215,56 @@ class WorkingSet:
             if value >= before * (1.0 - 1e-11):
                 return
             before = value
+
+    def coupled_gap(self) -> float:
+        """As `Programmes.linear_gap`, with full weights: the rows meet in the objective alone.
+
+        Unlike without full weights, the objective may fall as a half-width grows, by rounding at least: there the
+        linearisation has no minimum but for what the squared widths themselves allow (`_at_most`).
+        """
+        coupled = self.sums.coupled
+        assert coupled is not None
+        flat = np.concatenate([row.d for row in self.rows])
+        slopes = (coupled @ flat).reshape(len(self.rows), -1)
+        diagonals, scale = np.diagonal(coupled).reshape(slopes.shape), self.sums.psi_scale
+        weights = (diagonals[:, scale > 0] / scale[scale > 0] ** 2).max(axis=1, initial=0.0)  # Σ w_ii, about
+        least = sum(row.least_value() * row.scale**2 * weight for row, weight in zip(self.rows, weights, strict=True))
+        value = max(0.5 * float(flat @ slopes.ravel()), least, 1e-300)
+        above = 0.0
+        for own, slope, diagonal in zip(self.programmes, slopes, diagonals, strict=True):
+            row = own.row
+            if not row.unknown:
+                continue
+            slope = row.psi_columns.take(slope) * row.unit_psi * row.scale
+            largest = float(np.abs(slope).max(initial=0.0))
+            _, d = row.scaled()
+            falls = bool((slope < 0.0).any())
+            if not falls and largest * (float(d.sum()) + 1.0) <= 1e-12 * value:  # nothing to gain
+                continue
+            try:
+                most = self._at_most(row, diagonal) if falls else None
+                above += float(slope @ d) - own.least_linear(slope / largest, most) * largest
+            except FitError:
+                return np.inf
+        return max(above, 0.0) / value
+
+    def _at_most(self, row: Row, diagonal: Array) -> Array:
+        """Largest scaled half-widths that the optimum of (10) with full weights can have, (q,) of the free ones.
+
+        Σ w' W w over the samples is at least λ Σ w_ii w_i², with λ the least eigenvalue of any W whose diagonal is
+        scaled to ones; and no product of two half-widths of a row is negative, so that each alone is bounded. What
+        the row is now, lifted over what it violates, is no less than the optimum on the samples held.
+
+        `diagonal` (q,): of Σ (Δt ψ)(Δt ψ)ᵀ w_ii.
+        """
+        if self._least_eigenvalue is None:
+            self._least_eigenvalue = max(self.fleet.least_eigenvalue(), 1e-300)
+        coupled = self.sums.coupled
+        assert coupled is not None
+        flat = np.concatenate([other.d + other.outside() * other.size_unit * other.scale for other in self.rows])
+        square = 4.0 * float(flat @ coupled @ flat)  # some room for what the structure does not let be lifted
+        own = row.psi_columns.take(diagonal) * (row.unit_psi * row.scale) ** 2
+        return np.asarray(np.sqrt(square / (self._least_eigenvalue * np.maximum(own, 1e-300))))
 
     def linear(self) -> Solution:
         """Solve (11), then least sum of squared widths among its optima, then the centre."""
@@ -336,8 +386,8 @@ class WorkingSet:
         self._each(self.rows, settle)
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
-        """Settle rows on all cores, which the solvers do without the lock; those that share a programme at once."""
-        if self._coupled is not None:
+        """Settle rows on all cores, which the solvers do without the lock; with full weights, all at once."""
+        if self._together:
             settle(rows[0])
             return
         began = said = perf_counter()
@@ -350,7 +400,7 @@ class WorkingSet:
 
     def _groups(self, rows: list[Row]) -> list[list[Row]]:
         """Rows whose samples fit in memory together; with full weights, all."""
-        if self._coupled is not None or self.whole:
+        if self._together or self.whole:
             return [rows]
         columns, count = self.fleet.columns, self.fleet.columns.count
         each = 8 * SUBSAMPLE * (3 * self.fleet.p + len(columns.nominal) + len(columns.half)) * count
@@ -402,7 +452,7 @@ class WorkingSet:
             ]
             if not again:
                 return
-            rows = self.rows if self._coupled is not None else again
+            rows = self.rows if self._together else again
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
     def _candidate(self, reach: Array, room: Array, most: int, rows: list[Row]) -> Candidate:
@@ -497,12 +547,3 @@ class WorkingSet:
         if len(slack) and slack[worst] < -1e-9:
             distance = float(-slack[worst] * row.sizes(worst) * row.scale)
             raise InfeasibleError(row.i, int(row.samples.index[worst]), distance)
-
-    def _settle_coupled(self, _: Row) -> None:
-        assert self._coupled is not None
-        for _number in range(MAX_ROUNDS):
-            self.solvers.add(self._coupled.solve())
-            self.rounds += 1
-            if not any([row.widen_pool() for row in self.rows]):
-                return
-        raise FitError(f"the working set did not settle in {MAX_ROUNDS} rounds; scale the signals to order one")
