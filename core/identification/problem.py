@@ -50,33 +50,13 @@ class Block:
         """Number of states."""
         return len(self.x_next)
 
-    def piece(self, start: int, stop: int) -> Block:
-        """Some consecutive transitions, without a copy."""
-        weights = self.weights if self.weights.ndim == 1 else self.weights[start:stop]
-        part = slice(start, stop)
-        s = None if self.s is None else self.s[:, part]
-        base = None if self.base is None else self.base[:, part]
-        return Block(self.start + start, self.z[:, part], self.x_next[:, part], self.dt[part], weights, s, base)
-
     def every(self, first: int, stride: int) -> Block:
         """A copy of every stride-th transition from the first."""
-        weights = self.weights if self.weights.ndim == 1 else self.weights[first::stride].copy()
         part = slice(first, None, stride)
-        s = None if self.s is None else self.s[:, part].copy()
-        base = None if self.base is None else self.base[:, part].copy()
-        return Block(
-            self.start, self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy(), weights, s, base
-        )
-
-    def take(self, index: NDArray[np.intp]) -> Block:
-        """A copy of some transitions.
-
-        `index` (K,): positions in the block.
-        """
-        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
-        s = None if self.s is None else self.s[:, index]
-        base = None if self.base is None else self.base[:, index]
-        return Block(self.start, self.z[:, index], self.x_next[:, index], self.dt[index], weights, s, base)
+        weights = self.weights if self.weights.ndim == 1 else self.weights[part].copy()
+        s, base = (None if rows is None else rows[:, part].copy() for rows in (self.s, self.base))
+        z, x_next, dt = self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy()
+        return Block(self.start, z, x_next, dt, weights, s, base)
 
     @property
     def origin(self) -> Array:
@@ -91,11 +71,6 @@ class Block:
         rate = self.x_next - self.origin
         rate /= self.dt
         return rate
-
-    @property
-    def signals(self) -> Array:
-        """[x; u; s], (p + q, K)."""
-        return self.z if self.s is None else np.vstack([self.z, self.s])
 
     def phi(self, columns: Columns) -> Array:
         """Regressors of the nominal row.
@@ -212,11 +187,9 @@ class Problem:
     def block(self, part: slice) -> Block:
         """Transitions of a slice, without a copy."""
         weights = self.weights if self.weights.ndim == 1 else self.weights[part]
-        s = None if self.s_columns is None else self.s_columns[:, part]
-        base = None if self.base_columns is None else self.base_columns[:, part]
-        return Block(
-            part.start or 0, self.z_columns[:, part], self.next_columns[:, part], self.dt[part], weights, s, base
-        )
+        s, base = (None if rows is None else rows[:, part] for rows in (self.s_columns, self.base_columns))
+        z, x_next = self.z_columns[:, part], self.next_columns[:, part]
+        return Block(part.start or 0, z, x_next, self.dt[part], weights, s, base)
 
     def blocks(self) -> Iterator[Block]:
         """All transitions, in blocks."""
@@ -253,21 +226,12 @@ class Problem:
 
     def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
         """The same problem on some transitions; a slice is no copy."""
-        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
         z, x_next = self.z_columns[:, index], self.next_columns[:, index]
         if not isinstance(index, slice):  # numpy would lay the copy out in rows
             z, x_next = np.ascontiguousarray(z), np.ascontiguousarray(x_next)
-        return Problem(
-            z,
-            x_next,
-            self.dt[index],
-            self.source[index],
-            self.k[index],
-            weights,
-            self.columns,
-            None if self.s_columns is None else self.s_columns[:, index],
-            None if self.base_columns is None else self.base_columns[:, index],
-        )
+        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
+        s, base = (None if rows is None else rows[:, index] for rows in (self.s_columns, self.base_columns))
+        return Problem(z, x_next, self.dt[index], self.source[index], self.k[index], weights, self.columns, s, base)
 
     def without(self, index: NDArray[np.intp]) -> Problem:
         """The same problem without some transitions."""
