@@ -11,6 +11,7 @@
 
 import io
 import json
+import sys
 from contextlib import redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -22,13 +23,13 @@ pytest.importorskip("scipy", reason="scipy, which the experiment needs, is not i
 pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, is not installed")
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.plants.leibov import leibov2006, transient
 
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from direct_search import direct_search  # noqa: E402
 
 
 def objective(model, transients):
@@ -64,16 +65,6 @@ def test_the_direct_search_finds_an_interval_that_can_be_told_by_hand():
     found = direct_search([run])
     assert found.model.A[0, 0] == pytest.approx(-1.0, abs=1e-3)
     assert found.model.dA[0, 0] == pytest.approx(0.5, abs=1e-3)
-
-
-def test_the_direct_search_refuses_what_it_cannot_do():
-    run = transient(60, 1)
-    with pytest.raises(FitError, match="no signals"):
-        direct_search([Transient(run.t, run.x, run.u)])
-    x = run.x.copy()
-    x[1] += 0.01  # at rest before
-    with pytest.raises(FitError, match="at rest"):
-        direct_search([Transient(run.t_ns, x, run.u, signals=run.signals)])
 
 
 def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
@@ -135,8 +126,6 @@ def test_the_experiment_shows_what_it_must(experiment):
         assert max(case(data, "±30%, noise 0.0001", criterion)["mean_width"]) > 0.05  # what pure intervals cost
         spools = [v[0] for v in wide["eigenvalues"][:2]]
         assert spools == pytest.approx([-1.6, -2.0], rel=0.1)
-    for search in data["direct_search"]:
-        assert search["exact"] <= search["direct_search"] < 1.1 * search["exact"]
 
 
 @pytest.mark.slow
@@ -145,7 +134,7 @@ def test_the_experiment_leaves_figures_models_and_numbers(experiment):
     for name in ("check.png", "check_paper_pulses.png"):
         assert (folder / name).read_bytes().startswith(b"\x89PNG")
     text = (folder / "reproduce.txt").read_text()
-    for word in ("-15.59", "published", "direct search", "thrust", "outside domain"):
+    for word in ("-15.59", "published", "thrust", "outside domain"):
         assert word in text
     models = list(folder.glob("*.model.json"))
     assert len(models) == len(data["cases"])

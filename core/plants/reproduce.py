@@ -25,7 +25,6 @@ from scipy.linalg import expm
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.direct_search import direct_search
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.monitor.verdict import Verdicts
@@ -132,22 +131,6 @@ def reproduce(
     first, chosen = cases[0], next(c for c in cases if c.name == wide)
     tell(eigenvalue_text({f"(10) from {paper}": first.model, f"(10) from {wide}": chosen.model}))
     tell(matrix_text(chosen.model, f"(10) from {wide}"))
-    searches = []
-    for name, transients in ((paper, [up]), (wide, large)):
-        step(f"direct search from {name}")
-        exact = next(c for c in cases if c.name == name)
-        found = direct_search(transients)
-        searches.append(
-            {
-                "identified_from": name,
-                "exact": exact.numbers["objective"],
-                "direct_search": found.objective,
-                "exact_seconds": exact.numbers["seconds"],
-                "direct_search_seconds": found.seconds,
-                "evaluations": found.evaluations,
-            }
-        )
-    tell(search_text(searches))
     for case in cases:
         label = case.name.replace(" (the paper's)", "").replace(", noise 0.0001", "_noise")
         name = label.replace("±", "both").replace("+", "up").replace("%", "")
@@ -158,7 +141,6 @@ def reproduce(
         save(utilisation_figure(case.model, case.verdicts), folder / f"{name}_utilisation.png")
     data = {
         "cases": [c.numbers for c in cases],
-        "direct_search": searches,
         "published_eigenvalues": [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()],
     }
     for name, text in (("reproduce.json", json.dumps(data, indent=1)), ("reproduce.txt", "\n\n".join(lines))):
@@ -251,17 +233,3 @@ def matrix_text(model: UncertainLTI, name: str) -> str:
         ]
         parts.append(f"A, B [1/s], {title}\n" + table(("", *SHORT, *SHORT_CONTROLS), rows))
     return "\n\n".join(parts)
-
-
-def search_text(searches: Sequence[dict[str, Any]]) -> str:
-    """The paper's solver compared with the exact one."""
-    rows = [
-        [
-            s["identified_from"], number(s["exact"]), number(s["direct_search"]),
-            f"{s['direct_search'] / s['exact'] - 1:+.1%}", f"{s['exact_seconds']:.2f}",
-            f"{s['direct_search_seconds']:.2f}", f"{s['direct_search_seconds'] / s['exact_seconds']:.0f}",
-        ]
-        for s in searches
-    ]  # fmt: skip
-    header = ("identified from", "(10), exact", "direct search", "above", "exact [s]", "direct [s]", "ratio of times")
-    return "The paper's solver, direct search by golden section, and the exact one\n" + table(header, rows)
