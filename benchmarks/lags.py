@@ -76,7 +76,7 @@ def stamp_of(data: bytes) -> int:
 
 def lagging(messages: Sequence[Message], lag_ns: int) -> list[Message]:
     """The messages with stamps of the controls behind, and a stamp on those of the gear."""
-    found, newest = [], messages[0].log_time
+    found, newest = [], perturbed.EPOCH_NS
     for one in messages:
         data = one.data
         if len(data) < 4:
@@ -211,16 +211,17 @@ def main() -> None:
     parser.add_argument("--streams", type=int, default=50)
     parser.add_argument("--steps", type=int, default=500, help="samples of a stream, 0.01 s each")
     parser.add_argument("--lags", type=int, nargs="+", default=[0, 1, 2, 3, 4, 5], help="in steps")
+    parser.add_argument("--seeds", type=int, nargs="+", help="instead of so many from the first on")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--busy", type=int, default=0, metavar="N", help="processes that keep the machine busy")
     args = parser.parse_args()
     total = Counter[str]()
     with busy(args.busy):
-        for i in range(args.streams):
+        seeds = args.seeds or range(args.first, args.first + args.streams)
+        for i, seed in enumerate(seeds):
             with tempfile.TemporaryDirectory() as folder, open_world(Path(folder)) as world:
-                seed, lag = args.first + i, args.lags[i % len(args.lags)]
-                total += one_stream(world, Path(folder), seed, lag, args.steps)
-                print(f"{i + 1} of {args.streams}: {dict(total)}", flush=True)
+                total += one_stream(world, Path(folder), seed, args.lags[seed % len(args.lags)], args.steps)
+                print(f"{i + 1} of {len(seeds)}: {dict(total)}", flush=True)
     print(", ".join(f"{count} {name}" for name, count in total.items()))
 
 

@@ -103,7 +103,7 @@ def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSu
     kind = message_class(type_name)
     channel = file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
     return MatchedSubscription(
-        node, topic, type_name, kind, lambda data: file.write(channel, clock.now().nanoseconds, data), raw=True
+        node, topic, type_name, kind, lambda data, _: file.write(channel, clock.now().nanoseconds, data), raw=True
     )
 
 

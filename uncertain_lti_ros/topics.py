@@ -147,11 +147,11 @@ class MatchedSubscription:
     """Subscription to one topic whose QoS `look` compares with the graph.
 
     `node`: the node; `topic`: as in the model or on the command line; expanded and remapped by the node; `type_name`:
-    `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw;
-    `requested`: what the user requests; `raw`: whether the callback takes bytes; `received, lost, late`: messages
-    received, those lost on the way or in the queue, and deadlines missed by publishers; `last`: the last message;
-    `publishers`: publishers of this type that the graph knows; `problems`: publishers that cannot be heard and why, one
-    sentence each.
+    `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw, and
+    when it was published, ns by its publisher; `requested`: what the user requests; `raw`: whether the callback takes
+    bytes; `received, lost, late`: messages received, those lost on the way or in the queue, and deadlines missed by
+    publishers; `last`: the last message; `publishers`: publishers of this type that the graph knows; `problems`:
+    publishers that cannot be heard and why, one sentence each.
 
     The middleware reports what its writer gives up, and not what full queues of this reader push out; the numbers that
     a publisher gives its messages show both, as long as it is the only one.
@@ -163,7 +163,7 @@ class MatchedSubscription:
         topic: str,
         type_name: str,
         message_class: Any,
-        callback: Callable[[Any], None],
+        callback: Callable[[Any, int], None],
         requested: RequestedQos = RequestedQos(),
         raw: bool = False,
     ) -> None:
@@ -261,7 +261,7 @@ class MatchedSubscription:
         if before is not None and number is not None and number != before + 1:
             self._count_skipped(number - before - 1)
         self._number = number
-        self._callback(message)
+        self._callback(message, info["source_timestamp"])
 
     def _count_skipped(self, skipped: int) -> None:
         """Take a jump in the numbers of messages; it says nothing if they fall, or come from several publishers."""

@@ -273,15 +273,17 @@ class Intake:
         self._sender, self._memory, self._turned, self._failed = sender, memory, turned, failed
         self.session, self.active, self.clock = None, False, None
 
-    def message(self, topic: str, data: bytes) -> None:
-        """Take a message as it arrives."""
+    def message(self, topic: str, data: bytes, sent_ns: int = 0) -> None:
+        """Take a message as it arrives; `sent_ns`: when it was published, 0 if that is not known."""
         session = self.session
         if session is None or not self.active:
             return
         now = time.monotonic()
         try:
-            arrival_ns = time.time_ns() if self.clock is None else self.clock()
-            messages = session.accept(topic, arrival_ns, data, now)
+            received_ns = time.time_ns()
+            arrival_ns = received_ns if self.clock is None else self.clock()
+            late = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
+            messages = session.accept(topic, arrival_ns, data, now, sent_ns, late)
         except Exception as error:
             self._note(session, topic, error)
         else:

@@ -12,8 +12,9 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from statistics import median
 from typing import Any
 
 import cython
@@ -23,7 +24,7 @@ from uncertain_lti.model.jumps import jumps_in_words
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Arming, Condition
-from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Lags, Waiting
+from uncertain_lti.monitor.catch_up import STALL, WINDOW, CatchUp, Waiting
 from uncertain_lti.monitor.deployed import Rule
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.monitor.likeness import Explainer
@@ -42,6 +43,7 @@ SHOWN = 5
 FUTURE = 1.0
 """s that a stamp may be ahead of the clock before it is reported."""
 
+_LOOKS, _MOST_LOOKS = 3, 50  # looks at the stamps of a topic by which its usual lag is known, and of the last ones
 _OK = Status.OK  # looking up one of an enumeration is slow
 _FUTURE_NS = to_ns(FUTURE)
 _NOTHING: tuple[Verdict, ...] = ()
@@ -168,7 +170,7 @@ class Stream:
     _came: cython.double
     _quiet: cython.Py_ssize_t  # verdicts without an alarm since the last one with
     _catches_up: Any
-    _lags: Any
+    _behind: Any
     _reads_condition: Any
 
     def __init__(
@@ -212,8 +214,8 @@ class Stream:
         self._heard: dict[str, float] = {}
         self._began, self._judged = now, -math.inf
         self._came = now
-        self._lags = Lags()
-        self._catches_up = self._catch_up(self._stamped) if math.isfinite(self._stall) else None
+        self._behind: dict[str, deque[float]] = {}
+        self._catches_up = self._catch_up(self._stamped, start=True) if math.isfinite(self._stall) else None
         self.reordered, self.caught_up = 0, ""
         self.period = Period(now)
 
@@ -333,45 +335,43 @@ class Stream:
         self.latched, self.sampler.counters = latched, counters
         self.failures += 1
 
-    def _catch_up(self, awaited: Sequence[str], since: float | None = None) -> CatchUp:
-        step, max_gap = self.model.sampling.dt_median or 0.0, to_ns(self.sampler.signals.max_gap)
-        clock, start = self.sampler.clock, since is None
-        return CatchUp(clock, self._stamped, awaited, step, max_gap, self._window, start, self._lags, since or 0.0)
-
-    def _look_at_lag(self) -> None:
-        latest, heard = self.sampler.latest(), self._heard.get(self.sampler.clock)
-        if latest is not None and heard is not None:
-            self._lags.look(heard, latest[0])
-            for topic in self._stamped:
-                if topic in self._heard and (kept := self.sampler.kept(topic)) and kept[-1][0]:
-                    self._lags.look_at(topic, self._heard[topic], kept[-1][0])
+    def _catch_up(self, awaited: Sequence[str], start: bool) -> CatchUp:
+        return CatchUp([self.sampler.clock, *awaited], self._window, start)
 
     @property
     def lags(self) -> dict[str, float]:
         """Topics whose stamps lag those of the clock topic by more than a step, and by how much, s."""
-        step = to_ns(self.model.sampling.dt_median or 0.0)
-        return {topic: behind * 1e-9 for topic, behind in self._lags.behind().items() if step and behind > step}
+        step = self.model.sampling.dt_median or math.inf
+        lags = {topic: median(behind) for topic, behind in self._behind.items() if len(behind) >= _LOOKS}
+        return {topic: lag for topic, lag in lags.items() if lag > step}
 
-    def accept(self, topic: str, arrival_ns: int, data: bytes, now: float) -> Sequence[Waiting]:
+    def _look_at_lags(self) -> None:
+        latest, clock = self.sampler.latest(), self._heard.get(self.sampler.clock, 0.0)
+        for topic in self._stamped:
+            kept = self.sampler.kept(topic)
+            if latest is not None and kept and kept[-1][0]:
+                behind = self._behind.setdefault(topic, deque(maxlen=_MOST_LOOKS))
+                behind.append((latest[0] - kept[-1][0]) * 1e-9 + self._heard[topic] - clock)
+
+    def accept(
+        self, topic: str, arrival_ns: int, data: bytes, now: float, sent_ns: int = 0, late: float = 0.0
+    ) -> Sequence[Waiting]:
         """Receive one serialised message, and tell which messages are to be taken now.
 
         That is this message, except at the start and after a stall, when messages wait until topics have caught
         up with each other (`CatchUp`). Then `release` has to be called every now and then.
+
+        `sent_ns`: when it was published, by the clock of its publisher; 0 if that is not known; `late`: s since then.
         """
         before, self._came = self._came, now
         if self._catches_up is None:
             if now - before <= self._stall:
                 return ((topic, arrival_ns, data),)
             lately = [t for t in self._stamped if self._heard.get(t, -math.inf) >= before - self._stall]
-            self._catches_up = self._catch_up(lately, before)
-        stamp_ns = None
-        if topic in self._readers and self.sampler.signals.time[topic] == "header":
-            try:
-                stamp_ns = self._readers[topic].read(data)[0]
-            except UnreadableError:
-                return ((topic, arrival_ns, data),)  # it decides nothing
+            self._catches_up = self._catch_up(lately, start=False)
+        if topic in self._readers:
             self._heard[topic] = now
-        self._catches_up.put(topic, arrival_ns, data, stamp_ns, now)
+        self._catches_up.put((topic, arrival_ns, data), sent_ns, late, now)
         return self.release(now)
 
     def release(self, now: float, all_of_them: bool = False) -> Sequence[Waiting]:
@@ -379,16 +379,16 @@ class Stream:
         waits = self._catches_up
         if waits is None:
             if math.isfinite(self._stall):
-                self._look_at_lag()
+                self._look_at_lags()
             return ()
         before = waits.reordered
         released = waits.finish(now) if all_of_them else waits.ready(now)
         self.reordered += waits.reordered - before
         if waits.over:
-            self._catches_up, self._lags.since = None, now
+            self._catches_up = None
             if waits.reordered:
                 self.caught_up = (
-                    f"topics arrived one after another, up to {waits.behind_ns * 1e-9:.3g} s apart; "
+                    f"topics arrived one after another, up to {waits.late:.3g} s late; "
                     f"{waits.reordered} messages were put in order, for which verdicts waited {waits.took:.2f} s"
                 )
         return released
