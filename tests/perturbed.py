@@ -480,7 +480,7 @@ def of_a_swapped_model(rng: np.random.Generator, folder: Path) -> tuple[list[Row
 
 
 def held_up_on_the_way(rng: np.random.Generator, folder: Path) -> tuple[list[Row], list[Row]]:
-    """Topics come in bursts at the start and after a stop, with a lag and in disorder; expected is what comes without bursts."""
+    """Topics come in bursts at the start and after a stop, in disorder and with a lag; expected: as without bursts."""
     while (model := armed_model(rng)).q:  # by time of receipt, a topic that is held up is another one
         pass
     lag = rng.integers(0, 11) * STEP_NS // 2  # of the stamps of the controls
