@@ -62,8 +62,8 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.recordings.raw_messages import RawMessage
-from uncertain_lti.recordings.stamps import header_stamp_ns
+from uncertain_lti.recordings.message_reader import header_stamp_ns
+from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import FieldType
 

@@ -28,7 +28,7 @@ from uncertain_lti import read_transients
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.containers import scan
+from uncertain_lti.recordings.bag_files import survey
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
 from uncertain_lti.signals.signal_map import SignalMap
@@ -352,5 +352,5 @@ def test_a_flipped_bit_loses_no_message_in_silence(converted, kind, tmp_path):
 def test_a_scan_leaves_nothing_beside_the_file(converted, tmp_path):
     path = tmp_path / "a.db3"
     shutil.copy(converted["db3"], path)
-    scan(path)
+    survey(path)
     assert list(tmp_path.iterdir()) == [path]

@@ -34,7 +34,7 @@ from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.stamps import header_stamp_ns
+from uncertain_lti.recordings.message_reader import header_stamp_ns
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status

@@ -14,7 +14,6 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
-import threading
 import zlib
 from pathlib import Path
 
@@ -24,12 +23,10 @@ import pytest
 from bag_writer import Layout, float64
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
-import uncertain_lti.recordings.mcap_batches
+import uncertain_lti.recordings.bag_arrays
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
-from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))
@@ -38,7 +35,7 @@ XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),)
 @pytest.fixture(autouse=True)
 def small_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     """So that a short file has many."""
-    monkeypatch.setattr(uncertain_lti.recordings.mcap_batches, "_BATCH", 6000)
+    monkeypatch.setattr(uncertain_lti.recordings.bag_arrays, "_BATCH", 6000)
 
 
 def recording(folder: Path, compression: str, chunk_size: int) -> Path:
@@ -147,19 +144,3 @@ def test_damaged_files(tmp_path: Path, compression: str, chunk_size: int) -> Non
             del data[at : at + dice.randint(1, 300)]
         path.write_bytes(data)
         assert outcome(path, by_message=False) == outcome(path, by_message=True), f"damage {damage} at {at}"
-
-
-@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-def test_a_reading_that_is_broken_off_leaves_no_thread(tmp_path: Path, compression: str) -> None:
-    bag = Bag(recording(tmp_path, compression, 300), indexed=True)
-
-    def broken(items, total):  # type: ignore[no-untyped-def]
-        for number, item in enumerate(items):
-            if number == total // 2:
-                raise KeyboardInterrupt
-            yield item
-
-    before = threading.active_count()
-    with pytest.raises(KeyboardInterrupt):
-        read_columns(bag, ["/x"], [[FieldPath("position[2]")]], broken)
-    assert threading.active_count() == before

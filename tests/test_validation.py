@@ -451,7 +451,7 @@ def test_fit_prints_and_stores_what_leaving_out_gives(folder, capsys):
 
 def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     """Folder, metadata and name group; what the fit was told, validate goes by."""
-    from uncertain_lti.recordings.bag_metadata import metadata_pairs
+    from uncertain_lti.recordings.bag_files import metadata_pairs
 
     bags = []
     for seed in range(6):

@@ -7,41 +7,45 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Bag: one MCAP recording as decoded messages in order of log time."""
+"""Bag: one recording of ROS messages, decoded in order of log time, and which recordings some paths name."""
 
 from __future__ import annotations
 
 import heapq
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.files import natural
 from uncertain_lti.recordings.bag_arrays import in_reach, read_columns
-from uncertain_lti.recordings.bag_files import parts_of
-from uncertain_lti.recordings.bag_seams import not_one_recording
-from uncertain_lti.recordings.containers import outline_or_scan, scan
+from uncertain_lti.recordings.bag_files import (
+    listed_parts,
+    not_one_recording,
+    parts_of,
+    stem_and_index,
+    survey,
+)
 from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages
-from uncertain_lti.recordings.message_types import define, lines_of, normal_name, undefined
-from uncertain_lti.recordings.raw_messages import RawMessage, RecordedChannel
+from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, normal_name, undefined
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo
 from uncertain_lti.recordings.topic_facts import topic_facts
 from uncertain_lti.recordings.unreadable import os_error
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import FieldType, TypeFields
 
-__all__ = ["Bag"]
+__all__ = ["Bag", "group_bags"]
 
 
 _MOST_LINES = 100_000  # of definitions that are read in one file
 _MOST_NAMES = 50  # of topics in an error
 _MOST_HELD = 1 << 30  # bytes
 _SIZE_OF_AN_ENTRY = 400  # bytes; in memory, with what Python puts around it
-_NEVER: tuple[int, ...] = (2**64,)
+_NEVER = 2**64
 _LEAST_LINES = 50  # that a definition counts for, however short it is
 
 
@@ -71,9 +75,8 @@ class Bag:
         self.path = Path(path)
         self._warnings: list[str] = []
         self._undecoded: dict[str, str] = {}
-        survey = outline_or_scan if indexed else scan
-        contents = [part if isinstance(part, Contents) else survey(Path(part)) for part in parts]
-        self._take(contents or self._open(survey))
+        contents = [part if isinstance(part, Contents) else survey(Path(part), indexed) for part in parts]
+        self._take(contents or self._open(indexed))
 
     def _take(self, contents: list[Contents]) -> None:
         self._contents = contents
@@ -92,7 +95,7 @@ class Bag:
         if self.indexed:
             self._warnings = self._folder_warnings
             self._undecoded = {}
-            self._take([scan(part.path) if part.indexed else part for part in self._contents])
+            self._take([survey(part.path) if part.indexed else part for part in self._contents])
 
     def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
         """Each file, and its channels that count for some topics."""
@@ -184,24 +187,24 @@ class Bag:
             self._require(topic, readable=False)
         return self._sorted([_of(channels, wanted) for channels in self._channels])
 
-    def _open(self, survey: Callable[[Path], Contents]) -> list[Contents]:
+    def _open(self, indexed: bool) -> list[Contents]:
         try:
             if self.path.is_dir():
-                return self._folder(survey)
+                return self._folder(indexed)
             if self.path.exists() and not self.path.is_file():
                 raise BagError(f"{self.path}: neither a file nor a folder; check the path")
-            return [survey(self.path)]
+            return [survey(self.path, indexed)]
         except OSError as error:
             raise os_error(self.path, error) from None
 
-    def _folder(self, survey: Callable[[Path], Contents]) -> list[Contents]:
+    def _folder(self, indexed: bool) -> list[Contents]:
         paths, listed, self._warnings = parts_of(self.path)
         contents = []
         for path in paths:
             if len(paths) > 1 and not path.stat().st_size:  # the part that was open when the power went
                 self._warnings.append(f"{path}: the file is empty; it is left out")
             else:
-                contents.append(survey(path))
+                contents.append(survey(path, indexed))
         if not listed and (why := not_one_recording(contents)):
             raise BagError(
                 f"{self.path}: without a metadata.yaml its files do not look like one recording ({why}); name them "
@@ -294,37 +297,26 @@ class Bag:
                 if not block.channels.isdisjoint(wanted):
                     blocks.append((block.start, part, number, block))
         blocks.sort(key=lambda entry: entry[:3])
-        # What is pending of each block: place of its first message, size, and its messages, the first one last.
-        pending: list[tuple[tuple[int, ...], int, list[tuple[int, int, int, int, RawMessage]]]] = []
+        pending: list[tuple[int, int, int, int, RawMessage]] = []  # a heap; no two have the same place
         held = 0
         for position, (_, part, number, block) in enumerate(blocks):
             wanted = channels[part]
             records = self._contents[part].records(block, wanted)
-            found: list[tuple[int, int, int, int, RawMessage]] = []
             for key, log_time, publish_time, begin, end in messages(records):
                 if channel := wanted.get(key):
                     raw = RawMessage(log_time, publish_time, records[begin:end], channel)
-                    found.append((log_time, part, number, begin, raw))
-            if found:
-                found.sort(reverse=True)  # never compares messages: no two have the same place
-                size = sum(len(entry[4].data) + _SIZE_OF_AN_ENTRY for entry in found)
-                heapq.heappush(pending, (found[-1][:4], size, found))
-                held += size
-            if held > _MOST_HELD and len(pending) > 1:
+                    heapq.heappush(pending, (log_time, part, number, begin, raw))
+                    held += end - begin + _SIZE_OF_AN_ENTRY
+            following = blocks[position + 1][0] if position + 1 < len(blocks) else _NEVER
+            while pending and pending[0][0] < following:
+                raw = heapq.heappop(pending)[4]
+                held -= len(raw.data) + _SIZE_OF_AN_ENTRY
+                yield raw
+            if held > _MOST_HELD:
                 raise BagError(
                     f"{self.path}: its messages are so far out of order that more than {_MOST_HELD >> 20} MiB of them "
                     f"have to wait; put them in order with `mcap sort`"
                 )
-            following = (blocks[position + 1][0],) if position + 1 < len(blocks) else _NEVER
-            while pending and pending[0][0] < following:
-                _, size, found = heapq.heappop(pending)
-                limit = min(following, pending[0][0]) if pending else following
-                while found and found[-1] < limit:
-                    yield found.pop()[4]
-                if found:
-                    heapq.heappush(pending, (found[-1][:4], size, found))
-                else:
-                    held -= size
 
 
 def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool = False) -> dict[int, RecordedChannel]:
@@ -360,3 +352,48 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
             channel.topic, type_name, channel.message_encoding, schema, channel.metadata, definition
         )
     return channels
+
+
+def group_bags(paths: Sequence[Path], indexed: bool = False) -> list[Bag]:
+    """Bags that some paths name, in the order of their first mention.
+
+    A folder is one recording. Files are one recording each, except the parts of a split bag: files
+    `<stem>_<i>.mcap` of one stem in one folder that either
+
+    - are listed together in the metadata.yaml of their folder, or
+    - are numbered 0, 1, 2, ... without a hole, carry the same topics, and follow each other in log time
+      without a break: each begins at most 1 s, or the longest pause inside one of them, after the one
+      before ends, and overlaps it by no more than 10 % of the shorter (messages at a seam may be out of order).
+
+    In doubt files stay apart: that loses the one transition at a seam, while joining two runs would invent one.
+    """
+    order: list[tuple[Path, str]] = []
+    files: dict[tuple[Path, str], list[Path]] = {}
+    for path in paths:
+        pair = None if path.is_dir() else stem_and_index(path)
+        group = (path.parent, f"{pair[0]}_*.mcap" if pair else path.name)
+        if group not in files or path.is_dir():
+            order.append(group)
+        files.setdefault(group, []).append(path)
+    bags = []
+    for group in order:
+        bags += _group(files[group], indexed)
+    return bags
+
+
+def _group(paths: list[Path], indexed: bool) -> list[Bag]:
+    if len(paths) == 1 or len(set(paths)) < len(paths):
+        return [Bag(path, indexed=indexed) for path in paths]
+    try:
+        listed = {part.resolve(): i for i, part in enumerate(listed_parts(paths[0].parent))}
+    except BagError:  # about other files in the folder
+        listed = {}
+    if all(path.resolve() in listed for path in paths):
+        paths = sorted(paths, key=lambda path: listed[path.resolve()])
+        return [Bag(paths[0], paths, indexed)]
+    contents = {path: survey(path, indexed) for path in paths}
+    ordered = [contents[path] for path in sorted(paths, key=natural)]
+    numbers = [pair[1] for part in ordered if (pair := stem_and_index(part.path))]
+    if numbers[0] == 0 and not not_one_recording(ordered):
+        return [Bag(ordered[0].path, ordered)]
+    return [Bag(path, [contents[path]]) for path in paths]

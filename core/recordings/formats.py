@@ -19,8 +19,7 @@ from pathlib import Path
 
 from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.bag_groups import group_bags
+from uncertain_lti.recordings.bag import Bag, group_bags
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import Table, is_table
 from uncertain_lti.signals.table_layout import TableLayout

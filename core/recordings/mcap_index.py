@@ -40,7 +40,7 @@ from uncertain_lti.recordings.mcap_records import (
     parse,
     walk,
 )
-from uncertain_lti.recordings.mcap_scan import most_records, scan
+from uncertain_lti.recordings.mcap_scan import most_records
 from uncertain_lti.recordings.unreadable import os_error
 
 _DATA_END_SIZE = RECORD.size + 4
@@ -155,8 +155,3 @@ def _block(index: bytes, data_end: int) -> Block:
     if place + chunk_length + index_length > data_end or end > LATEST:
         raise _NoIndexError
     return Block(place + before, size, compression, length, start, end, channels, before)
-
-
-def outline_or_scan(path: Path) -> Contents:
-    """What the index of a file states, or else what is found by walking it."""
-    return outline(path) or scan(path)

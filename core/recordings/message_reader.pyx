@@ -27,7 +27,6 @@ from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, u
 from libc.string cimport memchr, memcmp, memcpy
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_types import FieldType
 
 CODES = {
@@ -47,6 +46,15 @@ cdef enum:  # what a message is; from LONGER on by how many bytes
 NOT_PLAIN = OTHER
 NO_STAMP = -1
 _SHAPED_ODDLY = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
+
+def header_stamp_ns(message):
+    """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero."""
+    stamp = getattr(getattr(message, "header", None), "stamp", None)
+    if stamp is None:
+        return None
+    time = stamp.sec * 1_000_000_000 + stamp.nanosec
+    return time or None
 
 
 cdef union _Number:

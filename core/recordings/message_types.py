@@ -20,18 +20,18 @@ import re
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import zstandard
+from mcap.records import Schema
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
-from uncertain_lti.recordings.stamps import header_stamp_ns
+from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan, header_stamp_ns
 from uncertain_lti.signals.field_types import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
@@ -383,3 +383,50 @@ def _one_line(error: Exception, limit: int = 160) -> str:
         return f"it cannot be parsed from '{lines[3].strip()[:40]}' on"
     text = " ".join(str(error).split()) or type(error).__name__
     return text if len(text) <= limit else text[:limit] + " ..."
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedChannel:
+    """A channel as the file describes it: everything needed to write its messages again.
+
+    `topic`: name of its topic; `type`: message type, `pkg/msg/Type`; `encoding`: of its messages; `schema`: its record
+    in the file; None without one; `metadata`: what the recorder stored of the channel, QoS for example; `definition`:
+    how its messages are decoded; `counted`: whether its messages are those of its topic (see `Bag` on topics with
+    several types).
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema: Schema | None
+    metadata: Mapping[str, str]
+    definition: Definition
+    counted: bool = False
+
+
+class RawMessage(NamedTuple):
+    """One message as recorded.
+
+    `log_time_ns`: log time, ns; `publish_time_ns`: publish time, ns; `data`: serialised message; `channel`: what it was
+    recorded on.
+    """
+
+    log_time_ns: int
+    publish_time_ns: int
+    data: bytes
+    channel: RecordedChannel
+
+    @property
+    def topic(self) -> str:
+        """Topic it was published on."""
+        return self.channel.topic
+
+    @property
+    def type(self) -> str:
+        """Message type, `pkg/msg/Type`."""
+        return self.channel.type
+
+    @property
+    def encoding(self) -> str:
+        """Encoding of `data`; `cdr` is what can be decoded."""
+        return self.channel.encoding

@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping
 from statistics import median
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.raw_messages import RawMessage
+from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.recordings.recording import TopicFacts, TopicInfo
 from uncertain_lti.signals.paths import signal_paths
 

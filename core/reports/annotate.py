@@ -39,7 +39,7 @@ from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, VerdictRecords
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.containers import scan
+from uncertain_lti.recordings.bag_files import survey
 from uncertain_lti.recordings.mcap_copy import copy, declare
 from uncertain_lti.recordings.mcap_records import LATEST, Contents, count
 from uncertain_lti.recordings.mcap_writer import McapWriter
@@ -121,7 +121,7 @@ def annotate(
 ) -> Annotated:
     """Write a copy of a recording with the verdicts added; block by block, whatever its size."""
     output = Path(output)
-    contents = [scan(Path(part)) for part in parts]
+    contents = [survey(Path(part)) for part in parts]
     try:
         output.parent.mkdir(exist_ok=True)
     except OSError as error:

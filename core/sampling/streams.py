@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.recordings.bag_arrays import in_reach
+from uncertain_lti.recordings.message_reader import header_stamp_ns
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.recordings.stamps import header_stamp_ns
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap
 

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.recordings.bag_metadata import metadata_pairs
+from uncertain_lti.recordings.bag_files import metadata_pairs
 from uncertain_lti.sampling.transient import Transient
 
 KEYS = "folder, hours=H, metadata=NAME or name=PATTERN"
