@@ -23,7 +23,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.fit_text import horizons_text
-from uncertain_lti.signals.horizon_rule import HorizonRule
+from uncertain_lti.signals.choices import HorizonRule
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import rules_for, sizes_of
 

@@ -24,7 +24,7 @@ from uncertain_lti.sampling.recall import recall, recalled, with_delays, with_me
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.memory import Memory, parse_memory
+from uncertain_lti.signals.functions import Memory, parse_memory
 from uncertain_lti.signals.signal_map import Signal
 
 

@@ -28,9 +28,8 @@ from hypothesis import strategies as st
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.recordings.message_types import define
-from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.field_path import FieldPath, numeric_paths
 from uncertain_lti.signals.field_types import FieldType, TypeFields
-from uncertain_lti.signals.paths import numeric_paths
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 NAN, INF = math.nan, math.inf
@@ -631,7 +630,7 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
 
 
 def test_a_unit_of_the_table_that_is_a_list(tmp_path):
-    from uncertain_lti.signals.table_layout import TableLayout
+    from uncertain_lti.signals.choices import TableLayout
 
     with pytest.raises(SignalError, match="unit is \\['ms'\\]"):
         TableLayout.from_dict({"unit": ["ms"]}, "table")

@@ -32,7 +32,7 @@ from uncertain_lti.cli.command import (
     print_notes,
     print_summary,
 )
-from uncertain_lti.signals.additive import CHOICES
+from uncertain_lti.signals.choices import CHOICES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -43,7 +43,7 @@ from uncertain_lti.sampling.reading import load_signals, sample, time_source
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.additive import Additive
+from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.signal_map import SignalMap
 
 Recording = tuple[str, tuple[str, ...]]

@@ -28,7 +28,7 @@ from uncertain_lti.identification.problem import Problem
 from uncertain_lti.kernel.arithmetic import normalised_columns
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.sampling.transient import Transient, Transitions
-from uncertain_lti.signals.additive import Additive
+from uncertain_lti.signals.choices import Additive
 
 _PIECE = 100_000
 """Samples, about, that a thread normalises at a time."""

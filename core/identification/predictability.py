@@ -28,7 +28,7 @@ from uncertain_lti.identification.excitation import (
     unexplained,
 )
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.signals.memory import Memory
+from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal_map import Signal
 
 NOISE = 0.5

@@ -26,7 +26,7 @@ from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.scheduling import EXCESS, PAYS, SLACK, WORSE, fold_of, jackknife
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.horizon_rule import HorizonRule
+from uncertain_lti.signals.choices import HorizonRule
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.part import by_unit
 

@@ -34,8 +34,8 @@ from uncertain_lti.proposal.ways import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.memory import Memory
-from uncertain_lti.signals.table_layout import TableLayout
+from uncertain_lti.signals.choices import TableLayout
+from uncertain_lti.signals.functions import Memory
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.quantities import longest_hold
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.signals.additive import CHOICES_TEXT
+from uncertain_lti.signals.choices import CHOICES_TEXT
 
 _LONGEST_LINE = 1 << 20  # letters
 _ADDITIVE = f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give."

@@ -31,8 +31,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.scheduling import Fold, fold_of
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.additive import Additive
-from uncertain_lti.signals.memory import Memory
+from uncertain_lti.signals.choices import Additive
+from uncertain_lti.signals.functions import Memory
 from uncertain_lti.validation.left_out import validate
 
 KNOTS = (2, 3, 5)

@@ -22,7 +22,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag, group_bags
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import Table, is_table
-from uncertain_lti.signals.table_layout import TableLayout
+from uncertain_lti.signals.choices import TableLayout
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.table_files import YEARS as _YEARS
 from uncertain_lti.recordings.table_files import Column, RawTable
-from uncertain_lti.signals.table_layout import UNITS, TableLayout
+from uncertain_lti.signals.choices import UNITS, TableLayout
 
 NO_TIME = -(2**63)
 """Instant of a row without one."""

@@ -19,7 +19,7 @@ from statistics import median
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.recordings.recording import TopicFacts, TopicInfo
-from uncertain_lti.signals.paths import signal_paths
+from uncertain_lti.signals.field_path import signal_paths
 
 _BURSTS = 10  # times that the mean step is longer than the median one where messages come in bursts
 

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.memory import Memory
+from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 
 Values = Array

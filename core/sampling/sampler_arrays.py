@@ -32,7 +32,7 @@ from uncertain_lti.sampling.recall import recall
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, REMEMBERED_SAMPLES
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.memory import Memory
+from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal_map import SignalMap
 
 Integers = NDArray[np.int64]

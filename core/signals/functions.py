@@ -7,13 +7,18 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Functions of a message's values, such as yaw(...) and norm(...): one table for recordings and the live node."""
+"""Functions of a field: of one message's values, such as yaw(...), and of earlier samples, such as lag(...)."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Container, Mapping
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple
+
+from uncertain_lti.base.errors import SignalError
 
 
 class ValueKind(NamedTuple):
@@ -107,3 +112,49 @@ FUNCTIONS: Mapping[str, FieldFunction] = {
     "norm": FieldFunction(VECTOR, _unchanged, math.hypot),
 }
 """Name in a signals file -> function. A function added here can be used in recordings, live and by `init`."""
+
+
+LONGEST_DELAY = 1_000_000
+"""Samples by which a signal is taken earlier at most."""
+
+KINDS: tuple[Literal["lag", "diff", "rate"], ...] = ("lag", "diff", "rate")
+"""Functions of a field's earlier samples."""
+
+_NUMBERED = re.compile(r"(.*?),\s*([+-]?\d+)\s*", re.DOTALL)
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """How a signal follows from the samples of its field, up to the present one.
+
+    Sample k takes y_{k - samples} (lag), y_k - y_{k-1} (diff) or (y_k - y_{k-1}) / Δt_{k-1} (rate); there is none until
+    the segment has the samples that it needs.
+
+    `kind`: the function; `samples`: samples by which a lag is earlier.
+    """
+
+    kind: Literal["lag", "diff", "rate"]
+    samples: int = 1
+
+    def of(self, field: str) -> str:
+        """The field path of this memory of a field."""
+        return f"lag({field}, {self.samples})" if self.kind == "lag" else f"{self.kind}({field})"
+
+
+@lru_cache(maxsize=4096)
+def parse_memory(text: str) -> tuple[Memory | None, str]:
+    """Take the function of earlier samples off a field path."""
+    match = re.fullmatch(rf"\s*({'|'.join(KINDS)})\s*\((.*)\)\s*", text, re.DOTALL)
+    if not match:
+        return None, text.strip()
+    kind = next(k for k in KINDS if k == match[1])
+    inner, samples = match[2].strip(), 1
+    if numbered := _NUMBERED.fullmatch(inner):
+        if kind != "lag":
+            raise SignalError(f"field '{text}': {kind} takes a field alone; write {kind}({numbered[1].strip()})")
+        inner, samples = numbered[1].strip(), int(numbered[2])
+        if not 1 <= samples <= LONGEST_DELAY:
+            raise SignalError(f"field '{text}': a lag is 1 to {LONGEST_DELAY} samples, not {samples}")
+    if re.match(rf"({'|'.join(KINDS)})\s*\(", inner):
+        raise SignalError(f"field '{text}': {', '.join(KINDS)} do not nest; write one of them")
+    return Memory(kind, samples), inner

@@ -20,7 +20,7 @@ from typing import Literal
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.memory import LONGEST_DELAY, Memory, parse_memory
+from uncertain_lti.signals.functions import LONGEST_DELAY, Memory, parse_memory
 
 Number = float | Literal["auto"]
 At = Literal["departure", "arrival", "both"]

@@ -21,17 +21,15 @@ from typing import Any, Literal
 from uncertain_lti.base.errors import SignalError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
-from uncertain_lti.signals.additive import Additive
+from uncertain_lti.signals.choices import Additive, HorizonRule, TableLayout
 from uncertain_lti.signals.entries import LISTS, STEP_CHOICES, map_arguments
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 from uncertain_lti.signals.file_values import load_yaml
-from uncertain_lti.signals.horizon_rule import HorizonRule
-from uncertain_lti.signals.memory import Memory
+from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal import Recalled as Recalled
 from uncertain_lti.signals.signal import ScheduleRule as ScheduleRule
 from uncertain_lti.signals.signal import Signal as Signal
-from uncertain_lti.signals.table_layout import TableLayout
 
 TimeSource = Literal["header", "log"]
 
