@@ -37,7 +37,6 @@ from measure import best, peak_memory, table
 from recorded import COMPRESSIONS, FRAMES, JAZZY, ROBOT, payloads, write
 
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.bag_arrays import read_columns
 from uncertain_lti.recordings.mcap_records import crc32
 from uncertain_lti.sampling.reading import read_transients, sample, sample_by_message
 from uncertain_lti.sampling.streams import read_stream
@@ -65,9 +64,7 @@ def recording(folder, count, compression, chunk, frames):
 
 def ours(path, paths):
     """Open a bag, and read fields of these topics."""
-    return read_columns(
-        Bag(path, indexed=True), list(paths), [[FieldPath(p) for p in every] for every in paths.values()]
-    )
+    return Bag(path, indexed=True).columns(list(paths), [[FieldPath(p) for p in every] for every in paths.values()])
 
 
 def rosbags(path, topics, most):

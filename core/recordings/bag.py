@@ -22,7 +22,7 @@ from typing import Any
 from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.base.files import natural
-from uncertain_lti.recordings.bag_arrays import in_reach, read_columns
+from uncertain_lti.recordings.bag_arrays import ColumnReader, IndexMismatchError, in_reach
 from uncertain_lti.recordings.bag_files import (
     listed_parts,
     not_one_recording,
@@ -109,9 +109,11 @@ class Bag:
         """Set `reading_notes`, for example to those of another process that read the same recording."""
         self._warnings, self._undecoded = list(warnings), dict(undecoded)
 
-    def left_out(self, topic: str, number: int, why: str) -> str:
-        """Sentence about messages that cannot be decoded."""
-        return f"{self.path}: {topic}: {count(number, 'message')} left out that cannot be decoded ({why})"
+    def leave_out(self, undecoded: Mapping[str, tuple[int, str]]) -> None:
+        """Warn of messages that cannot be decoded: topic -> how many, and why one of them cannot."""
+        for topic, (number, why) in undecoded.items():
+            of_them = f"{count(number, 'message')} left out that cannot be decoded ({why})"
+            self._undecoded[topic] = f"{self.path}: {topic}: {of_them}"
 
     @property
     def reading_notes(self) -> tuple[list[str], dict[str, str]]:
@@ -145,7 +147,7 @@ class Bag:
     @property
     def warnings(self) -> list[str]:
         """What is missing or left out, each one sentence that begins with the file; grows while messages are read."""
-        return [printable(warning) for warning in (*self._warnings, *self._undecoded.values())]
+        return [printable(warning) for warning in (*self._warnings, *sorted(self._undecoded.values()))]
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
         """Fields of a type that a readable topic has or uses."""
@@ -169,8 +171,22 @@ class Bag:
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
-        """Numbers at some paths of each topic, read block by block; see `read_columns`."""
-        return read_columns(self, topics, paths, progress)
+        """Numbers at some paths of each topic, read block by block; messages that cannot be decoded are left out."""
+        while True:
+            reader = ColumnReader(
+                self.path, self.described(topics), {name: self.topics[name].count for name in topics}, paths
+            )
+            try:
+                columns = reader.run(progress)
+            except IndexMismatchError:
+                if not self.indexed:
+                    raise BagError(
+                        f"{self.path}: the file changed while it was read; read it again when it is written"
+                    ) from None
+                self.walk()
+            else:
+                self.leave_out(reader.undecoded)
+                return columns
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Facts about every topic; reads the recording once, and decodes one message of each topic."""
@@ -273,15 +289,15 @@ class Bag:
             raise BagError(f"{self.path}: topic {topic} cannot be decoded: {info.reason}; choose another topic")
 
     def _decoded(self, channels: list[dict[int, RecordedChannel]]) -> Iterator[tuple[str, int, Any]]:
-        failed: dict[str, int] = {}
+        undecoded: dict[str, tuple[int, str]] = {}
         for raw in self._sorted(channels):
             channel = raw.channel
             try:
                 message = channel.definition.decode(raw.data)
             except BagError as error:
-                topic = channel.topic
-                failed[topic] = failed.get(topic, 0) + 1
-                self._undecoded[topic] = self.left_out(topic, failed[topic], str(error))
+                number, least = undecoded.get(channel.topic, (0, str(error)))
+                undecoded[channel.topic] = number + 1, min(least, str(error))
+                self.leave_out(undecoded)
                 continue
             yield channel.topic, raw.log_time_ns, message
 

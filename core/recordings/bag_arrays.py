@@ -12,11 +12,11 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -30,25 +30,16 @@ from uncertain_lti.recordings.mcap_scan import most_records
 from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan, header_stamp_ns
 from uncertain_lti.recordings.message_types import Definition, RecordedChannel
-from uncertain_lti.recordings.recording import Columns, Progress, Recording
+from uncertain_lti.recordings.recording import Columns, Progress
 from uncertain_lti.recordings.unreadable import os_error
 from uncertain_lti.signals.field_path import FieldPath
 
+_BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
+_CHECKSUM_AT = RECORD.size + 24
 
-@dataclass
-class _Undecoded:
-    """Messages of a topic that cannot be decoded: where the first and last are, and why the last one cannot."""
 
-    number: int = 0
-    first: tuple[int, int] = (2**64, 0)
-    last: tuple[int, int] = (-1, 0)
-    why: str = ""
-
-    def add(self, place: tuple[int, int], why: str) -> None:
-        self.number += 1
-        self.first = min(self.first, place)
-        if place >= self.last:
-            self.last, self.why = place, why
+class IndexMismatchError(Exception):
+    """The file is not what its index states: it has to be walked."""
 
 
 class FieldReader:
@@ -84,30 +75,6 @@ class FieldReader:
         return failures
 
 
-class Blocks(Recording, Protocol):
-    """A recording whose files are read block by block: `Bag`."""
-
-    def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
-        """Each file, and its channels that count for some topics."""
-
-    def left_out(self, topic: str, number: int, why: str) -> str:
-        """Sentence about messages that cannot be decoded."""
-
-
-def read_columns(
-    bag: Blocks, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
-) -> Columns:
-    """Read some paths of each topic; messages that cannot be decoded are left out, and the bag warns of them."""
-    try:
-        return _Reading(bag, topics, paths).run(progress)
-    except IndexMismatchError:
-        bag.walk()
-    try:
-        return _Reading(bag, topics, paths).run(progress)
-    except IndexMismatchError:
-        raise BagError(f"{bag.path}: the file changed while it was read; read it again when it is written") from None
-
-
 def in_reach(path: Path, log_time: int) -> int:
     """Check that a log time can be kept as a 64-bit integer."""
     if log_time > LATEST:
@@ -118,23 +85,33 @@ def in_reach(path: Path, log_time: int) -> int:
     return log_time
 
 
-class _Reading:
-    def __init__(self, bag: Blocks, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]]) -> None:
-        self.bag, self.topics, self.paths = bag, topics, paths
-        self.parts = bag.described(topics)
-        counts = [bag.topics[name].count for name in topics]
-        self.total = sum(counts)
-        self.readers: list[FieldReader] = []
-        self.undecoded = [_Undecoded() for _ in topics]
-        self.met = 0  # messages so far, with those left out
+class ColumnReader:
+    """Reads some paths of each topic of a recording.
+
+    `path`: of the recording; `parts`: its files, and the channels of each that count; `counts`: messages by topic;
+    `paths`: of each topic; `undecoded`: topic -> how many messages are left out, and why one of them.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        parts: Sequence[tuple[Contents, dict[int, RecordedChannel]]],
+        counts: Mapping[str, int],
+        paths: Sequence[Sequence[FieldPath]],
+    ) -> None:
+        self.path, self.parts, self.topics, self.paths = path, parts, list(counts), paths
+        self.total = sum(counts.values())
+        self.readers: dict[tuple[int, Definition], FieldReader] = {}
+        self.undecoded: dict[str, tuple[int, str]] = {}
         self.filled = 0
-        self.filled_of = [0] * len(topics)
+        self.filled_of = [0] * len(counts)
         self.topic = np.empty(self.total, dtype=np.int64)
         self.arrival = np.empty(self.total, dtype=np.int64)
         self.stamp = np.empty(self.total, dtype=np.int64)
-        self.values = [np.empty((n, len(p)), dtype=np.float64) for n, p in zip(counts, paths, strict=True)]
+        self.values = [np.empty((n, len(p)), dtype=np.float64) for n, p in zip(counts.values(), paths, strict=True)]
 
     def run(self, progress: Progress | None) -> Columns:
+        """Read all; raises `IndexMismatchError`."""
         steps: Iterable[object] = self._steps()
         if progress is not None:  # which counts messages
             steps = progress(
@@ -142,94 +119,54 @@ class _Reading:
             )
         for _ in steps:
             pass
-        self._note_left_out()
         return self._in_order()
 
     def _steps(self) -> Iterator[int]:
         """Read batch after batch; yields how many messages each has."""
         for contents, channels in self.parts:
             topic_of = np.zeros(1 << 16, dtype=np.int64)
-            reader_of = np.zeros(1 << 16, dtype=np.int64)
+            readers = {}
             for key, channel in channels.items():
                 topic_of[key] = where = self.topics.index(channel.topic)
-                reader_of[key] = self._reader(where, channel.definition)
+                reader = FieldReader(channel.definition, self.paths[where])
+                readers[key] = self.readers.setdefault((where, channel.definition), reader)
             for batch in batches(contents, channels):
-                self._take(batch, topic_of[batch.channel], reader_of[batch.channel])
+                self._take(batch, topic_of[batch.channel], readers)
                 yield len(batch.channel)
 
-    def _reader(self, where: int, definition: Definition) -> int:
-        """Number of the reader for messages of this definition on a topic."""
-        for number, reader in enumerate(self.readers):
-            if reader.definition is definition and reader.paths is self.paths[where]:
-                return number
-        self.readers.append(FieldReader(definition, self.paths[where]))
-        return len(self.readers) - 1
-
-    def _take(self, batch: Batch, topic: Integers, reader: Integers) -> None:
-        number = len(topic)
-        if self.filled + number > self.total:
-            raise IndexMismatchError  # more than it states
-        stamp = np.empty(number, dtype=np.int64)
-        keep: NDArray[np.bool_] | None = None
-        for where in range(len(self.topics)):
+    def _take(self, batch: Batch, topic: Integers, readers: Mapping[int, FieldReader]) -> None:
+        kept, stamp = np.ones(len(topic), dtype=bool), np.empty(len(topic), dtype=np.int64)
+        for where in np.unique(topic).tolist():
             rows = np.flatnonzero(topic == where)
-            if not len(rows):
-                continue
-            failed = self._read_topic(where, batch, rows, reader[rows], stamp)
-            if failed:
-                keep = np.ones(number, dtype=bool) if keep is None else keep
-                keep[rows[failed]] = False
-        self.met += number
-        kept: NDArray[np.bool_] | slice = slice(None) if keep is None else keep
-        number = number if keep is None else int(np.count_nonzero(keep))
-        where_to = slice(self.filled, self.filled + number)
+            values = np.empty((len(rows), len(self.paths[where])))
+            channel = batch.channel[rows]
+            for key in np.unique(channel).tolist():
+                mine = np.flatnonzero(channel == key)
+                at = rows[mine]
+                read, stamps = np.empty((len(at), values.shape[1])), np.empty(len(at), dtype=np.int64)
+                for row, why in readers[key].read(batch.data, batch.begin[at], batch.end[at], read, stamps):
+                    kept[at[row]] = False
+                    name = self.topics[where]
+                    number, least = self.undecoded.get(name, (0, why))
+                    self.undecoded[name] = number + 1, min(least, why)
+                values[mine], stamp[at] = read, stamps
+            begin = self.filled_of[where]
+            if begin + len(rows) > len(self.values[where]):
+                raise IndexMismatchError  # more than it states
+            self.filled_of[where] = end = begin + int(kept[rows].sum())
+            self.values[where][begin:end] = values[kept[rows]]
         log_time = batch.log_time[kept]
-        if number:
-            in_reach(self.bag.path, int(log_time.max()))
-        self.topic[where_to] = topic[kept]
-        self.arrival[where_to] = log_time
-        self.stamp[where_to] = stamp[kept]
-        self.filled += number
-
-    def _read_topic(self, where: int, batch: Batch, rows: Integers, reader: Integers, stamp: Integers) -> list[int]:
-        """Read the messages of one topic; returns which of them cannot be decoded."""
-        begin = self.filled_of[where]
-        values = self.values[where][begin : begin + len(rows)]
-        if len(values) < len(rows):
-            raise IndexMismatchError
-        failures: list[tuple[int, str]] = []
-        for number in np.unique(reader).tolist():
-            mine = np.flatnonzero(reader == number)
-            begins, ends = batch.begin[rows[mine]], batch.end[rows[mine]]
-            read, stamps = np.empty((len(mine), values.shape[1])), np.empty(len(mine), dtype=np.int64)
-            whole = len(mine) == len(rows)
-            failed = self.readers[number].read(batch.data, begins, ends, values if whole else read, stamps)
-            failures += [(int(mine[row]), why) for row, why in failed]
-            stamp[rows[mine]] = stamps
-            if not whole:
-                values[mine] = read
-        for row, why in failures:
-            self.undecoded[where].add((int(batch.log_time[rows[row]]), self.met + int(rows[row])), why)
-        if failures:
-            kept = np.ones(len(rows), dtype=bool)
-            kept[[row for row, _ in failures]] = False
-            good = values[kept]
-            values[: len(good)] = good
-        self.filled_of[where] += len(rows) - len(failures)
-        return [row for row, _ in failures]
-
-    def _note_left_out(self) -> None:
-        warnings, undecoded = self.bag.reading_notes
-        met = [(entry.first, name, entry) for name, entry in zip(self.topics, self.undecoded, strict=True)]
-        for _, name, entry in sorted((m for m in met if m[2].number), key=lambda m: m[0]):
-            undecoded[name] = self.bag.left_out(name, entry.number, entry.why)
-        self.bag.restore_notes(warnings, undecoded)
+        if len(log_time):
+            in_reach(self.path, int(log_time.max()))
+        to = slice(self.filled, self.filled + len(log_time))
+        self.topic[to], self.arrival[to], self.stamp[to] = topic[kept], log_time, stamp[kept]
+        self.filled += len(log_time)
 
     def _in_order(self) -> Columns:
         """Stable sort by log time: messages are in file order so far."""
         topic, arrival, stamp = self.topic[: self.filled], self.arrival[: self.filled], self.stamp[: self.filled]
         values = [v[:n] for v, n in zip(self.values, self.filled_of, strict=True)]
-        alone = sum(reader.alone for reader in self.readers)
+        alone = sum(reader.alone for reader in self.readers.values())
         if (arrival[1:] >= arrival[:-1]).all():
             return Columns(topic, arrival, stamp, values, alone)
         order = np.argsort(arrival, kind="stable")
@@ -244,14 +181,6 @@ class _Reading:
             if (mine[1:] < mine[:-1]).any():
                 values[where] = read[mine]
         return Columns(topic, arrival[order], stamp[order], values, alone)
-
-
-_BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
-_CHECKSUM_AT = RECORD.size + 24
-
-
-class IndexMismatchError(Exception):
-    """The file is not what its index states: it has to be walked."""
 
 
 @dataclass(frozen=True, slots=True)

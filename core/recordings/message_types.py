@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import functools
 import re
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -31,7 +30,8 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan, header_stamp_ns
+from uncertain_lti.recordings.aside import one_line
+from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
 from uncertain_lti.signals.field_types import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
@@ -113,37 +113,19 @@ class Definition:
     @functools.cached_property
     def has_header(self) -> bool:
         """Whether the type has a field `header` with a time stamp."""
-        return "stamp" in self._header_fields()
-
-    @functools.cached_property
-    def _header_first(self) -> bool:
-        first = next(iter(self.fields(self.type_name)), "")
-        return first == "header" and next(iter(self._header_fields())) == "stamp"
-
-    def _header_fields(self) -> Mapping[str, FieldType]:
         header = self.fields(self.type_name).get("header")
         if header is None or header.kind != "message" or header.array is not None:
-            return {}
-        fields = self.fields(header.type_name)
-        return fields if "stamp" in fields and fields["stamp"].type_name == "builtin_interfaces/msg/Time" else {}
+            return False
+        stamp = self.fields(header.type_name).get("stamp")
+        return stamp is not None and stamp.type_name == "builtin_interfaces/msg/Time"
 
     def stamp_ns(self, data: bytes) -> int | None:
-        """`header_stamp_ns` of an encoded message, read from its first bytes where the header is there."""
-        if not self.has_header:
-            return None
-        if not self._header_first:
-            try:
-                return header_stamp_ns(self.decode(data))
-            except BagError:
-                return None
+        """`header_stamp_ns` of an encoded message; None of one that cannot be decoded."""
         try:
-            data = _plain(data, 12)
+            _, found = self._plan.read(_plain(data))
         except (zstandard.ZstdError, TypesysError):
             return None
-        if len(data) < 12:
-            return None
-        sec, nanosec = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
-        return sec * 1_000_000_000 + nanosec or None
+        return found[0] if found is not None else None
 
     def fields(self, type_name: str) -> Mapping[str, FieldType]:
         """Fields of a type in this schema."""
@@ -194,10 +176,10 @@ class _Decoder:
         return self._data[self._at - length : self._at].split(b"\0")[0].decode(errors="replace")
 
 
-def _plain(data: bytes, wanted: int = _LARGEST_MESSAGE) -> bytes:
+def _plain(data: bytes) -> bytes:
     """Bytes of a message that the recorder may have compressed on its own (rosbag2's compression mode MESSAGE)."""
     if data[:4] == _ZSTD:  # no CDR begins like this
-        most = min(wanted, max(_LEAST_INFLATED, _LARGEST_RATIO * len(data)))
+        most = min(_LARGEST_MESSAGE, max(_LEAST_INFLATED, _LARGEST_RATIO * len(data)))
         data = zstandard.ZstdDecompressor().stream_reader(data).read(most)
     if data[:2] not in ENCAPSULATIONS:  # the decoder takes whatever it is for plain
         raise TypesysError(f"it is no plain CDR; it begins with {data[:2].hex() or 'nothing'}")
@@ -377,12 +359,11 @@ def _field_type(description: Any) -> FieldType:
     return FieldType(_KINDS[what[0]], what[0], array)
 
 
-def _one_line(error: Exception, limit: int = 160) -> str:
+def _one_line(error: Exception) -> str:
     lines = str(error).splitlines()
     if len(lines) > 3 and lines[0].startswith("Could not parse"):  # the text, the position, what is there
         return f"it cannot be parsed from '{lines[3].strip()[:40]}' on"
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= limit else text[:limit] + " ..."
+    return one_line(error)
 
 
 @dataclass(frozen=True, eq=False)
