@@ -17,7 +17,7 @@ from time import perf_counter
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import on_cores, one_by_one
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
@@ -71,20 +71,17 @@ class WorkingSet:
     unknowns change (the size of a sample is linear in |z|), so while they change less than the slack that was
     brought, no other sample can leave its bounds, and the proof of optimality needs no further pass.
 
-    `fleet`: the data; `structure`: as in `fit`; `excluded`: transitions that need not be contained; `progress`: called
-    with one line of text per pass.
+    `fleet`: the data; `structure`: as in `fit`; `progress`: called with one line of text per pass.
     """
 
     def __init__(
         self,
         fleet: Fleet,
         structure: Structure | None = None,
-        excluded: Index | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> None:
         self.fleet = fleet
         self.progress = progress or (lambda text: None)
-        self.excluded = np.empty(0, dtype=np.intp) if excluded is None else excluded
         self.whole = fleet.N <= 2 * SUBSAMPLE
         stride = 1 if self.whole else fleet.N // SUBSAMPLE
         self.sums, self._first = fleet.moments(stride)
@@ -203,15 +200,18 @@ class WorkingSet:
         The rows meet in the objective alone, which is convex and smooth, so going round them descends to the optimum
         of all; and rows whose widths differ by many orders of magnitude never share a programme.
         """
-        assert self.sums.coupled is not None
+        coupled = self.sums.coupled
+        assert coupled is not None
+
+        def among(own: Programmes) -> str:
+            return own.among(coupled, [other.d for other in self.rows])
+
         before = np.inf
         for _number in range(MAX_ROUNDS):
             for row in self.rows:
-                if row.unknown:
-                    row.among(self.sums.coupled, [other.d for other in self.rows])
-                self._settle(self.programmes[row.i], Programmes.among, polish=True)
+                self._settle(self.programmes[row.i], among, polish=True)
             flat = np.concatenate([row.d for row in self.rows])
-            value = float(flat @ self.sums.coupled @ flat)
+            value = float(flat @ coupled @ flat)
             if value >= before * (1.0 - 1e-11):
                 return
             before = value
@@ -246,7 +246,7 @@ class WorkingSet:
                 above += float(slope @ d) - own.least_linear(slope / largest, most) * largest
             except FitError:
                 return np.inf
-        return max(above, 0.0) / value
+        return float(max(above, 0.0) / value)
 
     def _at_most(self, row: Row, diagonal: Array) -> Array:
         """Largest scaled half-widths that the optimum of (10) with full weights can have, (q,) of the free ones.
@@ -501,8 +501,6 @@ class WorkingSet:
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
     def _hold(self, row: Row, samples: Samples) -> None:
-        if len(self.excluded):
-            samples = samples[~np.isin(samples.index, self.excluded)]
         row.hold(samples, self.fleet.columns, self._like)
         self._like = row
 
