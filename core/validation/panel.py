@@ -243,8 +243,10 @@ def _factor(
     A threshold that is the largest size of so many hours is passed about once in as many: every rule but one counts as
     a cluster of alarms, and those come in clusters as they do somewhat below the thresholds.
     """
+    if not shown:  # all that was left out lies far outside what was fitted
+        return 1.0, math.inf, 0
     parts, levels = [part for part, _ in shown], [level for _, level in shown]
-    largest = np.sort(_peaks(unit_numbers(parts), levels))[::-1] if parts else np.zeros(1)
+    largest = np.sort(_peaks(unit_numbers(parts), levels))[::-1]
     third = float(largest[:3][-1])
 
     def raised(factor: float) -> Array:
