@@ -347,10 +347,10 @@ def test_errors_that_nobody_foresaw_are_counted_told_and_outlived(world: World, 
     model = by_hand()
     code = """
 import sys
-from uncertain_lti.monitor import live_rule
+from uncertain_lti.monitor import deployed
 from uncertain_lti_ros import envelope_monitor
 report, count = envelope_monitor.EnvelopeMonitorNode.report, [0, 0]
-class Judging(live_rule.EnvelopeMonitor):
+class Judging(deployed.EnvelopeMonitor):
     def judge(self, *args, **named):
         count[0] += 1
         if count[0] % 10 == 0:
@@ -363,7 +363,7 @@ def reporting(node):
     if count[1] % 7 == 0:
         raise KeyError("every seventh")
     return report(node)
-live_rule.EnvelopeMonitor = Judging
+deployed.EnvelopeMonitor = Judging
 envelope_monitor.EnvelopeMonitorNode.report = reporting
 sys.exit(envelope_monitor.main())
 """
@@ -493,7 +493,9 @@ class Sends:
         self.now, self.used = 100.0, 0.0
         self.sending = dict.fromkeys(("flags", "lower", "violation"), (5e-6, 5e-6))  # processor time and time, s
         its_module = sys.modules[Sender.__module__]
-        clock = SimpleNamespace(monotonic=lambda: self.now, thread_time=lambda: self.used)
+        clock = SimpleNamespace(
+            monotonic=lambda: self.now, thread_time=lambda: self.used, time_ns=time.time_ns, sleep=time.sleep
+        )
         monkeypatch.setattr(its_module, "time", clock)
         self.model = stream_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
         self.node = stream_cases.Node(tmp_path / "m.json")

@@ -95,6 +95,7 @@ class Sender:
     _publishers: Mapping[str, Publisher] = cython.declare(object)
     _messages: VerdictMessages = cython.declare(object)
     _reason_sent: str = cython.declare(object)
+    _doubted: cython.double  # until when what messages take is measured by the processor's time
     _known: cython.bint  # who listens; otherwise it must be found out
     _given: Any  # None where nobody listens, for a message without a verdict, one with, and what is predicted
     _judged: Any
@@ -107,7 +108,7 @@ class Sender:
 
     def __init__(self, now: float) -> None:
         self.alarm_sent, self.held_back = now, 0
-        self._ways = {}
+        self._ways, self._doubted = {}, -math.inf
         self._known = self._alarm_heard = self._reason_heard = False
         self._reason_sent = ""
         self._given = self._judged = self._predicted = self._foreseen = None
@@ -181,14 +182,20 @@ class Sender:
     def _send(self, ways: list[Any], messages: list[bytes]) -> None:
         i: cython.Py_ssize_t
         way: _Way
-        began: cython.double = time.thread_time()  # not by the steady clock: the processor may be busy with others
+        # The time of the processor, which may be busy with others, costs a call of the system: it is asked for only
+        # where a message took long lately.
+        doubted: cython.bint = time.monotonic() < self._doubted
+        clock: Any = time.thread_time if doubted else time.monotonic
+        began: cython.double = clock()
         for i in range(len(messages)):
             way = ways[i]
             if way.slow >= _PATIENCE and self._rests(way):
                 continue
             way.send(messages[i])
-            ended: cython.double = time.thread_time()
-            if ended - began > _SLOW:
+            ended: cython.double = clock()
+            if ended - began > _SLOW and not doubted:
+                self._doubted = ended + _FORGET
+            elif ended - began > _SLOW:
                 self._was_slow(way, ended - began)
             elif way.slow > 0:
                 way.slow -= 1
@@ -211,7 +218,7 @@ class Sender:
         now: cython.double = time.monotonic()
         if now - way.tried >= _FORGET:
             way.slow = 0
-        way.slow, way.tried = min(way.slow + 1, 2 * _PATIENCE), now
+        way.slow, way.tried, self._doubted = min(way.slow + 1, 2 * _PATIENCE), now, now + _FORGET
         rest: cython.double = _REST_OF_FLAGS if way.name == FLAGS.name else _REST * len(self.slow_topics())
         way.until = now + rest * took
 
