@@ -45,7 +45,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.recordings import bag as bag_module
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.recordings.mcap_index import outline
+from uncertain_lti.recordings.mcap_scan import outline
 from uncertain_lti.recordings.message_types import define
 from uncertain_lti.reports.annotate import annotate
 from uncertain_lti.sampling.reading import read_as_fitted_with_decisions

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.recordings.topic_facts import usual_step
+from uncertain_lti.recordings.recording import usual_step
 from uncertain_lti.signals.functions import FUNCTIONS, QUATERNION
 
 FEWEST = 20

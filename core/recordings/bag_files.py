@@ -25,9 +25,8 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC, natural
 from uncertain_lti.base.plain_yaml import compose, construct
 from uncertain_lti.recordings.foreign import scan_foreign
-from uncertain_lti.recordings.mcap_index import outline
 from uncertain_lti.recordings.mcap_records import RECORD, Contents, messages, parse
-from uncertain_lti.recordings.mcap_scan import scan
+from uncertain_lti.recordings.mcap_scan import outline, scan
 from uncertain_lti.recordings.message_types import normal_name
 from uncertain_lti.recordings.unreadable import SUFFIXES, file_names, no_recording, os_error
 

@@ -27,9 +27,9 @@ from urllib.parse import quote
 from mcap.records import Channel, Schema
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.aside import aside, one_line
 from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, Tally, count, message_record
 from uncertain_lti.recordings.message_types import Definition, define, distribution_text, ros2_text
+from uncertain_lti.recordings.unreadable import aside, one_line
 
 _DATABASE = b"SQLite format 3\0"
 _BAG = b"#ROSBAG V2.0\n"

@@ -53,7 +53,7 @@ class Block(NamedTuple):
 
     `offset`: first byte; `size`: bytes in the file; `compression`: empty where the bytes are records as they are;
     `length`: bytes of the records; `start`: smallest log time, ns; `end`: largest log time, ns; `channels`: those that
-    have a message here; `unchecked`: of a chunk that was found in an index (`mcap_index.outline`), bytes in front of
+    have a message here; `unchecked`: of a chunk that was found in an index (`mcap_scan.outline`), bytes in front of
     its records, which are still to be compared with the block, and the records with their checksum; 0 otherwise; `cut`:
     the file ends within it.
     """
@@ -87,7 +87,7 @@ class Contents:
 
     `path`: the file; `size`: its bytes; `blocks`: in file order; `channels`: by number; `schemas`: by number; `tally`:
     by number of the channel; `warnings`: sentences that begin with the path; `indexed`: the file was not walked, and
-    this is only what its index states (`mcap_index.outline`): first and last of a tally are those of the chunks that
+    this is only what its index states (`mcap_scan.outline`): first and last of a tally are those of the chunks that
     hold the channel; `summed`: the file has a checksum over everything, which was not checked; `others`: where
     attachments, metadata and private records begin, in file order; empty when the file was not walked.
     """

@@ -9,8 +9,9 @@
 
 """Scan of an MCAP file: its blocks of raw messages, whatever is missing from it or damaged.
 
-A file is walked once from its beginning (`scan`), without need of summary, index or footer, and then read
-block by block (`mcap_records`). A block is a chunk, or a stretch of records outside chunks.
+A file is walked once from its beginning (`scan`), without need of summary, index or footer, and then read block by
+block (`mcap_records`); or what its summary states is used until then (`outline`). A block is a chunk, or a stretch of
+records outside chunks.
 
 What counts when a file is not whole:
 
@@ -31,19 +32,22 @@ from __future__ import annotations
 
 import bisect
 import struct
+from functools import lru_cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Footer, Schema, Statistics
+from mcap.records import Channel, DataEnd, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
-from uncertain_lti.recordings.aside import LARGEST_RATIO, most_inflated
 from uncertain_lti.recordings.mcap_records import (
     CHUNK,
     FOOTER_SIZE,
     LARGEST_CHUNK,
+    LATEST,
+    MESSAGE,
     PIECE,
     PRIVATE,
     RECORD,
@@ -58,8 +62,14 @@ from uncertain_lti.recordings.mcap_records import (
     walk,
 )
 from uncertain_lti.recordings.mcap_walk import Records, walk_records
-from uncertain_lti.recordings.unreadable import not_mcap, os_error
+from uncertain_lti.recordings.unreadable import LARGEST_RATIO, most_inflated, not_mcap, os_error
 
+_DATA_END_SIZE = RECORD.size + 4
+_FOOTER = struct.Struct("<QQI")  # begin of the summary, begin of its offsets, checksum
+_CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last log time, place and length of the chunk, size of what follows
+_INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
+_INDEX_REST = struct.Struct("<QI")  # length of the message indexes, of the compression's name
+_SIZES = struct.Struct("<QQ")  # compressed, decompressed
 _LEAST_STRETCH = 1 << 14  # bytes
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
 _CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
@@ -330,15 +340,11 @@ class _Scanner:
 
     def _summary(self) -> None:
         """Definitions, statistics and places of chunks, where the file states them and their checksum holds."""
-        footer_at = self.found.size - len(MAGIC) - FOOTER_SIZE
-        tail = self._at(footer_at, FOOTER_SIZE)
-        if len(tail) < FOOTER_SIZE or tail[:9] != RECORD.pack(Opcode.FOOTER, 20):
+        stated = _summary_of(self.stream, self.found.size)
+        if stated is None:
             return
-        footer = parse(Footer, tail[RECORD.size :])
-        if not footer or not len(MAGIC) <= footer.summary_start < footer_at:
-            return
-        records = self._at(footer.summary_start, footer_at - footer.summary_start)
-        if footer.summary_crc not in (0, crc32(tail[:-4], crc32(records))):
+        _, records, whole = stated
+        if not whole:
             self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
             return
         for opcode, begin, end in walk(records):
@@ -350,7 +356,7 @@ class _Scanner:
                 self.statistics = parse(Statistics, records[begin:end])
             elif opcode == Opcode.CHUNK_INDEX:
                 offset = _CHUNK_AT.unpack_from(records, begin)[0] if end - begin >= _CHUNK_AT.size else 0
-                if len(MAGIC) <= offset < footer_at and self._at(offset, 1) == bytes([Opcode.CHUNK]):
+                if len(MAGIC) <= offset and self._at(offset, 1) == bytes([Opcode.CHUNK]):
                     self.known.append(offset)
         self.known.sort()
 
@@ -376,3 +382,120 @@ def _tally(found: Records) -> dict[int, Tally]:
     ends = np.minimum.reduceat(times, starts), np.maximum.reduceat(times, starts)
     rows = zip(channels.tolist(), counts.tolist(), ends[0].tolist(), ends[1].tolist(), strict=True)
     return {channel: Tally(number, first, last) for channel, number, first, last in rows}
+
+
+class _NoIndexError(Exception):
+    """The file has no index that can be gone by."""
+
+
+def outline(path: Path) -> Contents | None:
+    """What the summary of a whole file says of its chunks, before any is read; None where it has to be walked.
+
+    What is read by it afterwards is compared with it (`bag_arrays`): the head of every chunk, its checksum, the number
+    of messages of every channel. Where anything is not as stated, the file is walked instead, so a damaged file reads
+    the same either way. Damage to what is not read stays unseen.
+    """
+    try:
+        with open(path, "rb", buffering=0) as stream:
+            size = stream.seek(0, 2)
+            stream.seek(0)
+            stated = _summary_of(stream, size) if stream.read(len(MAGIC)) == MAGIC else None
+            if stated is None or not stated[2] or stated[0] < len(MAGIC) + _DATA_END_SIZE:
+                return None
+            begin, summary, _ = stated
+            stream.seek(begin - _DATA_END_SIZE)
+            data_end = stream.read(_DATA_END_SIZE)
+    except OSError as error:
+        raise os_error(path, error) from None
+    if data_end[:9] != RECORD.pack(Opcode.DATA_END, 4):
+        return None
+    try:
+        return _contents(path, size, summary, begin - _DATA_END_SIZE, data_end[9:] != bytes(4))
+    except (_NoIndexError, struct.error, UnicodeDecodeError):
+        return None
+
+
+def _summary_of(stream: BinaryIO, size: int) -> tuple[int, bytes, bool] | None:
+    """Where the summary begins, its records, and whether its checksum holds; None where the file states none."""
+    foot = size - len(MAGIC) - FOOTER_SIZE
+    if foot < len(MAGIC):
+        return None
+    stream.seek(foot)
+    tail = stream.read(FOOTER_SIZE + len(MAGIC))
+    if tail[:9] != RECORD.pack(Opcode.FOOTER, _FOOTER.size) or not tail.endswith(MAGIC):
+        return None
+    begin, _, checksum = _FOOTER.unpack_from(tail, RECORD.size)
+    if not len(MAGIC) <= begin < foot:
+        return None
+    stream.seek(begin)
+    records = stream.read(foot - begin)
+    return begin, records, checksum in (0, crc32(tail[: FOOTER_SIZE - 4], crc32(records)))
+
+
+def _contents(path: Path, size: int, summary: bytes, data_end: int, data_crc: bool) -> Contents:
+    found = Contents(path, size, indexed=True, summed=data_crc)
+    statistics: Statistics | None = None
+    blocks: list[Block] = []
+    for opcode, begin, end in walk(summary):
+        if opcode == Opcode.CHUNK_INDEX:
+            blocks.append(_block(summary[begin:end], data_end))
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            record = parse(Schema if opcode == Opcode.SCHEMA else Channel, summary[begin:end])
+            table: dict[int, object] = found.schemas if isinstance(record, Schema) else found.channels  # type: ignore[assignment]
+            if record is None or table.setdefault(record.id, record) != record:
+                raise _NoIndexError
+        elif opcode == Opcode.STATISTICS:
+            statistics = parse(Statistics, summary[begin:end])
+    if statistics is None or statistics.chunk_count != len(blocks):
+        raise _NoIndexError
+    if any(channel.schema_id and channel.schema_id not in found.schemas for channel in found.channels.values()):
+        raise _NoIndexError  # they are in the chunks
+    blocks.sort(key=lambda block: block.offset)
+    if any(before.offset + before.size > after.offset - after.unchecked for before, after in pairwise(blocks)):
+        raise _NoIndexError
+    if statistics.message_count > most_records(size) or sum(block.length for block in blocks) > most_inflated(size):
+        raise _NoIndexError
+    counts = {channel: number for channel, number in statistics.channel_message_counts.items() if number}
+    found.blocks = [block for block in blocks if block.channels]
+    room: dict[int, int] = {}  # messages that the blocks of a channel can hold
+    for block in found.blocks:
+        for channel in block.channels:
+            room[channel] = room.get(channel, 0) + block.length // (RECORD.size + MESSAGE.size)
+            there = found.tally.setdefault(channel, Tally(0, block.start, block.end))
+            there.first, there.last = min(there.first, block.start), max(there.last, block.end)
+    if not counts or room.keys() != counts.keys():
+        raise _NoIndexError
+    for channel, number in counts.items():
+        if channel not in found.channels or number > room[channel]:
+            raise _NoIndexError
+        found.tally[channel].count = number
+    if statistics.message_count != found.count:
+        raise _NoIndexError
+    return found
+
+
+@lru_cache(maxsize=256)
+def _channels(low: bytes, high: bytes) -> frozenset[int]:
+    """Numbers from their low and high bytes; most chunks hold the same channels."""
+    return frozenset(a + 256 * b for a, b in zip(low, high, strict=True))
+
+
+def _block(index: bytes, data_end: int) -> Block:
+    start, end, place, chunk_length, size_of_offsets = _CHUNK_INDEX.unpack_from(index)
+    rest = _CHUNK_INDEX.size + size_of_offsets
+    listed, pair = index[_CHUNK_INDEX.size : rest], _INDEX_OFFSET.size
+    if len(listed) % pair:
+        raise _NoIndexError
+    channels = _channels(listed[::pair], listed[1::pair])
+    index_length, name_length = _INDEX_REST.unpack_from(index, rest)
+    name_at = rest + _INDEX_REST.size
+    compression = index[name_at : name_at + name_length].decode()
+    size, length = _SIZES.unpack_from(index, name_at + name_length)
+    before = RECORD.size + CHUNK.size + name_length + 8
+    if chunk_length != before + size or place < len(MAGIC) or place + chunk_length > data_end:
+        raise _NoIndexError
+    if compression not in ("", "lz4", "zstd") or length > LARGEST_CHUNK or (not compression and length != size):
+        raise _NoIndexError
+    if place + chunk_length + index_length > data_end or end > LATEST:
+        raise _NoIndexError
+    return Block(place + before, size, compression, length, start, end, channels, before)

@@ -30,8 +30,8 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.aside import one_line
 from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
+from uncertain_lti.recordings.unreadable import one_line
 from uncertain_lti.signals.field_types import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes

@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.packages import absent
-from uncertain_lti.recordings.aside import aside, most_inflated, one_line
-from uncertain_lti.recordings.unreadable import os_error
+from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"
 _LOOK = 1 << 16  # bytes in which the shape of a CSV file is looked for
