@@ -94,7 +94,7 @@ def test_everything_armed_stays_offline_in_disorder(
     verdicts = offline(path, bag)
     judged = [v for v in verdicts if v.judged]
     assert len({v.status for v in verdicts}) > 3 and {v.alarm for v in judged} == {True, False}
-    world.monitor(path)
+    process = world.monitor(path)
     names = ("horizon_utilisation", "statistics")
     outputs = Outputs.of(world, *names)
     world.command("play", bag, "--rate", 2).succeed()
@@ -103,6 +103,7 @@ def test_everything_armed_stays_offline_in_disorder(
         told = outputs.topics[name].count(len(judged))
         assert [bits(m.position) for m in told] == [bits(np.ravel(getattr(v, name))) for v in judged]
         assert sum(not np.isnan(m.position).any() for m in told) > 50
+    assert world.status()["unexpected_errors"] == 0 and "Traceback" not in process.output
 
 
 def test_everything_armed_stays_offline_through_a_swap_a_kill_and_a_change_of_qos(world: World, tmp_path: Path) -> None:

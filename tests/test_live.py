@@ -68,10 +68,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 # --- a model and recordings made by hand --------------------------------------------------------------------
 
 
-def by_hand(
-    time: str = "header", max_hold: float | None = 0.5, remembers: bool = False, **options: Any
-) -> UncertainLTI:
-    """remembers: with lag, diff and rate, values that do not count, a control at both ends, and a constant step."""
+def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) -> UncertainLTI:
     """Two states on a JointState, controls on a Vector3Stamped (header time) or a Float64 (log time)."""
     if time == "header":
         state = [(STATE, JOINT_STATE, "position[a]"), (STATE, JOINT_STATE, "position[b]")]
@@ -90,16 +87,6 @@ def by_hand(
             for name, (topic, kind, path) in zip(names[1], control, strict=False)
         ),
     )
-    if remembers:
-        a, b = signals.states
-        p, q = signals.controls
-        memories = [
-            replace(a, name="a_before", field="lag(position[a], 2)"),
-            replace(b, name="b_rate", field="rate(position[b])"),
-            replace(q, name="q_change", field="diff(vector.y)"),
-        ]
-        a, p = replace(a, valid=(0.24, 0.45)), replace(p, valid=(-0.7, math.inf), at="both")
-        signals = SignalMap((a, b), (p, q, *memories))
     signals = options.pop("signals", signals)
     n, m = len(signals.states), len(signals.controls)
     rng = np.random.default_rng(7)
@@ -110,9 +97,7 @@ def by_hand(
         time=dict.fromkeys(signals.topics, time),
         dt_median=STEP_NS * 1e-9,
         max_gap=2.5 * STEP_NS * 1e-9,
-        step=1.01 * STEP_NS * 1e-9 if remembers else None,
     )
-    signals = replace(signals, step=sampling.step or "recorded")
     model = UncertainLTI(
         rng.normal(size=(n, n)) - 2.0 * np.eye(n),
         rng.normal(size=(n, m)),
@@ -271,16 +256,15 @@ class Outputs:
         assert self.topics["violation"].messages[-1].data == verdicts[-1].alarm
 
 
-@pytest.mark.parametrize(("steps", "rate"), [(200, 1.0), (1500, 6.0)], ids=["real time", "six times as fast"])
-def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Path, steps: int, rate: float) -> None:
+def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Path) -> None:
     model = by_hand(alarm_rule=AlarmRule(2, 5))
     path = saved(model, tmp_path)
-    bag = header_bag(model, tmp_path / "run.mcap", steps)
+    bag = header_bag(model, tmp_path / "run.mcap", 1500)
     verdicts = offline(path, bag)
-    assert {v.status for v in verdicts} >= ({Status.OK, Status.MISSING, Status.GAP} if steps > 1000 else {Status.OK})
+    assert {v.status for v in verdicts} >= {Status.OK, Status.MISSING, Status.GAP}
     world.monitor(path)
     outputs = Outputs.of(world)
-    world.command("play", bag, "--rate", rate).succeed()
+    world.command("play", bag, "--rate", 6.0).succeed()
     outputs.hold_against(verdicts, ("a", "b"))
     status = world.status()
     assert status["verdicts"] == sum(v.judged for v in verdicts)
@@ -321,22 +305,8 @@ def test_statistics_and_the_reason_are_those_of_the_recording_and_of_a_snapshot(
     assert [bits(m.position) for m in found["/envelope_monitor/statistics"]] == [bits(m.position) for m in got]
 
 
-def test_memories_limits_and_a_constant_step_give_live_what_they_give_offline(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm_rule=AlarmRule(2, 5), remembers=True)
-    path = saved(model, tmp_path)
-    verdicts = offline(path, header_bag(by_hand(), tmp_path / "run.mcap", 300))
-    assert sum(v.judged for v in verdicts) > 100 and {v.status for v in verdicts} >= {Status.OK, Status.MISSING}
-    checked = EnvelopeMonitor(model).check(read_as_fitted(tmp_path / "run.mcap", UncertainLTI.load(path).signals))
-    assert checked.transient.counters.of("invalid").keys() == {"a", "a_before", "p", "p at arrival"}
-    assert bits(checked.lower[checked.judged]) == bits([v.lower for v in verdicts if v.judged])
-    world.monitor(path)
-    outputs = Outputs.of(world)
-    world.command("play", tmp_path / "run.mcap", "--rate", 2.0).succeed()
-    outputs.hold_against(verdicts, ("a", "b"))
-
-
 @pytest.mark.parametrize("at", ["departure", "arrival", "both"])
-def test_a_command_at_an_arrival_or_judged_gives_live_what_check_gives(world: World, tmp_path: Path, at: str) -> None:
+def test_a_command_at_an_arrival_or_judged_gives_one_by_one_what_check_gives(tmp_path: Path, at: str) -> None:
     plain = by_hand().signals
     p, q = plain.controls
     signals = replace(plain, controls=(replace(p, at=at), replace(q, judged=True)))
@@ -349,10 +319,6 @@ def test_a_command_at_an_arrival_or_judged_gives_live_what_check_gives(world: Wo
     judged = [v for v in verdicts if v.judged]
     assert len(judged) > 100 and bits(checked.lower[checked.judged]) == bits([v.lower for v in judged])
     assert checked.alarm.tolist() == [v.alarm for v in verdicts if not v.status.dropped]
-    world.monitor(path)
-    outputs = Outputs.of(world)
-    world.command("play", bag, "--rate", 2.0).succeed()
-    outputs.hold_against(verdicts, names)
 
 
 def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp_path: Path) -> None:
