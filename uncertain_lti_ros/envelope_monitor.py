@@ -127,20 +127,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         session: Session | None = self.intake.session
         return session
 
-    @session.setter
-    def session(self, session: Session | None) -> None:
-        """Judge by another."""
-        self.intake.session = session
-
     @property
     def active(self) -> bool:
         """Whether verdicts are given."""
         return self.intake.active
-
-    @active.setter
-    def active(self, active: bool) -> None:
-        """Begin or cease to take messages."""
-        self.intake.active = active
 
     # --- parameters ---
 
@@ -204,8 +194,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active:
             self.intake.waiting(all_of_them=True)
             session.go_on_from(self.session)
-        self.session = session
-        self.outputs.prepare(self.session)
+        self.intake.session = session
+        self.outputs.prepare(session)
         self.snapshots.clear()
         if self.active:
             self.subscribe()
@@ -246,10 +236,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         try:
             self.settings.requested_qos()
             self._prefix = self.settings.topic_prefix()
-            self.session = self._make_session(path, self.settings.rule({}))
+            self.intake.session = session = self._make_session(path, self.settings.rule({}))
             self.snapshots.open()
         except Exception as error:
-            self.session = None
+            self.intake.session = None
             self.reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
             then = "; the node starts as soon as its parameters are set right" if self._starts_itself else ""
             self.get_logger().error(f"not configured: {self.reason}{then}")
@@ -257,9 +247,9 @@ class EnvelopeMonitorNode(LifecycleNode):
             return TransitionCallbackReturn.FAILURE
         self.reason = ""
         self.outputs.open(self.settings.real("heartbeat"))
-        self.outputs.prepare(self.session)
-        self.get_logger().info(f"configured with {Path(path).name}: {self.session.model}")
-        if self.session.model.sampling.dt_median is None:
+        self.outputs.prepare(session)
+        self.get_logger().info(f"configured with {Path(path).name}: {session.model}")
+        if session.model.sampling.dt_median is None:
             self.get_logger().info("the model has no median step, so nothing is predicted")
         return super().on_configure(state)
 
@@ -275,7 +265,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         resolved = {topic: self.resolve_topic_name(self._there(topic)) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
-        self.active = True
+        self.intake.active = True
         self.outputs.poll()
         self._beat()
         return result
@@ -312,7 +302,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._unsubscribe()
         self.snapshots.close(self.session)
         self.outputs.close()
-        self.session = None
+        self.intake.session = None
 
     def finish(self) -> None:
         """Shut down properly, at the end of the process."""
@@ -350,7 +340,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _unsubscribe(self) -> None:
         self.intake.waiting(all_of_them=True)
-        self.active = False
+        self.intake.active = False
         self.outputs.sender.changed()
         for subscription in self.inputs.values():
             subscription.destroy()

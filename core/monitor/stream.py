@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
 
@@ -52,7 +53,7 @@ MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 """Type name and paths -> reader."""
 
 
-@cython.cclass
+@dataclass
 class Period:
     """What has happened since the last report.
 
@@ -61,36 +62,27 @@ class Period:
     on a mode that the model does not list; `alarm`: the alarm was raised at some time in it; `frozen, repeating`: by
     number of the state, the last repeat of those that were frozen, and of others that repeat for longer than ever in
     the fit; `withheld`: by number of the state, samples without a verdict on it as it needs a frozen one; `violations`:
-    by number of the state; `jumps`: the first jumps larger than any of the fit, in words;
-    `statuses`: of the samples in it; `counters`: those of the sampler when it began; `late`: late messages when it
-    began; `unreadable`: unreadable messages when it began; `future`: messages with a stamp in the future when it began.
+    by number of the state; `jumps`: the first jumps larger than any of the fit, in words; `statuses`: of the samples in
+    it; `counters, late, unreadable, future`: of the sampler, and of messages, when it began.
     """
 
-    began: float = cython.declare(cython.double, visibility="readonly")
-    verdicts: int = cython.declare(cython.Py_ssize_t, visibility="public")
-    outside: int = cython.declare(cython.Py_ssize_t, visibility="public")
-    unknown: int = cython.declare(cython.Py_ssize_t, visibility="public")
-    last_unknown: Verdict | None = cython.declare(object, visibility="public")
-    last_unlisted: Verdict | None = cython.declare(object, visibility="public")
-    alarm: bool = cython.declare(cython.bint, visibility="public")
-    frozen: dict[int, Moved] = cython.declare(object, visibility="readonly")
-    withheld: Counter[int] = cython.declare(object, visibility="readonly")
-    repeating: dict[int, Moved] = cython.declare(object, visibility="readonly")
-    violations: Counter[int] = cython.declare(object, visibility="readonly")
-    jumps: list[str] = cython.declare(object, visibility="readonly")
-    statuses: Counter[Status] = cython.declare(object, visibility="readonly")
-    counters: Counter[str] = cython.declare(object, visibility="public")
-    late: int = cython.declare(cython.Py_ssize_t, visibility="public")
-    unreadable: int = cython.declare(cython.Py_ssize_t, visibility="public")
-    future: int = cython.declare(cython.Py_ssize_t, visibility="public")
-
-    def __init__(self, began: float) -> None:
-        self.began, self.last_unknown, self.last_unlisted, self.alarm = began, None, None, False
-        self.verdicts = self.outside = self.unknown = 0
-        self.frozen, self.withheld, self.repeating = {}, Counter(), {}
-        self.violations, self.statuses, self.counters = Counter(), Counter(), Counter()
-        self.jumps = []
-        self.late = self.unreadable = self.future = 0
+    began: float
+    counters: Counter[str] = field(default_factory=Counter)
+    alarm: bool = False
+    late: int = 0
+    unreadable: int = 0
+    future: int = 0
+    verdicts: int = 0
+    outside: int = 0
+    unknown: int = 0
+    last_unknown: Verdict | None = None
+    last_unlisted: Verdict | None = None
+    frozen: dict[int, Moved] = field(default_factory=dict)
+    withheld: Counter[int] = field(default_factory=Counter)
+    repeating: dict[int, Moved] = field(default_factory=dict)
+    violations: Counter[int] = field(default_factory=Counter)
+    jumps: list[str] = field(default_factory=list)
+    statuses: Counter[Status] = field(default_factory=Counter)
 
 
 def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> dict[str, str]:
@@ -449,7 +441,7 @@ class Stream:
 
     @cython.cfunc
     def _count(self, verdict: Verdict, alarm_before: cython.bint, now: cython.double) -> None:
-        period: Period = self.period
+        period = self.period
         judged: cython.bint = verdict.judged
         if judged:
             self.last, self._judged = verdict, now
@@ -543,10 +535,6 @@ class Stream:
 
     def pass_over(self, now: float) -> Period:
         """Begin another period for `report`."""
-        period, self.period = self.period, Period(now)
-        self.period.alarm = self.alarm
-        self.period.late = self.late
-        self.period.unreadable = self.unreadable.total()
-        self.period.future = self.future.total()
-        self.period.counters = Counter(self.sampler.counters)
+        counts = self.late, self.unreadable.total(), self.future.total()
+        period, self.period = self.period, Period(now, Counter(self.sampler.counters), self.alarm, *counts)
         return period
