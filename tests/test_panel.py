@@ -281,12 +281,15 @@ def test_states_that_are_blind_are_named(runs):
     assert "per hour with 90% confidence" in promises(full, panel)[0]
 
 
-def test_where_all_that_was_left_out_lies_far_outside_there_is_no_limit(runs):
-    left = validate(runs, criterion="lp", additive="noise")
-    for part in left.parts:
-        part.extrapolated[:] = 2
-    panel = learn(left, runs)
-    assert (panel.limit, panel.alarms, panel.hours) == (math.inf, 0, 0.0)
+def test_recordings_far_from_one_another_give_a_panel_that_promises_no_rate():
+    """Each recording lies far outside what the other shows, so nothing that was left out says anything."""
+    rng = np.random.default_rng(1)
+    t = np.arange(60) * 0.1
+    runs = [Transient(t, c + 0.01 * rng.normal(size=(60, 1)), rng.normal(size=(60, 1))) for c in (1.0, 100.0)]
+    alarm = fit(runs, false_alarms=0.1).fit_summary["alarm"]
+    assert alarm["hours"] == 0 and alarm["limit_per_hour"] is None
+    assert "one stretch says nothing of their rate" in " ".join(alarm["promises"])
+    assert alarm["promises"][-1].endswith("the recordings cannot show that; record more")
 
 
 @pytest.mark.slow

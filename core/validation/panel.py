@@ -325,8 +325,7 @@ def promises(model: UncertainLTI, panel: Panel) -> list[str]:
         first = "false alarms: one stretch says nothing of their rate; record more"
     found = [first, f"sees within {panel.within:.3g} s a jump of {', '.join(each)}"]
     if panel.asked is not None and not panel.limit <= panel.asked:
-        found.append(
-            f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; "
-            f"{max(panel.needed_hours - panel.hours, 0.0):.3g} h more without an alarm would"
-        )
+        more = panel.needed_hours - panel.hours
+        remedy = f"{more:.3g} h more without an alarm would" if more > 0 else "record more"
+        found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {remedy}")
     return found
