@@ -35,7 +35,7 @@ from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.plants.turbofan_faults import Fault
 from uncertain_lti.plants.turbofan_runs import DT, turbofan_signals
-from uncertain_lti.validation.blocks import cut
+from uncertain_lti.validation.left_out import cut
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ("pulses_up_large", "pulses_down_large", "levels")

@@ -21,7 +21,7 @@ import numpy as np
 
 from uncertain_lti import Transient, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.validation.blocks import cut
+from uncertain_lti.validation.left_out import cut
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = ROOT.parent / "shared" / "data"

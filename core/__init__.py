@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
     from uncertain_lti.signals.signal_map import SignalMap as SignalMap
-    from uncertain_lti.validation.fitted_model import validate as validate
+    from uncertain_lti.validation.left_out import validate as validate
 
 __version__ = "0.2.0"
 
@@ -46,7 +46,7 @@ _HOME = {
     "fit": "proposal.fitting",
     "read_transients": "sampling.reading",
     "tune": "proposal.tune",
-    "validate": "validation.fitted_model",
+    "validate": "validation.left_out",
 }
 
 __all__ = sorted(_HOME)

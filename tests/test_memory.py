@@ -19,7 +19,7 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit, validate
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
-from uncertain_lti.proposal.ways import Remembered, memory_candidates, remember
+from uncertain_lti.proposal.tune import Remembered, memory_candidates, remember
 from uncertain_lti.sampling.recall import recall, recalled, with_delays, with_memories
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import Status

@@ -19,10 +19,10 @@ from tanks import Tanks
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
-from uncertain_lti.validation.false_alarms import false_alarms
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import CONFIDENCE, Panel, learn, promises, rules_for, worth
+from uncertain_lti.validation.result import false_alarms
 
 DT = 0.1
 

@@ -38,9 +38,9 @@ from uncertain_lti.proposal.scheduling import (
     choose_knots,
     decide,
 )
-from uncertain_lti.proposal.ways import promise, thinned
+from uncertain_lti.proposal.tune import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
-from uncertain_lti.validation.fitted_model import validate_model
+from uncertain_lti.validation.left_out import validate_model
 
 DT = 0.05
 

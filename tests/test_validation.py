@@ -29,13 +29,11 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.reports.validation_text import validation_text
-from uncertain_lti.validation.blocks import cut, remaining_spans
-from uncertain_lti.validation.false_alarms import raised_on
-from uncertain_lti.validation.fitted_model import validate_model
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.left_out import cut, remaining_spans, validate, validate_model
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import judge, rising
+from uncertain_lti.validation.result import raised_on
 
 # --- intervals ---
 

@@ -69,7 +69,7 @@ def run(options: argparse.Namespace) -> int:
     from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.detectable import check_within, detectable
-    from uncertain_lti.validation.fitted_model import validate_model
+    from uncertain_lti.validation.left_out import validate_model
     from uncertain_lti.validation.panel import learn, promises
 
     check_within(options.within)

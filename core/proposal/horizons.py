@@ -27,7 +27,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.scheduling import EXCESS, PAYS, SLACK, WORSE, fold_of, jackknife
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.choices import HorizonRule
-from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.left_out import leave_out
 from uncertain_lti.validation.part import by_unit
 
 MOST = 64
@@ -167,7 +167,7 @@ def choose_horizons(
         dropped |= _dropped(model, lengths)
         try:
             fold = fold_of(transients, groups, model)
-            left = validate(
+            left = leave_out(
                 transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap,
                 **{k: v for k, v in options.items() if k not in ("operating_point", "schedule")},
             )  # fmt: skip

@@ -24,13 +24,18 @@ from uncertain_lti.base.packages import absent
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.effects import earlier, held
-from uncertain_lti.proposal.naming import name_signals
 from uncertain_lti.proposal.plant import is_plant, plant_signals
-from uncertain_lti.proposal.quantities import longest_hold, set_operating_point, set_own_scale
 from uncertain_lti.proposal.reading import Iterate, read_sources, run_column
 from uncertain_lti.proposal.roles import ask_for, assign_roles, at_rest
-from uncertain_lti.proposal.signals_file import entry, signals_file
-from uncertain_lti.proposal.ways import choose_memories
+from uncertain_lti.proposal.signals_file import (
+    entry,
+    longest_hold,
+    name_signals,
+    set_operating_point,
+    set_own_scale,
+    signals_file,
+)
+from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.transient import Transient

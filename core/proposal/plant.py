@@ -18,9 +18,9 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
-from uncertain_lti.proposal.quantities import set_own_scale
-from uncertain_lti.proposal.redundancy import drop_copies
+from uncertain_lti.proposal.choosing import drop_copies
 from uncertain_lti.proposal.roles import role_of_column
+from uncertain_lti.proposal.signals_file import set_own_scale
 from uncertain_lti.recordings.table import TYPE
 
 FASTEST = 1.05

@@ -26,9 +26,8 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.validation.blocks import BLOCKS, block_spans, guard_interval
 from uncertain_lti.validation.groups import resolve_groups
-from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.left_out import BLOCKS, block_spans, guard_interval, leave_out
 from uncertain_lti.validation.part import by_unit, unit_numbers
 from uncertain_lti.validation.result import Validation
 
@@ -233,7 +232,7 @@ class Trials:
         options = {k: v for k, v in self.options.items() if k != "operating_point"}  # that of the model is taken
         fold = self.fold
         try:
-            left = validate(
+            left = leave_out(
                 self.transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, **options
             )
         except FitError as error:

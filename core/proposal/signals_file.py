@@ -12,14 +12,129 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from uncertain_lti.base.english import printable, shortlist
-from uncertain_lti.proposal.candidates import Candidate, Source
-from uncertain_lti.proposal.quantities import longest_hold
+from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source
+from uncertain_lti.proposal.effects import held
 from uncertain_lti.recordings.recording import Recording
+from uncertain_lti.recordings.table import TOPIC
+from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.choices import CHOICES_TEXT
+from uncertain_lti.signals.functions import FUNCTIONS
+from uncertain_lti.signals.signal_map import Signal
+
+_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+
+
+_DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value", "quaternion", "accel", "wrench"}
+
+
+_UNITS = (
+    *((re.compile(rf"{name}\("), function.unit) for name, function in FUNCTIONS.items() if function.unit),
+    (re.compile(r"angular_velocity\.|twist\.angular\.|(^|\.)angular\.[xyz]$"), "rad/s"),
+    (re.compile(r"linear_acceleration\."), "m/s^2"),
+    (re.compile(r"(^|\.)linear\.[xyz]$"), "m/s"),
+    (re.compile(r"pose\.position\.|translation\."), "m"),
+    (re.compile(r"fluid_pressure$"), "Pa"),
+)
+
+
+def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> None:
+    """Give every signal a name of its own and a unit."""
+    taken: set[str] = set()
+    elements = {c.element for c in states} - {""}
+    for group, suffix in ((states, "state"), (controls, "command")):
+        kinds = {c.kind for c in group}
+        for candidate in group:
+            words = _words(candidate, len(kinds) > 1)
+            name = "_".join(words)
+            if name in taken or (suffix == "command" and candidate.element in elements):
+                name = f"{name}_{suffix}"
+            number = 2
+            unique = name
+            while unique in taken:
+                unique, number = f"{name}_{number}", number + 1
+            candidate.name = unique
+            taken.add(unique)
+            inner = candidate.path
+            candidate.unit = next((unit for pattern, unit in _UNITS if pattern.search(inner)), "")
+
+
+def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
+    """Words of a name: those of the path that say something, else the topic's last."""
+    if candidate.element:
+        words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
+        return [*words, *_split(candidate.kind)] if several_kinds else words
+    inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
+    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
+    words = [w for w in _split(inner) if w not in _DULL]
+    if not words or all(len(w) == 1 or w.isdigit() for w in words):
+        if candidate.topic != TOPIC:  # that of every table says nothing
+            words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
+    return words or ["signal"]
+
+
+def _split(text: str) -> list[str]:
+    return [w.lower() for w in _PARTS.findall(text)]
+
+
+def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
+    """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it."""
+    every = {s.topic: s for s in sources}
+    clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
+    group = [*states, *controls]
+    limits = [longest_hold(every[c.topic], clock)[0] if c in controls else None for c in group]
+    recordings = [
+        np.column_stack([held(c, every[c.topic], number, clock, limit) for c, limit in zip(group, limits, strict=True)])
+        for number in range(len(clock.arrival))
+    ]
+    recordings = [r for r in recordings if len(r)]
+    signals = [Signal(c.name, c.topic, c.path, "auto", "auto") for c in group]
+    steady, scale, _ = resolve_auto(signals, recordings)
+    pooled = np.concatenate(recordings)
+    for j, candidate in enumerate(group):
+        finite = pooled[np.isfinite(pooled[:, j]), j]
+        span = float(np.ptp(finite)) if len(finite) else 0.0
+        candidate.steady = steady[j] if abs(steady[j]) > 1e-3 * span else 0.0
+        candidate.scale = _listed(scale[j] if scale[j] > 0.1 * span else span)
+
+
+def set_own_scale(candidate: Candidate) -> None:
+    """Median and range, for one in a comment."""
+    finite = np.concatenate(candidate.values)
+    finite = finite[np.isfinite(finite)]
+    candidate.steady, candidate.scale = float(np.median(finite)), _listed(float(np.ptp(finite)))
+
+
+def _listed(scale: float) -> float:
+    """The nearest scale that a signals file may have; 0 stays."""
+    return min(max(scale, 1.0 / LARGEST), LARGEST) if scale else 0.0
+
+
+def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
+    """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do."""
+    steps = np.concatenate([np.diff(a) for a in source.arrival if len(a) > 1] or [np.empty(0)]) * 1e-9
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None, ""
+    usual, long = float(np.median(steps)), float(np.percentile(steps, 99))
+    if long > 4 * usual:
+        return None, "comes now and then, and holds until the next one"
+    pauses = float(steps.max()) > 10 * usual
+    for mine, theirs in zip(source.arrival, clock.arrival, strict=False):
+        pauses |= len(mine) > 0 and len(theirs) > 0 and (theirs[-1] - mine[-1]) * 1e-9 > 10 * usual
+    if not pauses:
+        return None, ""
+    limit = max(5 * usual, 2 * long)
+    power = 10.0 ** math.floor(math.log10(limit))
+    return next(f * power for f in (1, 2, 5, 10) if f * power >= limit), "s; older ones have ended"
+
 
 _LONGEST_LINE = 1 << 20  # letters
 _ADDITIVE = f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give."

@@ -13,22 +13,316 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.identification import fitting
+from uncertain_lti.identification.assembly import assemble
+from uncertain_lti.identification.predictability import autocorrelation
+from uncertain_lti.identification.sensors import late_controls
+from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.proposal import ways
 from uncertain_lti.proposal.fitting import fit
-from uncertain_lti.proposal.ways import Setting
+from uncertain_lti.proposal.scheduling import Fold, fold_of
+from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.choices import Additive
+from uncertain_lti.signals.functions import Memory
+from uncertain_lti.validation.left_out import leave_out
 from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored
 from uncertain_lti.validation.panel import worth
+
+KNOTS = (2, 3, 5)
+"""Numbers of knots tried on a promising signal."""
+PROMISING, SIGNALS = 0.9, 2
+"""Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
+TRANSITIONS = 4000
+"""Transitions by which promising signals are found, about; of larger recordings pieces are taken, ..."""
+PIECE = 200
+"""... of so many transitions."""
+PAYS, ALLOWED = 0.8, 0.02
+"""Memories pay whose mean width on left-out data is at most this share, with at most so much more outside."""
+FOLDS = 5
+"""Times that something is left out to choose memories, at most."""
+FEWEST_STEPS, MOST_STEPS = 3, 0.05
+"""A control whose steps are events changes in at least so many transitions, and in at most this share of them."""
+LONGEST = 64
+"""Steps of the longest horizon tried."""
+
+
+@dataclass(frozen=True)
+class Remembered:
+    """A memory that may be added to the signals.
+
+    `of`: the state or control whose samples it takes; `memory`: how.
+    """
+
+    of: str
+    memory: Memory
+
+    @property
+    def name(self) -> str:
+        """Name of the new signal."""
+        lag = f"_{self.memory.samples}" if self.memory.samples > 1 else ""
+        return f"{self.of}_{ {'lag': 'before', 'diff': 'change', 'rate': 'rate'}[self.memory.kind] }{lag}".replace(
+            " ", ""
+        )
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to fit.
+
+    `words`: what it is, in words; `options`: arguments of `fit`; knots of a schedule are stated by their number;
+    `memories`: lags and rates that are added to the controls; `delays`: controls that are taken so many samples
+    earlier; `constant`: half-widths do not grow with x and u.
+    """
+
+    words: str
+    options: Mapping[str, Any]
+    memories: tuple[Remembered, ...] = ()
+    delays: tuple[tuple[str, int], ...] = ()
+
+    def prepared(self, transients: Sequence[Transient]) -> list[Transient]:
+        """The recordings with the delays and memories of this setting."""
+        if self.delays:
+            transients = [with_delays(t, dict(self.delays)) for t in transients]
+        return remember(transients, self.memories) if self.memories else list(transients)
+
+    def beside(self, what: str, **changes: Any) -> Setting:
+        """This one with something more."""
+        return replace(self, words=f"{self.words}, {what}", **changes)
+
+
+def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
+    """Controls that are taken earlier: those that then explain more, and all of them by one sample."""
+    first = transients[0]
+    signals = () if first.signals is None else first.signals.controls
+    remembered = {s.name for s in signals if s.memory is not None}
+    names = list(first.control_names)
+    low = np.min([np.nanmin(t.u, axis=0) for t in transients], axis=0)
+    high = np.max([np.nanmax(t.u, axis=0) for t in transients], axis=0)
+    moving = {name: 1 for j, name in enumerate(names) if name not in remembered and high[j] > low[j]}
+    if not moving:
+        return
+    sets = [moving]
+    try:
+        few = thinned(transients, 5 * TRANSITIONS)
+        problem = assemble(few, operating_point(first), None, best.options.get("additive", "noise"))
+        late = {names[j]: samples for j, (samples, _) in late_controls(problem).items() if names[j] in moving}
+        sets = [late, *(s for s in sets if s != late)] if late else sets
+    except FitError:
+        pass  # too few of them follow one another
+    for chosen in sets:
+        said = ", ".join(f"{name} {plural(count, 'sample')} earlier" for name, count in chosen.items())
+        words = "all controls 1 sample earlier" if len(chosen) > 1 and chosen is moving else said
+        yield best.beside(words, delays=tuple(chosen.items()))
+
+
+def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[Setting]]:
+    """Schedules on each promising signal."""
+    found = promise(thinned(transients, TRANSITIONS))
+    signals = [name for name in sorted(found, key=lambda name: found[name]) if found[name] <= PROMISING][:SIGNALS]
+    for name in signals:
+        yield [
+            best.beside(f"{count} knots on {name}", options={**best.options, "schedule": {name: count}})
+            for count in KNOTS
+        ]
+
+
+def memories(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
+    """Lags and rates of states whose residuals follow from sample to sample, and of controls that seldom change."""
+    delayed = replace(best, memories=()).prepared(transients)
+    for some in memory_candidates(delayed, best.options.get("additive", "noise")):
+        yield best.beside(f"with {', '.join(one.name for one in some)}", memories=some)
+
+
+def horizons(transients: Sequence[Transient], best: Setting, within: float) -> Iterator[Setting]:
+    """Envelopes over several steps beside that of one."""
+    step = float(np.median(np.concatenate([t.dt for t in transients])))
+    longest = min(LONGEST, round(within / step))
+    for steps in sorted({max(2, longest // 4), longest}):
+        if longest >= 2:
+            options = {**best.options, "horizons": [steps], "widths": "constant"}
+            yield best.beside(f"and over {steps} steps", options=options)
+
+
+def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
+    """Recordings with further controls that follow from their own earlier samples."""
+    return [with_memories(t, {one.name: (one.of, one.memory) for one in memories}) for t in transients]
+
+
+def memory_candidates(transients: Sequence[Transient], additive: Additive = "noise") -> list[tuple[Remembered, ...]]:
+    """Sets of memories that may narrow the envelope, by what least squares leaves unexplained.
+
+    Of the states whose residual follows from sample to sample (`Autocorrelation.follows`) the rates (the
+    differences, if the step is constant) and the values one sample earlier; of the controls that seldom change the
+    values one sample earlier, and their changes.
+    """
+    first = transients[0]
+    point = operating_point(first)
+    try:
+        problem = assemble(transients, point, None, additive)
+    except FitError:
+        return []
+    taken = {*first.state_names, *first.control_names, *first.scheduling_names}
+    remembered = {r.of for r in first.signals.recalled} if first.signals is not None else set()
+    found = autocorrelation(problem)
+    follow = [i for i in range(problem.n) if found is not None and found.follows(i) and i not in remembered]
+    rate = "rate" if first.step is None else "diff"
+    events = []
+    for j in range(problem.n, problem.p):
+        changes = int(np.count_nonzero(np.diff(problem.z[:, j])))
+        if FEWEST_STEPS <= changes <= MOST_STEPS * problem.N and j not in remembered:
+            events.append(j)
+    names = [*first.state_names, *first.control_names]
+    sets = [
+        tuple(Remembered(names[i], Memory(kind)) for i in group)  # type: ignore[arg-type]
+        for group, kinds in ((follow, (rate, "lag")), (events, ("lag", "diff")))
+        for kind in kinds
+        if group
+    ]
+    return [chosen for chosen in sets if not taken & {one.name for one in chosen}]
+
+
+def choose_memories(transients: Sequence[Transient], additive: Additive) -> tuple[tuple[Remembered, ...], float]:
+    """Which lags, rates or differences narrow the envelope of left-out data, and the mean width over that without.
+
+    Of the sets of `memory_candidates` those for the states are tried on about TRANSITIONS transitions, leaving out in
+    turn, then, beside the best of them, those for the controls.
+    """
+    sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), additive)
+    if not sets:
+        return (), 1.0
+    base = thinned(transients, TRANSITIONS)
+    try:
+        model = fitting.fit(base, schedule={}, describe_data=False, additive=additive)
+        fold = fold_of(base, None, model, FOLDS)
+        before = best = _judged(base, model, fold, additive)
+    except FitError:
+        return (), 1.0
+    states = {*transients[0].state_names}
+    chosen: tuple[Remembered, ...] = ()
+    for kind in (True, False):
+        beside, widths = chosen, best
+        for some in (s for s in sets if (s[0].of in states) is kind):
+            more = thinned(remember(transients, (*beside, *some)), TRANSITIONS)
+            try:
+                model = fitting.fit(more, schedule={}, describe_data=False, additive=additive)
+                after = _judged(more, model, fold, additive)
+            except FitError:
+                continue
+            ratio = math.exp(float(np.mean(np.log(after[0] / widths[0]))))
+            pays = ratio <= PAYS and after[1] >= before[1] - ALLOWED
+            if pays and np.mean(np.log(after[0] / best[0])) < 0:
+                best, chosen = after, (*beside, *some)
+    return chosen, math.exp(float(np.mean(np.log(best[0] / before[0]))))
+
+
+def _judged(
+    transients: Sequence[Transient], model: UncertainLTI, fold: Fold, additive: Additive
+) -> tuple[Array, float]:
+    """Mean width of each state on left-out data, in recorded units, and the share inside."""
+    left = leave_out(transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, additive=additive)
+    judged = np.array([part.judged for part in left.parts], dtype=np.float64)
+    if not judged.sum():
+        raise FitError("nothing that was left out can be judged")
+    width = sum(part.judged * part.mean_width for part in left.parts if part.judged) / judged.sum()
+    outside = sum(part.violated for part in left.parts) / judged.sum()
+    return np.maximum(width, 1e-300), float(1.0 - outside)
+
+
+def operating_point(transient: Transient) -> OperatingPoint:
+    """That of the signals of a recording; of arrays 0, with scales of 1."""
+    signals = transient.signals
+    if signals is not None:
+        return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+    sizes = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
+    steady, scale = [np.zeros(k) for k in sizes], [np.ones(k) for k in sizes]
+    return OperatingPoint(steady[0], steady[1], scale[0], scale[1], steady[2], scale[2])
+
+
+def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
+    """Pieces of each recording, evenly spread, so that about this many transitions are left in total."""
+    share = most / max(sum(len(t) for t in transients), 1)
+    return list(transients) if share >= 1 else [_pieces(t, share) for t in transients]
+
+
+def _pieces(transient: Transient, share: float) -> Transient:
+    length = min(PIECE, max(20, int(share * len(transient))))
+    count = max(1, round(share * len(transient) / length))
+    if count * (length + 2) >= len(transient):
+        return transient
+    starts = np.linspace(0, len(transient) - length - 2, count).astype(int)
+    keep = np.unique((starts[:, None] + np.arange(length + 2)).ravel())
+    x = transient.x[keep]
+    x[np.isin(keep, starts + length + 1)] = np.nan  # no transition from one piece to the next
+    names: dict[str, Any] = {}
+    if transient.signals is None:
+        names = {
+            "state_names": transient.state_names,
+            "control_names": transient.control_names,
+            "scheduling_names": transient.scheduling_names,
+        }
+    return Transient(
+        transient.t_ns[keep],
+        x,
+        transient.u[keep],
+        s=transient.s[keep],
+        name=transient.name,
+        signals=transient.signals,
+        max_gap=transient.max_gap,
+        min_step=transient.min_step,
+        step=transient.step or "recorded",
+        sources=transient.sources,
+        **names,
+    )
+
+
+def promise(transients: Sequence[Transient]) -> dict[str, float]:
+    """How far the largest residuals of least squares shrink with three knots on each signal.
+
+    The knots are the ends of the signal and one of a few places between, the best.
+    """
+    steps = [t.transitions() for t in transients]
+    first = transients[0]
+    names = [*first.state_names, *first.control_names, *first.scheduling_names]
+    x, u = np.concatenate([s.x for s in steps]), np.concatenate([s.u for s in steps])
+    dt = np.concatenate([s.dt for s in steps])
+    z = np.column_stack([x, u])
+    phi = dt * np.vstack([(z / np.maximum(np.abs(z).max(axis=0, initial=0.0), 1e-300)).T, np.ones(len(z))])
+    if len(z) < 9 * len(phi):
+        return dict.fromkeys(names, 1.0)
+    move = np.concatenate([s.x_next for s in steps]) - x
+    floor = np.maximum(1e-9 * np.ptp(x, axis=0), 1e-300)
+    whole = np.maximum(_largest(phi, move), floor)
+    found = {}
+    for name, values in zip(names, np.column_stack([z, np.concatenate([s.s for s in steps])]).T, strict=True):
+        low, high = float(values.min()), float(values.max())
+        places = {0.5 * (low + high), *np.quantile(values, [0.25, 0.5, 0.75]).tolist()}
+        found[name] = 1.0
+        for place in sorted(p for p in places if low < p < high):
+            weights = Schedule((Axis(name, knots=(low, place, high)),)).weights(values[None])
+            left = _largest((weights[:, None] * phi[None]).reshape(-1, len(z)), move)
+            found[name] = min(found[name], float(np.exp(np.mean(np.log(np.maximum(left, floor) / whole)))))
+    return found
+
+
+def _largest(phi: Array, move: Array) -> Array:
+    """Mean of the largest hundredth of the least-squares residuals of each state; phi (r, N), move (N, n)."""
+    theta = np.linalg.lstsq(phi.T, move, rcond=None)[0]
+    left = np.sort(np.abs(move - phi.T @ theta), axis=0)
+    return np.asarray(left[-max(1, len(left) // 100) :].mean(axis=0))
+
 
 WITHIN = 1.0
 """Time of the longest horizon tried, s."""
@@ -162,15 +456,15 @@ def tune(
         return True
 
     try:
-        for setting in ways.delays(transients, best):
+        for setting in delays(transients, best):
             attempt(setting)
-        for settings in ways.schedules(transients, best):
+        for settings in schedules(transients, best):
             for setting in settings:  # more and more knots, as long as they see more
                 if not attempt(setting):
                     break
-        for setting in ways.memories(transients, best):
+        for setting in memories(transients, best):
             attempt(setting)
-        for setting in ways.horizons(transients, best, WITHIN):
+        for setting in horizons(transients, best, WITHIN):
             attempt(setting)
     except (_SpentError, KeyboardInterrupt):
         reason += "; the time ran out before every way was tried"

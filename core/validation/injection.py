@@ -28,9 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Recalled
 
 
@@ -68,28 +66,6 @@ KINDS: Mapping[str, Kind] = {
 """Kinds of fault by name."""
 
 
-@dataclass(frozen=True)
-class Fault:
-    """One fault.
-
-    `kind`: one of `KINDS`; `signal`: name of the state, or of an actuator's control; `size`: in the unit of its kind;
-    negative for the other direction, where there is one; `at`: onset, s after the first sample; it begins with the
-    first sample at or after; `seed`: of noise.
-    """
-
-    kind: str
-    signal: str
-    size: float
-    at: float
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise FitError(f"there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
-        if not np.isfinite(self.size) or (self.size < 0 and not KINDS[self.kind].both):
-            raise FitError(f"a fault '{self.kind}' of size {self.size}; give a finite size of 0 or more")
-
-
 @dataclass(frozen=True, eq=False)
 class Windows:
     """Stretches of recordings of equal length, side by side, all with the onset of a fault at the same sample.
@@ -112,50 +88,27 @@ class Windows:
         return replace(self, t=self.t[which], x=self.x[which], u=self.u[which], s=self.s[which])
 
 
-def position(kind: str, signal: str, states: Sequence[str], controls: Sequence[str]) -> int:
-    """Column of the signal that a fault is of."""
-    names = controls if KINDS[kind].of == "actuator" else states
-    what = "control" if KINDS[kind].of == "actuator" else "state"
-    if signal not in names:
-        raise FitError(f"a fault '{kind}' is of a {what}, and '{signal}' is none of {', '.join(names)}")
-    return list(names).index(signal)
-
-
-def inject(transient: Transient, fault: Fault, model: UncertainLTI | None = None) -> Transient:
-    """A recording as it would have been with a fault."""
-    i = position(fault.kind, fault.signal, transient.state_names, transient.control_names)
-    onset = int(np.searchsorted(transient.t, fault.at - 1e-12))
-    windows = Windows(transient.t[None], transient.x[None], transient.u[None], transient.s[None], onset)
-    noise = np.random.default_rng(fault.seed).standard_normal((1, len(transient)))
-    signals = transient.signals if model is None else model.signals
-    recalled = () if signals is None else signals.recalled
-    x, u = faulty(windows, fault.kind, i, np.array([fault.size]), noise, recalled, model, transient.segment[None])
-    return transient.replace(x=x[0], u=u[0])
-
-
 def faulty(
     windows: Windows,
     kind: str,
     i: int,
     size: Array,
     noise: Array,
-    recalled: Sequence[Recalled] = (),
-    model: UncertainLTI | None = None,
-    segment: NDArray[np.int32] | None = None,
+    recalled: Sequence[Recalled],
+    model: UncertainLTI | None,
 ) -> tuple[Array, Array]:
     """States and controls of many recordings at once, each with a fault of its own size.
 
-    `size` (W,): size of the fault in each; `noise` (W, L): standard normal numbers; `segment` (W, L): segments of the
-    samples, over which no response goes on; default one; Returns (W, L, n): states, recorded units; Returns (W, L, m):
-    controls, recorded units: those of `windows`, but for the memories of states.
+    `size` (W,): size of the fault in each; `noise` (W, L): standard normal numbers; `model`: how the machine moves, for
+    faults that change that; Returns (W, L, n): states, recorded units; Returns (W, L, m): controls, recorded units:
+    those of `windows`, but for the memories of states.
     """
     if KINDS[kind].of == "sensor":
         x = windows.x.copy()
         x[:, windows.onset :, i] = _reading(windows, kind, windows.x[:, :, i], size, noise)
-    elif model is None:
-        raise FitError(f"a fault '{kind}' changes how the machine moves; give the model that says how")
     else:
-        x = _response(windows, kind, i, size, recalled, model, segment)
+        assert model is not None
+        x = _response(windows, kind, i, size, recalled, model)
     n = x.shape[2]
     of_states = [r for r in recalled if r.of < n <= r.position < n + windows.u.shape[2]]
     if not of_states:
@@ -214,7 +167,6 @@ def _response(
     size: Array,
     recalled: Sequence[Recalled],
     model: UncertainLTI,
-    segment: NDArray[np.int32] | None,
 ) -> Array:
     point = model.operating_point
     x, u, s = point.normalise_x(windows.x), point.normalise_u(windows.u), point.normalise_s(windows.s)
@@ -229,7 +181,6 @@ def _response(
                 for k in range(windows.onset, done.shape[1]):
                     done[:, k, r.position - n] += _recall(r, moved, k, dt)
     done = point.normalise_u(done)
-    broken = np.zeros(dt.shape, dtype=bool) if segment is None else np.diff(segment, axis=1) != 0
     faster = np.where(size >= 0, 1.0 / (1.0 + np.abs(size)), 1.0 + np.abs(size))  # of the time constant: slower first
     moved_by = np.zeros_like(x)  # the difference that the fault makes
     with np.errstate(over="ignore", invalid="ignore"):
@@ -248,7 +199,7 @@ def _response(
                 faulty = faulty.copy()
                 faulty[:, i] += size * (faulty[:, i] - idle[:, i])
             difference = faulty - healthy
-            # nothing is known of the machine across a gap: the difference stays as it was
-            unknown = broken[:, k] | ~np.isfinite(difference).all(axis=1)
-            moved_by[:, k + 1] = np.where(unknown[:, None], moved_by[:, k], difference)
+            # nothing is known of the machine where a sample is missing: the difference stays as it was
+            known = np.isfinite(difference).all(axis=1, keepdims=True)
+            moved_by[:, k + 1] = np.where(known, difference, moved_by[:, k])
         return np.asarray(windows.x + moved_by * point.X)

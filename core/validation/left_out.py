@@ -12,28 +12,66 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, controls_as, listed_transients
-from uncertain_lti.validation.blocks import BLOCKS, block_spans, cut, guard_interval, remaining_spans
-from uncertain_lti.validation.extrapolation import Reach
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
-from uncertain_lti.validation.part import Part, judge
+from uncertain_lti.validation.part import Part, Reach, judge
 from uncertain_lti.validation.result import Validation
 
+BLOCKS = 10
+"""Parts that a single recording is cut into, by default."""
 
-def validate(
+
+def cut(transient: Transient, start: int, stop: int) -> Transient:
+    """Samples start..stop-1 as a transient of their own."""
+    return transient.replace(slice(start, stop))
+
+
+def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
+    """Contiguous blocks with equal numbers of usable transitions; neighbours share one sample."""
+    usable = np.flatnonzero(transient.usable)
+    if len(usable) < 2 * blocks:
+        raise FitError(
+            f"{transient.name}: {plural(len(usable), 'usable transition')} "
+            f"{'is' if len(usable) == 1 else 'are'} too few for {plural(blocks, 'block')}; use fewer blocks, or "
+            f"record longer"
+        )
+    edges = [int(part[0]) for part in np.array_split(usable, blocks)] + [int(usable[-1]) + 1]
+    return [(a, b + 1) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+
+
+def guard_interval(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
+    """Three of the slowest stable time constants of the model, at most half of the shortest block."""
+    stable = [-v.real for v in model.eigenvalues().ravel() if v.real < 0]
+    shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
+    return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
+
+
+def remaining_spans(transient: Transient, start: int, stop: int, gap: float) -> list[tuple[int, int]]:
+    """What is left of a transient without a block and the guard intervals on both sides of it."""
+    if (start, stop) == (0, len(transient)):
+        return []
+    t = transient.t
+    before = int(np.count_nonzero(t[: start + 1] <= t[start] - gap))
+    after = stop - 1 + int(np.count_nonzero(t[stop - 1 :] < t[stop - 1] + gap))
+    return [(0, min(before, start + 1)), (min(after, len(t)), len(t))]
+
+
+def leave_out(
     transients: Sequence[Transient] | Transient,
     *,
     operating_point: OperatingPoint | None = None,
@@ -140,3 +178,111 @@ def _split_weights(
         return [None] * len(transients)
     lengths = np.cumsum([max(len(t) - 1, 0) for t in transients])
     return list(np.split(stacked, lengths[:-1]))
+
+
+def validate(
+    subject: UncertainLTI | Sequence[Transient] | Transient,
+    transients: Sequence[Transient] | Transient | None = None,
+    **options: Any,
+) -> Validation:
+    """Leave out one recording or group at a time, fit to the others, and judge what was left out.
+
+    `validate(model, runs)` fits with the model's own settings: criterion, additive terms, structure, discards, schedule
+    and the groups of its fit. `validate(runs)` fits as `fit(runs)` does.
+
+    Parameters
+    ----------
+    subject : UncertainLTI, Transient or sequence of Transient
+        A fitted model; or the recordings.
+    transients : Transient or sequence of Transient, optional
+        With a model, the recordings that it was fitted to.
+    **options : object
+        With a model those of `validate_model` (blocks, gap, groups, confidence, progress); else those of
+        `leave_out`, which takes those of `fit` as well (criterion, additive, ...).
+
+    Returns
+    -------
+    Validation
+        The parts, each judged by the model that was fitted without it.
+
+    Raises
+    ------
+    FitError
+        As of `validate_model` and `leave_out`; or a model is given without recordings, or recordings twice.
+    """
+    if isinstance(subject, UncertainLTI):
+        if transients is None:
+            raise FitError("a model alone says nothing; give the recordings it was fitted to: validate(model, runs)")
+        runs = listed_transients(transients)
+        if further := sorted(set(options) - {"blocks", "gap", "groups", "confidence", "progress"}):
+            raise FitError(
+                f"{', '.join(further)}: a model is validated with its own settings; leave this out, or give the "
+                f"recordings alone: validate(runs, {further[0]}=...)"
+            )
+        return validate_model(subject, runs, **options)
+    if transients is not None:
+        raise FitError("recordings are given twice; write validate(model, runs) or validate(runs)")
+    return leave_out(subject, **options)
+
+
+def validate_model(
+    model: UncertainLTI,
+    transients: Sequence[Transient],
+    *,
+    blocks: int | None = None,
+    gap: float | None = None,
+    groups: Sequence[Any] | str | None = None,
+    confidence: float = 0.9,
+    progress: Callable[[str], None] | None = None,
+) -> Validation:
+    """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
+
+    The key by which its file says that the recordings are grouped, `fit --group`, applies unless groups or blocks are
+    given.
+    """
+    if isinstance(groups, str) and groups == "none":
+        groups = None
+    elif groups is None and blocks is None:
+        groups = model.fit_summary.get("group")
+    if progress is not None:
+        progress("the fit to all recordings")
+    again = fit(transients, operating_point=model.operating_point, schedule=model.schedule or {}, **_options(model))
+    if not _same(again, model):
+        raise FitError(
+            "these recordings do not give this model again, so what was left out of them would say nothing about it; "
+            "name the recordings it was fitted to, or fit it again"
+        )
+    return leave_out(
+        transients,
+        operating_point=model.operating_point,
+        alarm_rule=model.alarm_rule,
+        blocks=blocks,
+        gap=gap,
+        groups=groups,
+        confidence=confidence,
+        full=again,
+        progress=progress,
+        **_options(model),
+    )
+
+
+def _options(model: UncertainLTI) -> Mapping[str, Any]:
+    """Options of `fit` with which a model was fitted; see `validate_model`."""
+    facts = model.fit_summary
+    for key in ("criterion", "additive"):
+        if key not in facts:
+            raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
+    if facts.get("weights", "ones") != "ones":
+        raise FitError("the model was fitted with weights, which its file does not hold; use validate() from Python")
+    options: dict[str, Any] = {"criterion": facts["criterion"], "additive": facts["additive"]}
+    options |= {key: facts[key] for key in ("discard", "count") if key in facts}
+    if "structure" in facts:
+        options["structure"] = Structure.from_dict(facts["structure"], model.n, model.m)
+    return options
+
+
+def _same(one: UncertainLTI, other: UncertainLTI) -> bool:
+    """The same widths from as many transitions; another numpy may round otherwise, so not to the bit."""
+    if one.fit_summary["transitions"] != other.fit_summary.get("transitions"):
+        return False
+    return np.allclose(one.fit_summary["mean_width"], np.asarray(other.fit_summary["mean_width"]), rtol=1e-6, atol=0.0)

@@ -23,7 +23,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import resolve_groups
-from uncertain_lti.validation.left_out import validate
+from uncertain_lti.validation.left_out import leave_out
 from uncertain_lti.validation.panel import Panel, learn, promises, worth
 from uncertain_lti.validation.part import judge
 from uncertain_lti.validation.result import Validation
@@ -99,7 +99,7 @@ def fit_monitored(
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
         return Monitored(*_armed(model, *_seen(model, transients), false_alarms), None, why, centred)
     try:
-        validation = validate(
+        validation = leave_out(
             transients,
             full=model,
             operating_point=model.operating_point,

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Part: a recording, or a block of one, judged by the model that was fitted without it."""
+"""Part: a recording, or a block of one, judged by the model that was fitted without it, and how far from it it lies."""
 
 from __future__ import annotations
 
@@ -25,7 +25,50 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions
-from uncertain_lti.validation.extrapolation import Reach
+
+BEYOND, FAR = (0.1, 2.0), (1.0, 10.0)
+"""Share of the range of a signal beyond it, and multiple of the largest leverage of the fit, from which on a sample is
+beyond what was fitted, or far beyond."""
+_SAME = 1e-12
+_MOST = 200_000  # transitions that the leverage is made from, about
+
+
+class Reach:
+    """What a fit saw of the normalised [x; u; s]: ranges, and leverages z' (Σ z z')^-1 z with z = [x; u; 1]."""
+
+    def __init__(self, model: UncertainLTI, transients: Sequence[Transient]) -> None:
+        self._model = model
+        every = np.concatenate([self._rows(t.transitions()) for t in transients])
+        self._low, self._high = every.min(axis=0), every.max(axis=0)
+        some = self._lever(every[:: max(1, len(every) // _MOST)])
+        self._scale = np.maximum(np.abs(some).max(axis=0), 1e-300)
+        scaled = some / self._scale
+        self._inverse = np.linalg.pinv(scaled.T @ scaled, rcond=_SAME, hermitian=True)
+        self._largest = float(self._leverage(some).max())
+
+    def _rows(self, steps: Transitions) -> Array:
+        return np.ascontiguousarray(self._model.normalised_columns(steps).T)
+
+    def _lever(self, rows: Array) -> Array:
+        return np.hstack([rows[:, : self._model.n + self._model.m], np.ones((len(rows), 1))])
+
+    def _leverage(self, lever: Array) -> Array:
+        scaled = lever / self._scale
+        return np.asarray(np.einsum("ki,ki->k", scaled @ self._inverse, scaled))
+
+    def level(self, steps: Transitions) -> NDArray[np.intp]:
+        """(K,): 0 where a transition begins within what was fitted, 1 beyond it, 2 far beyond."""
+        rows = self._rows(steps)
+        found = np.zeros(len(rows), dtype=np.intp)
+        if not len(rows):
+            return found
+        span, leverage = self._high - self._low, self._leverage(self._lever(rows))
+        for level, (share, times) in enumerate((BEYOND, FAR), start=1):
+            edge = share * span + _SAME * np.maximum(np.abs(self._low), np.abs(self._high))
+            beyond = ((rows < self._low - edge) | (rows > self._high + edge)).any(axis=1)
+            found[beyond | (leverage > times * self._largest)] = level
+        return found
+
 
 USUAL = 0.9
 """Share of the verdicts whose width a state's usual width is not below."""

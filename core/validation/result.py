@@ -17,16 +17,109 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
+from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.validation.false_alarms import false_alarms, raised_on
-from uncertain_lti.validation.intervals import rate_interval, share_interval
+from uncertain_lti.monitor.alarm import Alarm
+from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
-from uncertain_lti.validation.scenario import scenario
+
+
+def raised_on(rules: Sequence[Rule], part: Part) -> NDArray[np.bool_]:
+    """(K,): whether the rules raise the alarm, after each verdict of a part that was left out."""
+    model = part.judged_by
+    assert model is not None
+    one_step = containment(rules)
+    margin = 1.0 if one_step is None else one_step.margin
+    violated = ~(np.nan_to_num(part.severity) <= margin)
+    found, table = np.zeros(part.judged, dtype=bool), part.table
+    for start, stop in part.spans:
+        span = slice(start, stop)
+        alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
+        found[span] = alarm.over(part.dt[span], violated[span], table[span])[0]
+    return found
+
+
+def false_alarms(parts: Sequence[Part], rules: Sequence[Rule], confidence: float) -> dict[str, Any]:
+    """Alarms per hour on what was left out, with the interval for the rate of a model fitted to as many parts."""
+    raised = [raised_on(rules, part) for part in parts]
+    counts = [rising(each, part.starts) for each, part in zip(raised, parts, strict=True)]
+    hours = sum(part.hours for part in parts)
+    time = sum(float(part.dt[each].sum()) for each, part in zip(raised, parts, strict=True)) / 3600.0
+    low, high = rate_interval(by_unit(parts, counts), hours, confidence)
+    return {
+        "rule": "; or ".join(rule.words for rule in rules),
+        "alarms": sum(counts),
+        "parts_with_alarm": sum(count > 0 for count in counts),
+        "raised_share": time / hours if hours else None,
+        "per_hour": sum(counts) / hours if hours else None,
+        "interval": [low, high if math.isfinite(high) else None],
+    }
+
+
+VOID = 0.9
+"""A bound on the probability of leaving the envelope is reported only up to this."""
+
+
+def scenario(model: UncertainLTI, parts: Sequence[Part], what: str, confidence: float) -> dict[str, Any]:
+    """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none."""
+    G = int(unit_numbers(parts).max(initial=-1)) + 1
+    discarded = _discarded(model)
+    condition = (
+        f"holds if the {what}s were drawn independently of one another from one and the same distribution, and the "
+        f"machine will be run like that again; counted by whole {what}s, margin 1; a guide rather than a theorem, as "
+        f"the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
+    )
+    if what == "block":
+        return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
+    counted = "transients" if what == "recording" else "groups"
+    if discarded:
+        variables = _variables(model)
+        upper = discarding_bound(variables, discarded, G, confidence)
+        if upper > VOID:
+            return {
+                "words": f"not enough {counted} for a scenario bound: {G} with {variables} unknowns and at most "
+                f"{discarded} with discarded transitions"
+            }
+        return {
+            "interval": [0.0, upper],
+            "discarded": discarded,
+            "variables": variables,
+            "words": f"a fresh {what} leaves the envelope with a probability of at most {upper:.1%} "
+            f"(confidence {confidence:.0%}); {condition}, and each {what} with a discarded transition counted as "
+            f"discarded",
+        }
+    support = int(np.count_nonzero(by_unit(parts, [p.violated for p in parts])))
+    low, high = scenario_interval(support, G, confidence)
+    if high > VOID:
+        return {
+            "support": support,
+            "words": f"not enough {counted} for a scenario bound: {support} of {G} left the envelope of the others; "
+            f"record more of them",
+        }
+    return {
+        "support": support,
+        "interval": [low, high],
+        "words": f"a fresh {what} leaves the envelope somewhere with a probability between {low:.1%} and "
+        f"{high:.1%} (confidence {confidence:.0%}, {support} of {G} {what}s left the envelope of the others); "
+        f"{condition}",
+    }
+
+
+def _variables(model: UncertainLTI) -> int:
+    nominal = model.n * (model.n + model.m)
+    return 2 * nominal + sum(int(getattr(model, name).any()) * model.n for term in ADDITIVE for name in term.names)
+
+
+def _discarded(model: UncertainLTI) -> int:
+    """Recordings at most that lost a transition to the budget of outliers."""
+    listed = model.fit_summary.get("discarded", [])
+    return len(listed) if isinstance(listed, (list, tuple)) else 0
 
 
 @dataclass(frozen=True, repr=False)
