@@ -75,7 +75,6 @@ WORDS = {
     "flip": "change sign together",
     "wrap": "wraps around",
     "jitter": "the stamps jitter",
-    "hidden": "most of what one step leaves unexplained",
 }
 
 
@@ -243,17 +242,15 @@ def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
     ).all()
 
 
-def test_noise_near_rest_is_named_with_what_the_term_gains():
+def test_noise_near_rest_is_named():
     u = steps(np.random.default_rng(11), 1501)
     u[200:800] = 0.0
     transient = run(11, u=u, noise=5e-3)
     transient = Transient(transient.t_ns[1:], transient.x[1:], transient.u[1:])
     (message,) = [m for m in messages(transient, additive="none") if WORDS["gain"] in m]
-    promised = float(message.rpartition("falls to ")[2].rstrip("%)")) / 100
-    name = message.rpartition("mean width of ")[2].split()[0]
-    i = int(name.strip("x")) - 1
+    times = float(message.partition(" times that of")[0].rpartition(" ")[2])
     pure, better = fit(transient, additive="none"), fit(transient, additive="noise")
-    assert better.fit_summary["mean_width"][i] / pure.fit_summary["mean_width"][i] == pytest.approx(promised, abs=0.1)
+    assert times > 1.0 and (better.fit_summary["mean_width"] < pure.fit_summary["mean_width"]).all()
 
 
 def test_pure_intervals_that_do_well_are_left_alone():
@@ -282,7 +279,7 @@ def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
     assert "missing" not in neato | said(hunter)
     go2 = said(of(["go2/test_3.mcap"], "go2_joint.yaml"))
     assert "jitter" in go2  # 0.12 to 4.8 ms around 2 ms
-    assert not go2 & {"missing", "hidden", "code", "delay", "slow", "weak", "held", "quantised", "frozen", "one-sided"}
+    assert not go2 & {"missing", "code", "delay", "slow", "weak", "held", "quantised", "frozen", "one-sided"}
 
 
 def test_the_suggested_delay_narrows_the_neato(recordings, signals_folder):
@@ -523,29 +520,6 @@ def test_a_lagged_state_as_control_is_understood(recordings, signals_folder):
     assert better.fit_summary["mean_width"][0] < 0.6 * plain.fit_summary["mean_width"][0]
     found = better.fit_summary["messages"]
     assert not said(found) & {"collinear", "feedback", "slow", "no machine", "delay"} and "unstable" not in str(found)
-
-
-# --- a few transitions that hide an effect ---
-
-
-def test_a_dominating_transition_is_named_before_amplitudes():
-    u = steps(np.random.default_rng(4), 1501)
-    u[:, 1] *= 0.005
-    healthy = messages(run(u=u, noise=1e-3))
-    assert not {"weak", "hidden"} & said(healthy)
-
-    def bumped(x, u):
-        x = x.copy()
-        x[700] += 5.0
-        return x, u
-
-    found = messages(run(u=u, noise=1e-3, change=bumped))
-    (message,) = [m for m in found if "cannot be told" in m]
-    assert "1 transition (run at 34.95 s) holds most" in message and "'pump'" in message
-    assert "larger steps are not needed" in message and "weak" not in said(found)
-    weaker = messages(run(u=u * [1, 1e-3], noise=1e-3, change=bumped))
-    (message,) = [m for m in weaker if WORDS["weak"] in m]
-    assert message.index("look at what happened there first") < message.index("moves too little")
 
 
 # --- numbers that are no movement ---

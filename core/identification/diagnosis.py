@@ -35,16 +35,12 @@ FAST = 0.7
 """|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
 NEARLY = 0.5
 """Share of a mode's speed that must remain without measurement noise, or noise is what makes it fast."""
-TRIED = 4000
-"""Samples on which the gain of an additive term is tried."""
 WIDE = 0.5
 """Mean width, as a share of the state's own range, above which few faults can show."""
 SLOW, DISCARD = "sampling is slow", "--discard"
 """Words by which a message is known again."""
 AFTER_STEP = 5
 """Samples after a step of a control that still belong to it."""
-WORTH = 1.3
-"""Gain in mean width from which on the additive term is suggested."""
 
 
 def too_few(transitions: int, unknowns: int) -> str:
@@ -149,7 +145,7 @@ def describe(
     messages = [*broken, *messages]
     messages += [*([] if broken else _carried(few, discarded, problem, names, place)), *alike]
     known = predictability.prediction(part)
-    told, follow = _recordings(model, problem, part, sums, names, transients, place, bool(broken))
+    told, follow = _recordings(model, problem, part, sums, names, transients, bool(broken))
     messages += told
     messages += _noise_like(known, part, states, follow)
     past = bool(lagged)  # A alone is then not the dynamics
@@ -258,7 +254,6 @@ def _recordings(
     sums: Moments,
     names: Sequence[str],
     transients: Sequence[Transient],
-    place: Callable[[Sequence[int]], str],
     broken: bool,
 ) -> tuple[list[str], set[int]]:
     """Messages on the recordings (excitation, sensors, topics), and the states that lack another state.
@@ -281,7 +276,7 @@ def _recordings(
     if found:
         messages += predictability.missing(found, signals, follow)
     lost = {j: (i, certainty) for j, (i, certainty) in excitation.lost(problem, sums, known).items() if i not in follow}
-    messages += [] if broken else predictability.weak(problem, lost, names, place)
+    messages += [] if broken else predictability.weak(lost, names)
     messages += excitation.one_sided(part, names, known)
     messages += excitation.fed_back(part, names, past)
     messages += late
@@ -467,54 +462,23 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
 
 
 def _near_rest(problem: Problem, part: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:
-    """Widths that come from samples near rest, and what the additive term would gain; part: `_stretches`."""
+    """Widths that come from samples near rest; part: `_stretches`."""
     floor = 1e-9 * np.abs(part.z_columns[: part.n]).max(axis=1)  # below it both are rounding
     box = _least_squares_box(part, sums)
-    if part is not problem and (mean_width > 0.7 * box).any():  # the band of all samples is no narrower: a screen
-        box = _least_squares_box(problem, sums, enough=mean_width / 0.7)
-    suspect = [i for i in range(problem.n) if mean_width[i] > 0.7 * box[i] > floor[i]]
-    if not suspect:
+    if part is not problem and (mean_width > box).any():  # the band of all samples is no narrower: a screen
+        box = _least_squares_box(problem, sums, enough=mean_width)
+    blown = [i for i in range(problem.n) if mean_width[i] > box[i] > floor[i]]
+    if not blown:
         return []
     size = np.abs(part.z_columns).sum(axis=0)
     rest = float(np.mean(size <= 0.02 * np.quantile(size, 0.95)))
-    gain = _gain(part, size)
-    messages = []
-    blown = [i for i in suspect if mean_width[i] > box[i]]
-    if blown:
-        worst = max(blown, key=lambda i: float(mean_width[i] / box[i]))
-        messages.append(
-            f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of "
-            f"{states[worst]} is {mean_width[worst] / box[worst]:.3g} times that of a constant band around least "
-            f"squares, because noise near rest ({rest:.0%} of the samples) inflates the half-widths; use an "
-            f"additive term: --additive noise, or --additive disturbance (with noise, the mean width of "
-            f"{states[worst]} falls to {1 / gain[worst]:.0%})"
-        )
-    much = [i for i in suspect if i not in blown and gain[i] > WORTH]
-    if much:
-        best = max(much, key=lambda i: float(gain[i]))
-        messages.append(
-            f"samples near rest dominate the envelope of {_list([states[i] for i in much])}: with --additive noise "
-            f"the mean width of {states[best]} falls to {1 / gain[best]:.0%}"
-        )
-    return messages
-
-
-def _gain(problem: Problem, size: Array) -> Array:
-    """Mean width without over mean width with the noise term, (n,), by (10) on some samples; size (N,): |z|_1."""
-    from uncertain_lti.identification.fleet import Fleet
-    from uncertain_lti.identification.working_set import WorkingSet
-
-    index = np.arange(problem.N)
-    if problem.N > TRIED:  # those nearest rest, and an even share of the others
-        nearest = np.argpartition(size, TRIED // 4)[: TRIED // 4]
-        index = np.union1d(nearest, index[:: problem.N // TRIED])
-    part = replace(problem.subset(index), weights=np.ones(problem.n))
-    widths = []
-    for columns in (problem.columns, replace(problem.columns, names=frozenset({"v"}))):
-        some = replace(part, columns=columns)
-        solution = WorkingSet(Fleet([some])).quadratic()
-        widths.append((part.dt[:, None] * (some.psi() @ np.maximum(solution.d, 0.0))).mean(axis=0))
-    return np.asarray(widths[0] / np.maximum(widths[1], 1e-300))
+    worst = max(blown, key=lambda i: float(mean_width[i] / box[i]))
+    return [
+        f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of {states[worst]} is "
+        f"{mean_width[worst] / box[worst]:.3g} times that of a constant band around least squares, because noise near "
+        f"rest ({rest:.0%} of the samples) inflates the half-widths; use an additive term: --additive noise, or "
+        f"--additive disturbance"
+    ]
 
 
 def _least_squares_box(problem: Problem, sums: Moments, enough: Array | None = None) -> Array:

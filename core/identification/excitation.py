@@ -125,13 +125,6 @@ def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dic
     return found
 
 
-def certainty_of(problem: Problem, column: int, state: int) -> float:
-    """The effect of a column on a state, in standard errors of least squares."""
-    phi = np.column_stack([problem.z, np.ones(problem.N)])
-    rate = (problem.x_next[:, state] - problem.z[:, state]) / problem.dt
-    return float(_certainty(phi.T @ phi, (phi.T @ rate)[:, None], np.array([rate @ rate]), problem.N)[column, 0])
-
-
 def _certainty(gram: Array, cross: Array, total: Array, count: int) -> Array:
     """|Element| over its standard error, (b, t): gram (b, b), cross (b, t), sums of squares of the targets (t,)."""
     inverse = np.linalg.pinv(gram, hermitian=True)

@@ -11,22 +11,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
-from uncertain_lti.identification.excitation import (
-    DETERMINED,
-    certainty_of,
-    least_squares,
-    successive,
-    triangle,
-    unexplained,
-)
+from uncertain_lti.identification.excitation import DETERMINED, least_squares, successive, triangle, unexplained
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal_map import Signal
@@ -47,10 +39,6 @@ _CLIP = 5.0
 """Standard deviations at which a residual is cut before it is correlated: one event is no rule."""
 _MOST_PRODUCTS = 12
 """Signals up to which all products of two are tried as curves; beyond, squares and magnitudes alone."""
-FEW, MOST = 12, 0.5
-"""Up to this many transitions that hold more than this share of the squared residual dominate it."""
-OUTLYING = 10.0
-"""Each of them is this many times as large as the others' root mean square."""
 
 
 @dataclass(frozen=True)
@@ -185,17 +173,12 @@ def _curves(z: Array) -> Array:
     return np.hstack([z[:, i] * z[:, j], np.abs(z)])
 
 
-def _least_squares(problem: Problem) -> Array:
-    """Residual of each step, (N, n)."""
+def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
+    """Autocorrelation at one and two samples, (n, 2); `now`: transitions that continue the one before."""
     basis = np.column_stack([problem.z, np.ones(problem.N)]) * problem.dt[:, None]
     basis = basis / np.maximum(np.abs(basis).max(axis=0), 1e-300)
     step = problem.x_next - problem.z[:, : problem.n]
-    return np.asarray(step - basis @ np.linalg.lstsq(basis, step, rcond=None)[0])
-
-
-def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
-    """Autocorrelation at one and two samples, (n, 2); `now`: transitions that continue the one before."""
-    residual = _least_squares(problem)
+    residual = step - basis @ np.linalg.lstsq(basis, step, rcond=None)[0]
     spread = np.median(np.abs(residual), axis=0) / 0.6745
     limit = np.where(spread > 0, _CLIP * spread, np.inf)
     residual = np.clip(residual, -limit, limit)
@@ -236,47 +219,11 @@ def missing(known: Autocorrelation, signals: Sequence[Signal], states: Collectio
     return messages
 
 
-def dominating(problem: Problem, state: int) -> NDArray[np.intp]:
-    """The few transitions that hold most of what one step leaves unexplained of a state."""
-    square = _least_squares(problem)[:, state] ** 2
-    most = min(FEW, problem.N // 200)
-    largest = np.argsort(square)[::-1][:most]
-    total = float(square.sum())
-    rest = (total - float(square[largest].sum())) / max(problem.N - most, 1)
-    apart = largest[square[largest] > OUTLYING**2 * rest]
-    dominate = float(square[apart].sum()) > MOST * total
-    return np.asarray(apart if dominate else apart[:0])
-
-
-def weak(
-    problem: Problem,
-    lost: Mapping[int, tuple[int, float]],
-    names: Sequence[str],
-    place: Callable[[Sequence[int]], str],
-) -> list[str]:
-    """The sentence for each control whose effect is lost: the few transitions that hide it, or its small amplitude."""
-    messages = []
-    hiding = {state: dominating(problem, state) for state in {state for state, _ in lost.values()}}
-    for j, (state, certainty) in lost.items():
-        cure, few = "", hiding[state]
-        if len(few):
-            without = certainty_of(problem.without(few), j, state)
-            one = len(few) == 1
-            hidden = (
-                f"{plural(len(few), 'transition')} ({place(few.tolist())}) {'holds' if one else 'hold'} most of what "
-                f"one step leaves unexplained of '{names[state]}'"
-            )
-            look = "look at what happened there first"
-            if without >= DETERMINED:
-                messages.append(
-                    f"{hidden}, so the effect of control '{names[j]}' cannot be told ({certainty:.2g} standard errors, "
-                    f"{without:.2g} without {'it' if one else 'them'}): {look}; larger steps are not needed"
-                )
-                continue
-            certainty, cure = without, f"{hidden}: {look}; without {'it' if one else 'them'} "
-        messages.append(
-            f"{cure}control '{names[j]}' moves too little to be distinguished from the noise: its strongest effect, on "
-            f"'{names[state]}', is {certainty:.2g} standard errors; record it with larger or more steps "
-            f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
-        )
-    return messages
+def weak(lost: Mapping[int, tuple[int, float]], names: Sequence[str]) -> list[str]:
+    """The sentence for each control whose effect is lost."""
+    return [
+        f"control '{names[j]}' moves too little to be distinguished from the noise: its strongest effect, on "
+        f"'{names[state]}', is {certainty:.2g} standard errors; record it with larger or more steps "
+        f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
+        for j, (state, certainty) in lost.items()
+    ]
