@@ -37,7 +37,7 @@ from measure import best, peak_memory, table
 
 from uncertain_lti import EnvelopeMonitor
 from uncertain_lti.identification import fit, formulation
-from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.archive import CacheWriter
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
@@ -369,7 +369,7 @@ def disk_write(folder, N, parts):
 
 def disk_fit(folder, N, parts):
     """Fit from the cache, then with all of it in memory: the same optimum."""
-    from uncertain_lti.identification.cache import DiskPartition
+    from uncertain_lti.identification.archive import DiskPartition
 
     partition = DiskPartition(Path(folder) / "cache", N // parts * parts, 5, 9, np.ones(5), Columns.of("none", True))
     N = partition.N

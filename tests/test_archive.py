@@ -25,9 +25,8 @@ from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.archive import fit_archive
+from uncertain_lti.identification.archive import CacheWriter, fit_archive
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.cache import CacheWriter
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet

@@ -17,9 +17,9 @@ import pytest
 from test_several_steps import A, B, assembled, recordings, started
 
 from uncertain_lti.identification import several_steps
+from uncertain_lti.identification.fleet import likelier_alone
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.several_steps import Elements, nearest_to_all, runs_over_steps, segments
-from uncertain_lti.identification.spread import likelier_alone
 from uncertain_lti.identification.structure import Structure
 
 

@@ -25,7 +25,7 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep, Progress
 from uncertain_lti.cli.main import main
-from uncertain_lti.identification.cache import CacheWriter
+from uncertain_lti.identification.archive import CacheWriter
 
 CLI = [sys.executable, "-m", "uncertain_lti.cli.main"]
 

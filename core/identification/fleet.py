@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Fleet: the partitions of the data, and how a pass visits them all."""
+"""Fleet: the partitions of the data, in this process or on Dask, and how a pass visits them all."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import core_count
+from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Partition, Problem
-from uncertain_lti.identification.spread import likelier_alone
 from uncertain_lti.model.domain import Occupancy, cells_for
 from uncertain_lti.model.residuals import Residuals
 
@@ -139,3 +139,108 @@ class Fleet:
     def median_dt(self) -> float:
         """Median step."""
         return float(np.median(np.concatenate(self.map(passes.steps, self._same()))))
+
+
+class DaskFleet(Fleet):
+    """Partitions that workers make and keep; a pass sends the candidate and brings back the few samples that matter.
+
+    A partition is the result of a pure task, so a worker that is lost costs the time to make its partitions again.
+
+    `client`: the cluster; `tasks`: function and arguments; each makes one `Problem`; `done`: called with the number of
+    those made so far.
+    """
+
+    def __init__(
+        self,
+        client: Any,
+        tasks: Sequence[tuple[Callable[..., Problem], tuple[Any, ...]]],
+        done: Callable[[int], None] | None = None,
+    ) -> None:
+        self._client = client
+        made = [client.submit(function, *arguments, pure=False, retries=3) for function, arguments in tasks]
+        facts = _gather(client, [client.submit(_facts, part, pure=False, retries=3) for part in made], done)
+        kept = [(part, fact[0]) for part, fact in zip(made, facts, strict=True) if fact[0][0]]
+        if not kept:
+            raise FitError("no usable transition in any recording; check the signals file")
+        self._parts = [part for part, _ in kept]
+        self._constant_weights = next(fact[1] for fact in facts if fact[0][0])
+        self._describe([fact for _, fact in kept])
+
+    @property
+    def weights(self) -> Array | None:
+        """Weights (n,) that are constant in time; None where they are not."""
+        return self._constant_weights  # type: ignore[no-any-return]
+
+    @staticmethod
+    def run(
+        client: Any,
+        tasks: Sequence[tuple[Callable[..., T], tuple[Any, ...]]],
+        done: Callable[[int], None] | None = None,
+    ) -> list[T]:
+        """Run tasks on the workers."""
+        return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks], done)
+
+    def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
+        """function(partition, *arguments) on the workers."""
+        futures = [
+            self._client.submit(function, part, *args, pure=False, retries=3)
+            for part, args in zip(self._parts, arguments, strict=True)
+        ]
+        return _gather(self._client, futures)
+
+
+def _gather(client: Any, futures: list[Any], done: Callable[[int], None] | None = None) -> list[Any]:
+    from distributed import as_completed
+    from distributed.client import FutureCancelledError
+    from distributed.comm.core import CommClosedError
+    from distributed.scheduler import KilledWorker
+
+    try:
+        if done is not None:
+            for number, _ in enumerate(as_completed(futures), start=1):  # type: ignore[no-untyped-call]
+                done(number)
+        results: list[Any] = client.gather(futures)
+    except UncertainLTIError:
+        raise
+    except (KilledWorker, CommClosedError, FutureCancelledError, TimeoutError, OSError) as error:
+        raise FitError(f"the Dask cluster gave up ({type(error).__name__}); look at its workers' logs") from None
+    return results
+
+
+def _facts(part: Problem) -> tuple[tuple[Any, ...], Array | None]:
+    return (part.N, part.n, part.p, part.columns), part.weights if part.weights.ndim == 1 else None
+
+
+_FREEDOM = 3.0
+_ROUNDS = 15
+_LIKELIER = 0.01
+"""By so much the log-likelihood of a transition must be larger for the residual in place of the utilisation."""
+
+
+def likelier_alone(residual: Array, half: Array) -> bool:
+    """Whether one covariance of the residual describes it better, as of noise of readings, than one of the utilisation.
+
+    Compared is the likelihood of a distribution of Student's with few degrees of freedom: recordings far from the
+    usual, such as pulses, leave residuals many times as large, and by a normal distribution those few would decide.
+
+    `residual` (K, n): of some transitions; `half` (K, n): their half-widths.
+    """
+    if not (half > 0.0).all() or len(residual) <= 2 * residual.shape[1]:
+        return False
+    alone, relative = _log_likelihood(residual), _log_likelihood(residual / half)
+    return bool(alone > relative - np.log(half).sum(axis=1).mean() + _LIKELIER)
+
+
+def _log_likelihood(values: Array) -> float:
+    """Of a row, with the likeliest mean and scatter, but for a constant; -inf if the scatter is singular."""
+    n = values.shape[1]
+    weights = np.ones(len(values))
+    for _ in range(_ROUNDS):
+        centred = values - weights @ values / weights.sum()
+        scatter = (centred * weights[:, None]).T @ centred / len(values)
+        sign, logarithm = np.linalg.slogdet(scatter)
+        if sign <= 0.0 or not np.isfinite(logarithm):
+            return -np.inf
+        distance = ((centred @ np.linalg.inv(scatter)) * centred).sum(axis=1)
+        weights = (_FREEDOM + n) / (_FREEDOM + distance)
+    return float(-0.5 * logarithm - 0.5 * (_FREEDOM + n) * np.log1p(distance / _FREEDOM).mean())

@@ -7,23 +7,103 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""The optimum of a criterion over all transitions, with the half-widths that the verdict's own arithmetic needs."""
+"""The optimum of a criterion over all transitions, lifted until the verdict's own arithmetic finds none outside."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import one_thread_each
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import formulation
-from uncertain_lti.identification.passes import Judged, Moments
+from uncertain_lti.identification.passes import Envelope, Judged, Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.programmes import GOOD
-from uncertain_lti.identification.repair import E, repair
 from uncertain_lti.identification.row import LEAST
 from uncertain_lti.identification.working_set import Solution, WorkingSet
+
+E = TypeVar("E", bound=Envelope)
+
+_EPS = float(np.finfo(np.float64).eps)
+_ROUNDS = 40
+
+
+def repair(
+    build: Callable[[Array, Array], E],
+    engine: WorkingSet,
+    solution: Solution,
+    names: Sequence[str],
+    sizes: Array | None,
+    gentle: bool,
+) -> tuple[E, Array, Judged]:
+    """Lift the half-widths of a solution until `Fleet.judge` finds nothing outside in any row.
+
+    A solver leaves a violation of at most `violation` x (scaled size of the sample), and the size is linear in |z|,
+    so lifting each element by violation x its unit covers it in every sample. What is left is rounding: a few ulps
+    of |θ| + d for the products and sums and, for the state's own element, of 1 / Δt for the addition of x. What the
+    structure fixes stays, to the bit; the other elements of the row cover its rounding.
+
+    `sizes` (n,): largest |x| that the rates are added to; default that of the states. What the step does not multiply
+    covers it; `gentle`: begin with less than an ulp; Returns (q, n): lifted.
+    """
+    fleet, sums, theta, d = engine.fleet, engine.sums, solution.theta, solution.d
+    shared = None if engine.shared is None else engine.shared[1]
+    units = np.column_stack([row.size_unit for row in engine.rows])
+    n, p, columns = fleet.n, fleet.p, fleet.columns
+    free = units > 0
+    low, high = engine.half_limits
+    fixed = low == high
+    movable = free & ~fixed
+    lifted = np.where(fixed, d, d + units * np.maximum(solution.violation, 0.0))
+    blocks = (columns.count, -1, n)
+    nominal, own = np.zeros(d.shape).reshape(blocks), np.zeros(d.shape).reshape(blocks)
+    elements = np.abs(theta).reshape(blocks)
+    nominal[:, :p] = elements[:, :p]
+    for k, term in enumerate(columns.half, start=p):
+        if term in columns.nominal:
+            nominal[:, k] = elements[:, p + columns.nominal.index(term)]
+    own[:, np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
+    if sizes is not None:
+        for k, term in enumerate(columns.half, start=p):
+            if not term.times_dt:
+                own[:, k] = sizes
+    base = np.clip(lifted, low, high)
+    rounding = nominal.reshape(d.shape) + base + own.reshape(d.shape)
+    for i in np.flatnonzero((fixed & (rounding > 0)).any(axis=0)):  # the others carry what these cannot
+        share = float(sums.psi_scale @ (rounding[:, i] * fixed[:, i]))
+        rounding[:, i] += units[:, i] * share
+    if shared is not None:  # they stay equal to the bit
+        most = np.zeros(d.shape)
+        np.maximum.at(most, (shared, np.arange(n)), rounding)
+        rounding = most[shared, np.arange(n)]
+    todo = np.ones(n, dtype=bool)
+    lifted = base
+    for attempt in range(-6 if gentle else 0, _ROUNDS):
+        ulps = 2.0 ** (attempt + 2) * _EPS * rounding * movable
+        lifted = np.where(todo, np.minimum(base + ulps, high), lifted)
+        model = build(theta, lifted)
+        judged = fleet.judge(model)
+        todo = judged.outside > 0
+        if not todo.any():
+            return model, lifted, judged
+        if not movable[:, todo].any(axis=0).all():
+            break
+    row = int(np.argmax(todo))
+    if fixed[free[:, row], row].any():
+        raise FitError(
+            f"structure: with half-widths that are fixed, '{names[row]}' leaves "
+            f"{plural(int(judged.outside[row]), 'transition')} outside, by rounding at least; let a half-width of "
+            f"this row be free, or use an additive term"
+        )
+    raise FitError(
+        f"containment could not be repaired in row {int(np.argmax(todo))}: the signals differ too much in scale; "
+        f"give steady and scale that bring them to order one"
+    )
 
 
 def optimum(
@@ -38,34 +118,16 @@ def optimum(
 
     `sizes` (n,): as in `repair`; Returns (q, n): its half-widths; Returns (1,): of (10), or δ of each row of (11).
     """
-    fleet, sums = engine.fleet, engine.sums
+    sums = engine.sums
     if method == "working-set":
         with one_thread_each():
             solution = engine.quadratic() if criterion == "qp" else engine.linear()
     else:
         solution = _as_written(engine, criterion)
-    limits = engine.half_limits
-
-    def repaired(gentle: bool) -> tuple[E, Array, Judged]:
-        return repair(
-            build,
-            fleet,
-            sums,
-            solution.theta,
-            solution.d,
-            solution.violation,
-            limits,
-            np.column_stack([row.size_unit for row in engine.rows]),
-            None if engine.shared is None else engine.shared[1],
-            gentle,
-            names,
-            sizes,
-        )
-
-    envelope, d, judged = repaired(False)
+    envelope, d, judged = repair(build, engine, solution, names, sizes, False)
     reference = _criterion(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
     if not _relative(_criterion(engine, criterion, d, judged), reference, criterion, sums, judged) <= GOOD:
-        gentler = repaired(True)
+        gentler = repair(build, engine, solution, names, sizes, True)
         if (_criterion(engine, criterion, *gentler[1:]) < _criterion(engine, criterion, d, judged)).any():
             envelope, d, judged = gentler
     objective = _criterion(engine, criterion, d, judged)
