@@ -135,6 +135,14 @@ def test_a_huge_value_leaves_nothing_behind(kind: str) -> None:
     assert values[150:] == pytest.approx(np.broadcast_to(values[99], (250, values.shape[1])), rel=1e-12)
 
 
+def test_lists_and_other_layouts_are_the_same_numbers() -> None:
+    rows = np.random.default_rng(4).normal(size=(50, 3))
+    _, plain = statistic("energy", 0.2).push_all(np.full(50, 0.01), rows)
+    for given in (rows.tolist(), np.asfortranarray(rows), np.stack([rows, rows], axis=1)[:, 0]):
+        _, values = statistic("energy", 0.2).push_all([0.01] * 50, given)
+        assert values.tobytes() == plain.tobytes()
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_is_missing_changes_nothing(kind: str) -> None:
     rng = np.random.default_rng(3)

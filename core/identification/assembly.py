@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -19,19 +18,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.kernel.arithmetic import normalised_columns
-from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.signals.choices import Additive
-
-_PIECE = 100_000
-"""Samples, about, that a thread normalises at a time."""
 
 
 def is_constant(dt: Array) -> bool:
@@ -90,11 +84,11 @@ def assemble(
         stop = start + len(s.dt)
         part = slice(start, stop)
         start = stop
-        square += _normalise(s, s.transient.x, point.x_s, point.X, z[:n, part])
-        square += _normalise(s, s.transient.u, point.u_s, point.U, z[n:, part])
+        square += normalise_columns(s.transient.x[:-1], s.k, point.x_s, point.X, z[:n, part])
+        square += normalise_columns(s.transient.u[:-1], s.k, point.u_s, point.U, z[n:, part])
         if shared:
             s = s.take(slice(-1, None))
-        square += _normalise(s, s.transient.x, point.x_s, point.X, x_next[:, stop - len(s.k) : stop], 1)
+        square += normalise_columns(s.transient.x[1:], s.k, point.x_s, point.X, x_next[:, stop - len(s.k) : stop])
     further, more = _scheduling(steps, point)
     if not square + more <= LARGEST**2:
         raise _too_large(transients)
@@ -132,7 +126,8 @@ def _scheduling(steps: Sequence[Transitions], point: OperatingPoint) -> tuple[Ar
     s = np.empty((len(point.s_s), sum(len(step.dt) for step in steps)))
     start, square = 0, 0.0
     for step in steps:
-        square += _normalise(step, step.transient.s, point.s_s, point.S, s[:, start : start + len(step.k)])
+        part = s[:, start : start + len(step.k)]
+        square += normalise_columns(step.transient.s[:-1], step.k, point.s_s, point.S, part)
         start += len(step.dt)
     return s, square
 
@@ -194,17 +189,6 @@ def _factors(
         lengths = np.bincount(source, minlength=transients)
         factors = factors * len(source) / (np.maximum(lengths, 1) * np.count_nonzero(lengths))
     return None if (factors == 1.0).all() else factors
-
-
-def _normalise(steps: Transitions, values: Array, steady: Array, scale: Array, out: Array, after: int = 0) -> float:
-    """(values - steady) / scale of an array of a transient, as `OperatingPoint` does it, into columns (n, K).
-
-    Returns the sum of squares.
-    """
-    values = values[after : after + len(values) - 1]
-    edges = np.linspace(0, len(steps.k), max(len(steps.k) // _PIECE, 1) + 1).astype(int).tolist()
-    pieces = [slice(a, b) for a, b in itertools.pairwise(edges)]
-    return sum(on_cores(normalised_columns, [(values, steps.k[p], steady, scale, out[:, p]) for p in pieces]))
 
 
 def scaled_eigenvalues(weights: Array) -> Array:

@@ -134,27 +134,28 @@ cdef inline bint pairs_visited(
 
 
 def outside_domain(z, least, greatest, occupied=None):
-    """Whether z (K, n + m) leaves the box in some element, or is a combination that was not fitted."""
-    cdef const double[:, ::1] rows = np.ascontiguousarray(z)
-    cdef arrays.array low = doubles(least), high = doubles(greatest)
-    cdef Py_ssize_t i, k, size = rows.shape[1], cells = 0 if occupied is None else occupied.shape[1]
+    """Whether each of z (n + m, K) leaves the box in some element, or is a combination that was not fitted."""
+    cdef const double[:, :] columns = z
+    cdef arrays.array low = doubles(least), high = doubles(greatest), sample = doubles(least)
+    cdef Py_ssize_t i, k, size = columns.shape[0], cells = 0 if occupied is None else occupied.shape[1]
     cdef arrays.array per_unit = doubles(cells_per_unit(np.asarray(least), np.asarray(greatest), cells))
     cdef const unsigned char[::1] flags = np.ascontiguousarray(
         np.zeros(1, np.uint8) if occupied is None else occupied
     ).view(np.uint8).reshape(-1)
     cdef arrays.array place = array("i", bytes(4 * (size or 1)))
-    found = np.zeros(len(rows), dtype=bool)
+    cdef double* here = sample.data.as_doubles
+    found = np.zeros(columns.shape[1], dtype=bool)
     cdef unsigned char[::1] left = found.view(np.uint8)
     if len(least) != size or len(greatest) != size:
         raise ValueError("the domain does not fit the samples")
     with nogil:
-        for k in range(rows.shape[0]):
+        for k in range(columns.shape[1]):
             for i in range(size):
-                left[k] |= is_outside(rows[k, i], low.data.as_doubles[i], high.data.as_doubles[i])
+                here[i] = columns[i, k]
+                left[k] |= is_outside(here[i], low.data.as_doubles[i], high.data.as_doubles[i])
             if cells and size and not left[k]:
                 left[k] = not pairs_visited(
-                    &rows[k, 0], low.data.as_doubles, per_unit.data.as_doubles, &flags[0], size, cells,
-                    place.data.as_ints,
+                    here, low.data.as_doubles, per_unit.data.as_doubles, &flags[0], size, cells, place.data.as_ints
                 )
     return found
 

@@ -114,23 +114,27 @@ cdef class Statistic:
             found.data.as_doubles[i] = self.now[i]
         return found
 
-    def push_all(self, dt, rows):
+    def push_all(self, dt, rows, raised=None, found=None):
         """Take many verdicts.
 
         `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. NaN
         is no verdict on that state, and changes nothing of it, nor of any state if all are seen together; Returns (K,):
-        the alarm after each; Returns (K, n): `values` after each.
+        the alarm after each; Returns (K, n): `values` after each; both in `raised` and `found` where these are given.
         """
         cdef Py_ssize_t i, k, count = len(dt)
-        if np.shape(rows) != (count, self.n):
+        rows = np.asarray(rows, dtype=np.float64)
+        if rows.shape != (count, self.n):
             raise ValueError("the numbers of the verdicts do not fit the states")
-        if rows.dtype != np.float64 or rows.strides[1] != 8:
-            rows = np.ascontiguousarray(rows, dtype=np.float64)
+        if rows.strides[1] != 8:
+            rows = np.ascontiguousarray(rows)
         cdef const double[:, :] table = rows  # a row of numbers, however far from the next
         cdef const double[::1] times = np.ascontiguousarray(dt, dtype=np.float64)
-        found, raised = np.empty((count, self.size)), np.empty(count, dtype=bool)
-        cdef double[:, ::1] values = found
-        cdef unsigned char[::1] alarm = raised.view(np.uint8)
+        raised = np.empty(count, dtype=bool) if raised is None else raised
+        found = np.empty((count, self.size)) if found is None else found
+        cdef double[:, :] values = found
+        cdef unsigned char[:] alarm = raised.view(np.uint8)
+        if not (alarm.shape[0] == values.shape[0] == times.shape[0] == count and values.shape[1] == self.size):
+            raise ValueError("the numbers of the verdicts do not fit the states")
         with nogil:
             for k in range(count):
                 self.push(times[k], &table[k, 0])

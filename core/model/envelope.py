@@ -22,7 +22,7 @@ from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended, cent
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon, Run, Windows, unbroken_over, windows_of
-from uncertain_lti.model.operating_point import OperatingPoint, normalised
+from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns, normalised
 from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, Elements, Term
@@ -89,9 +89,13 @@ class Envelope(Elements):
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """Normalised [x; u; s] (n + m + q, K) of K transitions in recorded units."""
-        point = self.operating_point
-        parts = point.normalise_x(steps.x), point.normalise_u(steps.u), point.normalise_s(steps.s)
-        return np.vstack([part.T for part in parts])
+        run, point = steps.transient, self.operating_point
+        z = np.empty((self.n + self.m + self.q, len(steps.k)))
+        of_x, of_u, of_s = np.split(z, (self.n, self.n + self.m))
+        normalise_columns(run.x[:-1], steps.k, point.x_s, point.X, of_x)
+        normalise_columns(run.u[:-1], steps.k, point.u_s, point.U, of_u)
+        normalise_columns(run.s[:-1], steps.k, point.s_s, point.S, of_s)
+        return z
 
     def regime(self, z: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Of samples z (n + m + q, K) whether every mode is listed, and whether the regime is unknown.
@@ -209,7 +213,8 @@ class Envelope(Elements):
         """
         found = np.full((2, len(dt), len(self.horizons), self.n), np.nan)
         utilisation, residual = found
-        for j, (windows, centre, half) in enumerate(self.envelopes(k, z, dt)):
+        envelopes = self.envelopes(k, z, dt) if self.horizons else ()
+        for j, (windows, centre, half) in enumerate(envelopes):
             left, there = arrivals(x_next[windows.last].T, centre, half)
             residual[windows.last, j], utilisation[windows.last, j] = left.T, there.T
         return utilisation, residual

@@ -11,16 +11,21 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, real
+from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.errors import TransientError
+from uncertain_lti.kernel.arithmetic import normalised_columns
 from uncertain_lti.signals.signal_map import Signal
+
+_PIECE = 100_000  # rows that one thread takes at a time
 
 
 def normalised(value: Any, steady: Any, scale: Any) -> Any:
@@ -31,6 +36,13 @@ def normalised(value: Any, steady: Any, scale: Any) -> Any:
 def recorded(value: Any, steady: Any, scale: Any) -> Any:
     """Deviation in recorded units: the inverse of `normalised`."""
     return steady + scale * value
+
+
+def normalise_columns(values: Array, k: NDArray[np.intp], steady: Array, scale: Array, out: Array) -> float:
+    """Rows k (K,) of values (N, n), `normalised`, into columns (n, K), on all cores; the sum of their squares."""
+    edges = np.linspace(0, len(k), max(len(k) // _PIECE, 1) + 1).astype(int).tolist()
+    pieces = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    return sum(on_cores(normalised_columns, [(values, k[p], steady, scale, out[:, p]) for p in pieces]))
 
 
 @dataclass(frozen=True)

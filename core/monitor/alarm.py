@@ -116,11 +116,13 @@ class AlarmWindow:
         self.alarm = self._violations >= self._needed
         return self.alarm
 
-    def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
+    def push_all(
+        self, dt: Array, violated: NDArray[np.bool_], table: Array, after: NDArray[np.bool_], values: Array
+    ) -> None:
         """After each of many verdicts what `Alarm.push` gives, from a cleared alarm.
 
-        `dt` (K,): steps, s; `violated` (K,): as for `push`; `table` (K, rows, n): as of `Alarm.push`; Returns (K,): the
-        alarm after each; Returns (K, 0): nothing.
+        `dt` (K,): steps, s; `violated` (K,): as for `push`; `table` (K, rows, n): as of `Alarm.push`; `after`
+        (K,): takes the alarm after each; `values` (K, 0): takes nothing.
         """
         assert isinstance(self.rule, AlarmRule)
         given: NDArray[np.bool_] = np.ones(len(violated), dtype=bool)
@@ -128,8 +130,7 @@ class AlarmWindow:
             sizes = np.abs(table.reshape(len(table), table.shape[1] * table.shape[2])[:, self._places])
             given = np.asarray(~np.isnan(sizes).all(axis=1))
             violated = np.asarray((sizes > self._margin).any(axis=1))
-        after = np.concatenate([[False], raised(violated[given], self.rule)])
-        return after[np.cumsum(given)], np.zeros((len(violated), 0))
+        after[:] = np.concatenate([[False], raised(violated[given], self.rule)])[np.cumsum(given)]
 
     def values(self) -> Any:
         """None: it has no statistic."""
@@ -168,14 +169,15 @@ class AlarmOverThreshold:
         """Forget every verdict and the alarm."""
         self.statistic.reset()
 
-    def push_all(self, dt: Array, violated: NDArray[np.bool_], table: Array) -> tuple[NDArray[np.bool_], Array]:
+    def push_all(
+        self, dt: Array, violated: NDArray[np.bool_], table: Array, after: NDArray[np.bool_], values: Array
+    ) -> None:
         """After each of many verdicts what `Alarm.push` gives.
 
-        `dt` (K,): steps, s; `violated` (K,): not looked at; `table` (K, rows, n): as of `Alarm.push`; Returns (K,): the
-        alarm after each; Returns (K, n): `values` after each.
+        `dt` (K,): steps, s; `violated` (K,): not looked at; `table` (K, rows, n): as of `Alarm.push`; `after`
+        (K,): takes the alarm after each; `values` (K, n): takes `values` after each.
         """
-        after, values = self.statistic.push_all(dt, table[:, self._row])
-        return after, values
+        self.statistic.push_all(dt, table[:, self._row], after, values)
 
     def values(self) -> Any:
         """The statistic over its threshold.
@@ -300,10 +302,11 @@ class Alarm:
         alarm after each; Returns (K, rules): which rules raise it; Returns (K, statistics): `values` after each.
         """
         self.reset()
-        found = on_cores(lambda part: part.push_all(dt, violated, table), [(part,) for part in self.parts])
+        each, values = np.empty((len(dt), len(self.parts)), dtype=bool), np.empty((len(dt), len(self.names)))
+        parts = zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True)
+        on_cores(lambda part, after, own: part.push_all(dt, violated, table, after, own), list(parts))
         self.reset()
-        each = np.stack([after for after, _ in found], axis=1)
-        return np.asarray(each.any(axis=1)), each, np.concatenate([values for _, values in found], axis=1)
+        return np.asarray(np.logical_or.reduce(list(each.T))), each, values
 
 
 def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:

@@ -26,7 +26,7 @@ from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, judged
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
-from uncertain_lti.model.operating_point import normalised
+from uncertain_lti.model.operating_point import normalise_columns, normalised
 from uncertain_lti.model.repeats import walk
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, residual_row, steps_back
@@ -424,16 +424,15 @@ class EnvelopeMonitor:
         if not fitted.all():
             unfitted_step[steps.k[~fitted] + 1] = True
             steps = steps.take(fitted)
-        sizes = [np.abs(values).max(axis=1, initial=0.0) for values in (steps.x, steps.u, steps.s)]
-        carried = np.asarray(np.max(sizes, axis=0) <= LARGEST)
-        if not carried.all():
-            steps = steps.take(carried)
-        with np.errstate(over="ignore", invalid="ignore"):  # a value far beyond its bounds is beyond all numbers
-            z, x_next = model.normalised_columns(steps), point.normalise_x(steps.x_next)
+        given = steps.x, steps.u, steps.s
+        if any(max(values.max(initial=0.0), -values.min(initial=0.0)) > LARGEST for values in given):
+            steps = steps.take(np.max([np.abs(values).max(axis=1, initial=0.0) for values in given], axis=0) <= LARGEST)
+        z, x_next = model.normalised_columns(steps), np.empty((n, len(steps.k)))
+        normalise_columns(transient.x[1:], steps.k, point.x_s, point.X, x_next)
         listed, unknown = model.regime(z)
         if not listed.all():
             unlisted_mode[steps.k[~listed] + 1] = True
-            steps, unknown, z, x_next = steps.take(listed), unknown[listed], z[:, listed], x_next[listed]
+            steps, unknown, z, x_next = steps.take(listed), unknown[listed], z[:, listed], x_next[:, listed]
         arrival = steps.k + 1
         flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
         upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
@@ -450,17 +449,17 @@ class EnvelopeMonitor:
                 numbers[withheld | without[:, None]] = np.nan
             residual[withheld[arrival]] = np.nan
             kept = ~without[arrival]
-            steps, arrival, z, x_next = steps.take(kept), arrival[kept], z[:, kept], x_next[kept]
+            steps, arrival, z, x_next = steps.take(kept), arrival[kept], z[:, kept], x_next[:, kept]
             residual, unknown = residual[kept], unknown[kept]
             whole = ~withheld[arrival].any(axis=1)  # the run of a horizon needs every state
         at = arrival[whole]
         longer[at], longer_residual[at] = model.over_horizons(
-            steps.k[whole], z[:, whole], steps.dt[whole], x_next[whole]
+            steps.k[whole], z[:, whole], steps.dt[whole], x_next[:, whole].T
         )
         judged[arrival] = True
         unknown_regime = np.zeros(count, dtype=bool)
         unknown_regime[arrival] = unknown
-        outside[arrival] = unknown | model.domain.outside(z[:n].T, z[n : n + model.m].T)
+        outside[arrival] = unknown | model.domain.outside_columns(z[: n + model.m])
         violated = ((flags == 1.0) & self._counted).any(axis=1)
         alarms = Alarm(self.alarms.rules, model, self._counted)
         statistics = np.full((count, len(alarms.names)), np.nan)
@@ -509,8 +508,8 @@ class EnvelopeMonitor:
         return frozen, withheld, repeating, why
 
     def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (K, n)."""
+        """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (n, K)."""
         columns = np.empty((self.model.n, len(dt))), np.empty((self.model.n, len(dt)))
         self.model.columns_centre_and_half(z, dt, *columns)
-        lower, upper, residual, flags, utilisation = judged(x_next.T, *columns, self.rule.margin).transpose(0, 2, 1)
+        lower, upper, residual, flags, utilisation = judged(x_next, *columns, self.rule.margin).transpose(0, 2, 1)
         return flags, lower, upper, utilisation, residual

@@ -55,11 +55,11 @@ def rate_interval(
 
 def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, float]:
     """Exact binomial (Clopper-Pearson) interval for the share of whole transients."""
-    from scipy.stats import beta
+    from scipy.special import betainccinv, betaincinv  # scipy.stats takes a second to import
 
     tail = (1.0 - confidence) / 2.0
-    lower = float(beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
-    upper = float(beta.isf(tail, hits + 1, trials - hits)) if hits < trials else 1.0
+    lower = float(betaincinv(hits, trials - hits + 1, tail)) if hits else 0.0
+    upper = float(betainccinv(hits + 1, trials - hits, tail)) if hits < trials else 1.0
     return lower, upper
 
 
@@ -74,8 +74,7 @@ def quantile_share_interval(
 
     `units` (N,): cluster of each case; `hits` (N,): whether it has the property.
     """
-    from scipy.special import ndtr, stdtrit
-    from scipy.stats import beta
+    from scipy.special import betainccinv, betaincinv, ndtr, stdtrit
 
     unit, hit = np.asarray(units), np.asarray(hits, dtype=np.float64)
     total, found = len(hit), float(hit.mean()) if len(hit) else math.nan
@@ -89,8 +88,8 @@ def quantile_share_interval(
     worth = total / effect
     tail = float(ndtr(stdtrit(G - 1, (1.0 - confidence) / 2.0)))
     yes, no = middle * worth, (1.0 - middle) * worth
-    low = float(beta.ppf(tail, yes, no + 1.0)) if yes > 0 else 0.0
-    high = float(beta.isf(tail, yes + 1.0, no)) if no > 0 else 1.0
+    low = float(betaincinv(yes, no + 1.0, tail)) if yes > 0 else 0.0
+    high = float(betainccinv(yes + 1.0, no, tail)) if no > 0 else 1.0
     return found, (low, high)
 
 
