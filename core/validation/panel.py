@@ -134,22 +134,19 @@ def rules_for(model: UncertainLTI, steps: int, dt: float) -> list[StatisticRule]
     return found
 
 
-def sizes_of(rules: Sequence[Rule], part: Part) -> list[Array]:
+def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     """Size of each rule over its threshold, (K, n) or (K, 1), on one part by the alarm's own arithmetic."""
     model = part.judged_by
     assert model is not None
-    counted, table = np.ones(model.n, dtype=bool), part.table
-    found = []
-    for rule in rules:
-        assert isinstance(rule, StatisticRule)
-        values = np.zeros((part.judged, len(rule.thresholds(model.n))))
-        for start, stop in part.spans:
-            span = slice(start, stop)
-            violated = np.zeros(stop - start, dtype=bool)
-            values[span] = Alarm([rule], model, counted).over(part.dt[span], violated, table[span])[2]
-        size = np.minimum(np.nan_to_num(np.abs(values)), LARGEST)
-        found.append(size if rule.kind == "mean" else np.sqrt(size))
-    return found
+    alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
+    values = np.zeros((part.judged, len(alarm.names)))
+    for start, stop in part.spans:
+        span = slice(start, stop)
+        values[span] = alarm.over(part.dt[span], np.zeros(stop - start, dtype=bool), part.table[span])[2]
+    sizes = np.minimum(np.nan_to_num(np.abs(values)), LARGEST)
+    ends = np.cumsum([len(rule.thresholds(model.n)) for rule in rules])[:-1]
+    each = zip(rules, np.split(sizes, ends, axis=1), strict=True)
+    return [size if rule.kind == "mean" else np.sqrt(size) for rule, size in each]
 
 
 def learn(validation: Validation, transients: Sequence[Transient], rate: float | None = None) -> Panel:
