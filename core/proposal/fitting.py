@@ -179,10 +179,7 @@ def fit(
         others = {other: knots for other, knots in chosen.items() if other != name and not _is_auto(knots)}
         choice = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
         facts.append(choice.facts())
-        messages.append(
-            f"schedule: {plural(choice.chosen.count, 'knot')} on {name}: {choice.reason}"
-            + (f"; {choice.record}" if choice.record else "")
-        )
+        messages.append(f"schedule: {plural(choice.chosen.count, 'knot')} on {name}: {choice.reason}")
         at = knots_of(choice.chosen.model, name) if choice.chosen.model is not None else []
         chosen = {**chosen, name: at or 1}
         resolved = choice.chosen.model.schedule if choice.chosen.model is not None else None

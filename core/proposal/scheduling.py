@@ -28,7 +28,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.left_out import BLOCKS, block_spans, guard_interval, leave_out
-from uncertain_lti.validation.part import by_unit, unit_numbers
+from uncertain_lti.validation.part import by_unit
 from uncertain_lti.validation.result import Validation
 
 COUNTS = (1, 2, 3, 5)
@@ -55,8 +55,6 @@ NEGLIGIBLE = 0.0002
 """... but this share of their transitions anyway."""
 PAYS = 0.8
 """Mean width relative to one knot up to which more knots are worth having."""
-WANTED = 5
-"""Recordings that should visit each range of the scheduling signal."""
 FINEST = 1e-6
 """Width, relative to the range of its state, below which an envelope is no narrower than another."""
 
@@ -82,8 +80,7 @@ class Candidate:
     `count`: knots of the signal; `model`: fitted to everything; None where there is no such fit; `refused`: why there
     is none, or why nothing could be left out of it; `judged` (units,): left-out transitions of each recording, group or
     block; `outside` (units,): those outside the bounds of some state; `log_width` (units,): logarithm of the mean width
-    relative to one knot, the mean over the states; `visits` (blocks, units): left-out transitions nearest to each knot;
-    `block_outside` (blocks,): those of them outside.
+    relative to one knot, the mean over the states.
     """
 
     count: int
@@ -92,8 +89,6 @@ class Candidate:
     judged: Array = field(default_factory=lambda: np.zeros(0))
     outside: Array = field(default_factory=lambda: np.zeros(0))
     log_width: Array = field(default_factory=lambda: np.zeros(0))
-    visits: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    block_outside: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def share(self) -> float:
@@ -140,8 +135,7 @@ class Choice:
     """The number of knots that the recordings carry on one signal.
 
     `signal`: name of the signal; `candidates`: all that were tried, one knot first; `chosen`: the one taken; `what`:
-    what was left out at a time; `reason`: why, in words; `record`: what to record so that more knots are carried; empty
-    where that would not help.
+    what was left out at a time; `reason`: why, in words.
     """
 
     signal: str
@@ -149,7 +143,6 @@ class Choice:
     chosen: Candidate
     what: str
     reason: str
-    record: str
 
     def facts(self) -> dict[str, Any]:
         """As plain data for `fit_summary`."""
@@ -182,7 +175,6 @@ class Choice:
             "candidates": rows,
             "chosen": self.chosen.count,
             "reason": self.reason,
-            "record": self.record,
         }
 
 
@@ -271,7 +263,7 @@ def choose_knots(
         if candidates[-1].refused or (count in FURTHER and candidates[-1] is not best_of(candidates)):
             break  # more knots would be refused likewise, or are worth nothing
         candidates.append(trials.candidate(signal, count))
-    return decide(signal, candidates, trials)
+    return decide(signal, candidates, trials.fold.what)
 
 
 def knots_of(model: UncertainLTI, signal: str) -> list[float]:
@@ -315,12 +307,6 @@ def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation)
         ]
     )
     units = by_unit(parts, judged)
-    numbers = unit_numbers(parts)
-    blocks = 1 if model.schedule is None else model.schedule.blocks
-    visits, outside = np.zeros((blocks, len(units))), np.zeros(blocks)
-    for part, unit in zip(parts, numbers, strict=True):
-        visits[:, unit] += np.bincount(part.block, minlength=blocks)
-        outside += np.bincount(part.block[part.severity > 1.0], minlength=blocks)
     return Candidate(
         count,
         model,
@@ -328,8 +314,6 @@ def _judged(count: int, model: UncertainLTI, left: Validation, base: Validation)
         units,
         by_unit(parts, [part.violated for part in parts]),
         by_unit(parts, judged * ratios) / np.maximum(units, 1.0),
-        visits,
-        outside,
     )
 
 
@@ -371,21 +355,14 @@ def best_of(candidates: Sequence[Candidate]) -> Candidate:
     return min(good, key=lambda c: c.width[0], default=base)
 
 
-def decide(signal: str, candidates: Sequence[Candidate], trials: Trials) -> Choice:
+def decide(signal: str, candidates: Sequence[Candidate], what: str) -> Choice:
     """The simplest candidate within the error of the best, with the reason."""
     base, best = candidates[0], best_of(candidates)
     chosen = best
     if best is not base:
         limit = min(sum(best.width), math.log(PAYS))
         chosen = next(c for c in candidates[1:] if _admissible(c, base) and c.width[0] <= limit)
-    reason = _reason(candidates, best, chosen)
-    narrow = [c for c in candidates[1:] if not c.refused and c.width[0] <= math.log(PAYS)]  # none is admissible
-    short = [c for c in candidates[1:] if c.refused and c.model is not None]
-    wanted = narrow or short
-    record = ""
-    if chosen is base and wanted:
-        record = _record(signal, min(narrow, key=lambda c: c.excess(base)) if narrow else wanted[0], trials)
-    return Choice(signal, tuple(candidates), chosen, trials.fold.what, reason, record)
+    return Choice(signal, tuple(candidates), chosen, what, _reason(candidates, best, chosen))
 
 
 def _reason(candidates: Sequence[Candidate], best: Candidate, chosen: Candidate) -> str:
@@ -430,58 +407,3 @@ def _like_words(candidate: Candidate, base: Candidate, inside: bool) -> str:
         f" ({first} and {second} without the {len(every) - int(likes[0].sum())} of {len(every)} parts that are unlike "
         f"the others, of which one knot leaves over {UNLIKE:.0%} outside)"
     )
-
-
-def ranges(candidate: Candidate, signal: str, trials: Trials) -> list[dict[str, Any]]:
-    """What the recordings hold of the signal, knot by knot."""
-    model = candidate.model
-    assert model is not None and model.schedule is not None
-    axis = [a.signal for a in model.schedule.axes].index(signal)
-    at = knots_of(model, signal)
-    edges = [at[0], *(0.5 * (a + b) for a, b in zip(at, at[1:], strict=False)), at[-1]]
-    place = np.array([index[axis] for index in model.schedule.indices])
-    enough = 2 * (model.n + model.m)
-    there = np.zeros(len(at), dtype=int)
-    further = [s.name for s in model.signals.scheduling]
-    for transient in trials.transients:
-        blocks = model.main_block(model.normalised_columns(transient.scheduled_on(further).transitions()))
-        there += np.bincount(place[blocks[blocks >= 0]], minlength=len(at)) >= enough
-    rows = []
-    for k in range(len(at)):
-        visits = float(candidate.visits[place == k].sum()) if len(candidate.visits) else 0.0
-        rows.append(
-            {
-                "from": edges[k],
-                "to": edges[k + 1],
-                "recordings": int(there[k]),
-                "outside": float(candidate.block_outside[place == k].sum() / visits) if visits else None,
-            }
-        )
-    return rows
-
-
-def _record(signal: str, candidate: Candidate, trials: Trials) -> str:
-    """What to record, so that this candidate is carried."""
-    rows = ranges(candidate, signal, trials)
-    bad = [r for r in rows if r["recordings"] < WANTED or (r["outside"] or 0.0) > EXCESS]
-    if not bad or candidate.model is None:
-        return ""
-    unit = next(s.unit for s in candidate.model.signals.signals if s.name == signal)
-    number = len(trials.transients)
-    words, last = [], -2
-    spans: list[list[Any]] = []
-    for i, row in enumerate(rows):
-        if row not in bad:
-            continue
-        if i == last + 1:
-            spans[-1][1] = row["to"]
-            spans[-1][2] = min(spans[-1][2], row["recordings"])
-        else:
-            spans.append([row["from"], row["to"], row["recordings"]])
-        last = i
-    for low, high, count in spans:
-        words.append(
-            f"{low:.5g} to {high:.5g}{' ' + unit if unit else ''} in at least {max(2, WANTED - count)} more recordings "
-            f"({count} of {number} {'is' if count == 1 else 'are'} there)"
-        )
-    return f"to carry more knots, record {signal} from {', and from '.join(words)}, moving otherwise than in these"

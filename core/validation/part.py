@@ -84,8 +84,7 @@ class Part:
     margin 1; `outside_domain`: verdicts from outside the domain fitted without this part; `unseen`: violated verdicts
     from inside that domain; `mean_width` (n,): of the left-out model's bounds on this part, recorded units; `max_width`
     (n,): the largest such width; `relative_width` (n,): the mean over that of the full model on the same samples;
-    `group`: what was left out together with it; "" if it was left out alone; `block` (K,): block of the full model that
-    has the largest weight at each judged transition; 0 without a schedule; `model`: fitted without it; `transient`:
+    `group`: what was left out together with it; "" if it was left out alone; `model`: fitted without it; `transient`:
     what was left out; `longer` (K, H, n): utilisation by each horizon of the full model; NaN where a window is broken,
     or the left-out model has none; `longer_width` (H, n): mean width of the left-out model's envelopes over each
     horizon on this part, recorded units; NaN likewise; `residual` (K, n): x_next - centre of every judged transition,
@@ -108,7 +107,6 @@ class Part:
     max_width: Array
     relative_width: Array
     group: str = ""
-    block: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
     model: UncertainLTI | None = None
     transient: Transient | None = None
     longer: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
@@ -131,7 +129,7 @@ class Part:
         kept = ~left
         starts = sorted({int(np.count_nonzero(kept[:s])) for s in self.starts})
         count = int(np.count_nonzero(kept))
-        names = ("dt", "utilisation", "outside", "block", "longer", "residual", "longer_residual", "extrapolated")
+        names = ("dt", "utilisation", "outside", "longer", "residual", "longer_residual", "extrapolated")
         arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
         changes = {name: a[kept] if len(a) == len(kept) else a for name, a in arrays.items()}
         return replace(self, starts=tuple(s for s in starts if s < count) or (0,), **changes)
@@ -202,7 +200,6 @@ def judge(
         np.full(n, np.nan) if empty else width.max(axis=0),
         np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
         group,
-        full.main_block(full.normalised_columns(steps)),
         model,
         transient,
         longer,
