@@ -23,7 +23,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.model.residuals import Residuals
-from uncertain_lti.monitor.alarm import Alarm, Nearest, back_and_restarts, steps_back
+from uncertain_lti.monitor.alarm import Alarm, AlarmWindow, Arming, Condition, Nearest, back_and_restarts, steps_back
 
 ZEROS = np.zeros((2, 2))
 RULES = (
@@ -175,6 +175,7 @@ def test_rules_of_a_file_that_cannot_be_are_refused(rules: Any, words: str) -> N
         ({"mean": [0.0], "covariance": [[1.0]]}, "residuals of 1 state for 2 states"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [0.0, 1.0]]}, "not symmetric"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [2.0, 1.0]]}, "negative variance"),
+        ({"mean": [0.0, 0.0], "covariance": [[1.0, 0.0], [0.0, -1e-10]]}, "negative variance"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 0.0]]}, "has shape"),
     ],
 )
@@ -237,3 +238,22 @@ def test_time_has_stepped_back_where_an_instant_is_not_after_the_one_before_the_
     ):
         found = back_and_restarts(np.array(stamps))
         assert [np.flatnonzero(each).tolist() for each in found] == [back, restarts], stamps
+
+
+def test_two_of_three_verdicts_of_a_horizon_and_no_verdict_changes_nothing() -> None:
+    window = AlarmWindow(AlarmRule(2, 3, margin=1.5, horizon=4), [2, 3])
+    inside, beyond, none = ([9.0, 9.0, -1.5, 1.5], [0.0, 0.0, 0.0, -1.6], [9.0, 9.0, np.nan, np.nan])
+    rows = np.array([inside, beyond, none, beyond, none, inside, inside, [0.0, 0.0, 1.6, np.nan], none])
+    alarms = [window.push(0.1, True, row) for row in rows]
+    assert alarms == [False, False, False, True, True, True, False, False, False]
+    again, _ = window.push_all(np.full(len(rows), 0.1), np.ones(len(rows), dtype=bool), rows[:, None])
+    assert again.tolist() == alarms
+
+
+def test_a_value_is_known_to_another_condition_on_the_same_field() -> None:
+    arming = Arming(Condition.parse("/machine/mode data == 3"), 0)
+    assert arming.said_on(arming.condition) is None
+    arming.learn(3.0)
+    for text, known in (("/machine/mode data > 1", 3.0), ("/machine/mode other == 3", None), ("/a data == 3", None)):
+        assert arming.said_on(Condition.parse(text)) == known
+    assert arming.said_on(None) is None and Arming(None, 0).said_on(arming.condition) is None

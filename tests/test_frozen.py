@@ -198,6 +198,9 @@ def test_a_row_needs_a_state_that_moves_it_by_more_than_its_half_width() -> None
         dA = np.zeros((3, 3))
         dA[2, 1] = element  # half of which the half-width has already
         assert needs(model.replace(dA=dA, v=[0.1, 0.1, 0.1 - 0.01 * element]))[2, 1] == needed
+    exact = model.replace(sampling=Sampling(dt_median=0.25), v=[0.5] * 3)
+    for element, needed in ((1.0, False), (1.25, True)):  # 0.25 * 1 * 2 is the half-width to the last bit
+        assert needs(exact.replace(A=[[0.0] * 3, [0.0] * 3, [element, 0.0, 0.0]]))[2, 0] == needed
     everywhere = model.replace(domain=None)
     assert needs(everywhere).tolist() == [[True, False, False], [True, True, False], [True, False, True]]
 

@@ -274,3 +274,12 @@ def test_where_nothing_is_still_but_at_an_end_stop_it_is_said() -> None:
     steady, _, words = resolve_auto(signals(AUTO), [values])
     assert steady == [1.15]
     assert words.endswith("all of them with s0 at an end stop: give `steady` yourself")
+
+
+def test_an_end_stop_is_held_for_ten_samples_and_reached_at_half_the_usual_speed() -> None:
+    """Steps of 2 up to 79, of 1 over the ten before it: exactly half; and where nothing comes before, no speed."""
+    up = np.concatenate([np.arange(1.0, 81.0, 2.0), np.arange(80.0, 91.0)])
+    column = np.concatenate([up, np.full(10, 91.0)])[:, None]
+    assert end_stops([column]) == [[91.0]] and end_stops([column[:-1]]) == [[]]
+    at_once = np.concatenate([[90.0], np.full(10, 91.0)])[:, None]
+    assert end_stops([column, at_once]) == [[91.0]]

@@ -26,7 +26,7 @@ from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.monitor.session import ERROR, Rule
 from uncertain_lti.sampling.status import Status
 
-COUNTS = {perturbed.in_disorder: 40, perturbed.of_a_swapped_model: 20, perturbed.held_up_on_the_way: 8}
+COUNTS = {perturbed.in_disorder: 16, perturbed.of_a_swapped_model: 8, perturbed.held_up_on_the_way: 8}
 
 
 @pytest.mark.parametrize("case", COUNTS, ids=lambda case: case.__name__)

@@ -129,9 +129,8 @@ def test_without_pyarrow_the_sentence_names_the_command(tmp_path, monkeypatch):
         open_recording(tmp_path / "a.parquet")
 
 
-@pytest.mark.parametrize("kind", [".csv", ".npz"])
-def test_every_command_takes_them(tables, shipped, names, kind, tmp_path, capsys):
-    path, model, signals = str(tables[kind]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
+def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
+    path, model, signals = str(tables[".csv"]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
     assert main(["topics", path]) == 0
     assert f"/table: {', '.join(names)}" in capsys.readouterr().out
     assert main(["init", path, "--output", str(tmp_path / "init.yaml")]) == 0
@@ -402,7 +401,7 @@ def test_damage_anywhere_is_read_or_a_sentence(tables, kind, tmp_path):
     data = tables[kind].read_bytes()
     path = tmp_path / f"hurt{kind}"
     rng = random.Random(3)
-    for _ in range(25):
+    for _ in range(10):
         hurt = bytearray(data)
         where = rng.randrange(len(hurt)) if rng.random() < 0.5 else rng.randrange(2000)
         hurt[where : where + rng.choice([1, 4, 100])] = rng.randbytes(rng.choice([1, 4, 100]))
