@@ -66,7 +66,7 @@ def compiled() -> list[Extension]:
 extras = {
     # What `uncertain_lti.fit` needs. The newest of these want numpy 2: in a sourced ROS 2 say
     # `pip install '.[fit]' 'numpy<2'` (./run pins its numpy), and pip takes the last that do without.
-    "fit": ["daqp", "highspy", "scipy", "threadpoolctl"],
+    "fit": ["daqp", "highspy", "piqp", "scipy", "threadpoolctl"],
     # `fit(method="cvxpy")`: the whole problem as written, for comparison.
     "oracle": ["cvxpy", "highspy", "osqp>=1"],
     "cluster": ["distributed"],
@@ -84,14 +84,13 @@ extras = {
     "docs": ["furo", "latex2mathml", "myst-parser", "sphinx"],
     # Real rclpy where no ROS 2 is installed: wheels for x86_64 Linux.
     "ros": ["ros-jazzy-common-interfaces==5.3.6", "ros-rclpy[fastrtps]==7.1.6"],
-    # colcon test looks for pytest here; setuptools lets the tests read this file; piqp is a second answer to (10);
-    # cyclonedds hears the node from another vendor's DDS.
+    # colcon test looks for pytest here; setuptools lets the tests read this file; cyclonedds hears the node from
+    # another vendor's DDS.
     "test": [
         "Cython>=3",
         "cyclonedds; platform_machine == 'x86_64'",
         "hypothesis",
         "packaging",
-        "piqp",
         "pytest",
         "pytest-timeout",
         "pytest-xdist",

@@ -147,7 +147,7 @@ def test_a_model_is_written_whoever_reads_what_is_said(tmp_path, command):
     assert (tmp_path / "m.model.json").exists()
 
 
-SOLVERS = ("cvxpy", "daqp", "highspy", "osqp", "scipy")
+SOLVERS = ("cvxpy", "daqp", "highspy", "osqp", "piqp", "scipy")
 
 
 def test_in_the_environment_of_the_programs_the_remedy_is_one_command_of_run(tmp_path, monkeypatch):

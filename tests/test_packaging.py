@@ -63,7 +63,7 @@ ROSDEP_KEY = {
     "yaml": "python3-yaml",
     "zstandard": "mcap-ros2-support",
 }
-WITHOUT_ROSDEP_KEY = {"control", "daqp", "distributed", "threadpoolctl"}
+WITHOUT_ROSDEP_KEY = {"control", "daqp", "distributed", "piqp", "threadpoolctl"}
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +135,7 @@ def test_what_the_live_node_uses_imports_with_numpy_alone(module):
 
 def test_the_node_imports_without_solvers_plots_and_bag_readers():
     pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
-    heavy = "cvxpy daqp highspy matplotlib mcap osqp pandas rosbags scipy tqdm".split()
+    heavy = "cvxpy daqp highspy matplotlib mcap osqp pandas piqp rosbags scipy tqdm".split()
     import_in_fresh_process("uncertain_lti_ros.envelope_monitor", refused=heavy)
 
 

@@ -15,7 +15,7 @@ import sys
 from pathlib import Path
 
 _EXTRAS = {
-    "fit": "daqp highspy scipy threadpoolctl",
+    "fit": "daqp highspy piqp scipy threadpoolctl",
     "oracle": "cvxpy osqp",
     "plots": "PIL jinja2 markupsafe matplotlib",
     "tables": "pyarrow",

@@ -179,7 +179,7 @@ def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
 
     def add(pool: Index) -> None:
         nonlocal owner, least
-        rows, h, *_ = own.limited(pool)
+        rows, h = own.rows(pool)
         simplex.add(rows, h)
         owner, least = np.concatenate([owner, np.tile(pool, len(h) // len(pool))]), np.concatenate([least, h])
 

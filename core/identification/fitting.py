@@ -456,6 +456,7 @@ def _model(
 
 _PACKAGES = {
     "DAQP": ("daqp",),
+    "PIQP": ("piqp",),
     "HiGHS simplex": ("highspy",),
     "cvxpy with OSQP": ("cvxpy", "osqp"),
     "cvxpy with HiGHS": ("cvxpy", "highspy"),

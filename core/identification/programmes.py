@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -20,9 +20,8 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
 from uncertain_lti.identification.solvers import (
     FEASIBLE,
-    Sense,
+    Answer,
     Simplex,
-    Within,
     dual_bound,
     linear_bound,
     solve_near,
@@ -50,7 +49,6 @@ of the squared widths. Whether it was is seen from the optimum of δ alone, at t
 it seldom is small enough, so they are left to the simplex method at once.
 """
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
-_FURTHER = ((300.0, 1e-6), (1e3, 1e-6), (1e4, 1e-4))  # the same for (10), which no simplex method solves
 _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
 _HOLD = (1e-2, 1e-4, 1e-6)
@@ -75,7 +73,7 @@ class Programmes:
         self.exact = row.sums.visits.size > 1  # (11) by the simplex method
         self.least = 0.0  # δ of (11) that it found, in the same units as the limit
         self.attempt = _ATTEMPTS[0]
-        self._last: dict[str, tuple[Array, Sense]] = {}  # to the last programme of a kind, and what was active
+        self._last: dict[str, Answer] = {}  # to the last programme of a kind
         if like is not None:
             self.attempt, self._last = like.attempt, dict(like._last)
         self.drop_simplex()
@@ -119,51 +117,57 @@ class Programmes:
         self,
         kind: str,
         objective: Callable[[float, float], tuple[Array, Array]],
-        within: Within,
-        attempts: Sequence[tuple[float, float]] = _ATTEMPTS,
-    ) -> Array:
+        G: Array,
+        h: Array,
+        lower: Array,
+        upper: Array,
+        any_solver: bool = False,
+    ) -> tuple[Array, str]:
         """Solve a programme whose rows are some for each sample of the pool, from where the last of its kind ended.
 
-        objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP gives up.
+        objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
         """
         row = self.row
-        G, h, lower, upper = within
+        feasible = FEASIBLE if row.refined else ROUGH
         last, per_sample = self._last.get(kind), len(h) // max(len(row.pool), 1)
-        begin, start = np.zeros(len(lower)), None
-        if last is not None:
-            begin, active = last
-            if per_sample:
-                known = active[len(lower) : len(active) - len(row.asked)].reshape(per_sample, -1)
-                known = known[:, : len(row.pool)]  # the pool grows, but for discards
-                start = np.zeros(len(lower) + len(h) + len(row.asked), dtype=np.int32)
-                start[: len(lower)] = active[: len(lower)]
-                there = start[len(lower) : len(lower) + len(h)].reshape(per_sample, -1)
-                there[:, : known.shape[1]] = known
-        elif row.basis is None:
+        start = None
+        if last is not None and last.active is not None and per_sample:
+            known = last.active[len(lower) : len(last.active) - len(row.asked)].reshape(per_sample, -1)
+            known = known[:, : len(row.pool)]  # the pool grows, but for discards
+            start = np.zeros(len(lower) + len(h) + len(row.asked), dtype=np.int32)
+            start[: len(lower)] = last.active[: len(lower)]
+            there = start[len(lower) : len(lower) + len(h)].reshape(per_sample, -1)
+            there[:, : known.shape[1]] = known
+        begin = np.zeros(len(lower)) if last is None else last.xi
+        if last is None and row.basis is None:
             begin[: row.r] = row.scaled()[0]
-        within = *self._with_asked(G, h), lower, upper
-        for self.attempt in attempts:
+        G, h = self._with_asked(G, h)
+        for self.attempt in _ATTEMPTS:
             try:
-                self._last[kind] = solve_near(*objective(*self.attempt), within, begin, start, self._feasible)
-                return self._last[kind][0]
+                answer = solve_near(*objective(*self.attempt), G, h, lower, upper, begin, start, feasible)
+                break
             except FitError:
                 continue
-        raise FitError("DAQP could not solve the quadratic programme")
-
-    @property
-    def _feasible(self) -> float:
-        return FEASIBLE if self.row.refined else ROUGH
+        else:
+            if not any_solver:
+                raise FitError("DAQP could not solve the quadratic programme")
+            answer = solve_qp(*objective(*self.attempt), G, h, lower, upper, feasible=feasible)
+        self._last[kind] = answer
+        return answer.xi, answer.solver
 
     def quadratic(self) -> str:
         """Solve (10) on the working set."""
         row = self.row
-
-        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
-            return row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
-
-        within = *row.containment(row.pool), row.lower, row.upper
-        row.store(self._solve("quadratic", objective, within, (*_ATTEMPTS, *_FURTHER)))
-        return "DAQP"
+        answer, solver = self._solve(
+            "quadratic",
+            lambda factor, ridge: row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge),
+            *row.containment(row.pool),
+            row.lower,
+            row.upper,
+            any_solver=True,
+        )
+        row.store(answer)
+        return solver
 
     def regularised(self) -> str:
         """Solve (11) with a little of the squared widths on the working set."""
@@ -176,8 +180,15 @@ class Programmes:
             whole[:size, :size] = REGULARISATION * H
             return whole, np.append(REGULARISATION * f, 1.0)
 
-        row.store_limited(self._solve("regularised", objective, self.limited(row.pool)))
-        return "DAQP"
+        answer, solver = self._solve(
+            "regularised",
+            objective,
+            *self.rows(row.pool),
+            np.append(row.lower, 0.0),
+            np.append(row.upper, np.inf),
+        )
+        row.store_limited(answer)
+        return solver
 
     def linear(self) -> str:
         """Solve (11) on the working set, by the simplex method."""
@@ -185,7 +196,7 @@ class Programmes:
         box = self.box
         if box is not None and self._simplex is None:
             self._unit = float(np.median(row.width[row.pool] if len(row.pool) else row.width))
-        G, h = self.limited(row.pool)[:2] if box is None else self._distances(row.pool)
+        G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
         kinds = 3 if box is None else 2
         number = kinds * np.tile(row.samples.index[row.pool], kinds) + np.repeat(np.arange(kinds), len(row.pool))
         there = np.zeros((kinds, len(row.samples)), dtype=bool)  # rows that the simplex method has
@@ -275,7 +286,9 @@ class Programmes:
         row = self.row
         assert row.limit is not None
         xi = np.concatenate([*row.scaled(), [row.limit]])
-        bound = linear_bound(np.append(np.zeros(len(xi) - 1), 1.0), self.limited(row.pool), xi)
+        cost = np.append(np.zeros(len(xi) - 1), 1.0)
+        low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
+        bound = linear_bound(cost, *self.rows(row.pool), low, high, xi)
         if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
             return bound
         inside, room = row.slacks()
@@ -287,7 +300,7 @@ class Programmes:
         bound = max(bound, 0.0)
         for pool in (row.pool[decisive], row.pool):
             simplex = self.minimax()
-            simplex.add(*self.limited(pool)[:2])
+            simplex.add(*self.rows(pool))
             bound = max(bound, float(simplex.solve()[-1]))
             if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
                 break
@@ -316,7 +329,7 @@ class Programmes:
             theta = np.linalg.lstsq(row.basis, theta, rcond=None)[0].astype(np.float64)
         H, f = row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        bound = dual_bound(H, f, (*self._with_asked(*row.containment(row.pool)), row.lower, row.upper), xi)
+        bound = dual_bound(H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper, xi)
         value = max(row.value(d), row.least_value())
         weight = factor * TIE_BREAK * float(np.diagonal(row.gram).min(initial=1.0))
         spread = max(float(d @ row.plain @ d), 0.0)
@@ -345,23 +358,13 @@ class Programmes:
                 return float(value)
         return 1.0
 
-    def among(self, coupled: Array, widths: list[Array]) -> str:
+    def among(self) -> str:
         """(10) with full weights, of this row given the others.
 
         If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
         row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
-
-        `coupled` (n q, n q): of `Moments`; `widths` (q,): half-widths of all rows.
         """
-        row, q = self.row, len(self.row.d)
-        mine = slice(row.i * q, (row.i + 1) * q)
-        unit = row.unit_psi * row.scale
-        fixed = np.concatenate(widths)
-        fixed[mine] = row.fixed_d
-        gram = row.psi_columns.square(coupled[mine, mine]) * np.outer(unit, unit)
-        row.largest = float(np.diagonal(gram).max(initial=0.0)) or 1.0
-        row.gram = gram / row.largest
-        row.linear = row.psi_columns.take(coupled[mine] @ fixed) * unit / row.largest
+        row = self.row
         try:
             return self.quadratic()
         except FitError:
@@ -369,13 +372,12 @@ class Programmes:
             if steep <= 1.0:
                 raise
         G, h = self._with_asked(*row.containment(row.pool))
-        H, f = row.hessian(row.gram, row.linear, TIE_BREAK)
-        try:
-            row.store(solve_qp(H, f / steep, (G, h / steep, row.lower / steep, row.upper / steep))[0] * steep)
-            return "DAQP"
-        except FitError:
-            slope = np.maximum(row.linear / steep, 0.0)  # what falls, by rounding at least, has no end
-        simplex = Simplex(np.concatenate([np.zeros(row.r), slope]), row.lower, row.upper)
+        if -row.linear.min() >= row.linear.max():
+            H, f = row.hessian(row.gram, row.linear, TIE_BREAK)
+            answer = solve_qp(H, f / steep, G, h / steep, row.lower / steep, row.upper / steep)
+            row.store(answer.xi * steep)
+            return answer.solver
+        simplex = Simplex(np.concatenate([np.zeros(row.r), row.linear / steep]), row.lower, row.upper)
         simplex.add(G, h)
         row.store(simplex.solve())
         return "HiGHS simplex"
@@ -415,8 +417,8 @@ class Programmes:
             return np.inf
         return max(float(slope @ d) - least, 0.0) / max(row.value(d), row.least_value())
 
-    def limited(self, pool: Index) -> Within:
-        """Programmes in [ξ δ]: (8), (9) and the limit on the width for samples of the pool."""
+    def rows(self, pool: Index) -> tuple[Array, Array]:
+        """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
         row = self.row
         G, h = row.containment(pool)
         width = row.width[pool]
@@ -425,8 +427,6 @@ class Programmes:
         return (
             np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]),
             np.concatenate([h, width * row.half[pool] * unit[:, 0]]),
-            np.append(row.lower, 0.0),
-            np.append(row.upper, np.inf),
         )
 
     def bounded(self) -> str:
@@ -458,14 +458,14 @@ class Programmes:
                     held = H + hold * np.eye(len(step)), f - hold * step
                     low, high = row.lower - point, row.upper - point
                     feasible = _ROOM[-1] if row.refined else FEASIBLE
-                    answer, found = solve_near(*held, (G, h, low, high), step, active, feasible)
+                    answer = solve_near(*held, G, h, low, high, step, active, feasible, any_solver=True)
                 except FitError:
                     break
-                left = max(0.0, -float((G[:contained] @ answer - around).min(initial=0.0)))  # the repair covers it
-                d = (point + answer)[row.r :]
+                left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
+                d = (point + answer.xi)[row.r :]
                 if (width * (row.psi[pool] @ d + row.half[pool] + left)).max(initial=0.0) > (1.0 + GOOD) * self.allowed:
                     break
-                step, solver, active = answer, "DAQP", found
+                step, solver, active = answer.xi, answer.solver, answer.active
             if step.any():
                 break
         self.attempt = _ATTEMPTS[0]
@@ -484,12 +484,18 @@ class Programmes:
         half = psi @ (row.d[row.free_psi] / (row.unit_psi * row.scale)) + row.half[row.pool]
         y = row.y[row.pool]
         try:
-            G, h = self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half]))
-            H, within = row.centre + self.attempt[1] * np.eye(row.r), (G, h, row.lower[: row.r], row.upper[: row.r])
-            answer, _ = solve_qp(H, -row.target, within, feasible=self._feasible)
+            answer = solve_qp(
+                row.centre + self.attempt[1] * np.eye(row.r),
+                -row.target,
+                *self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
+                row.lower[: row.r],
+                row.upper[: row.r],
+                any_solver=False,
+                feasible=FEASIBLE if row.refined else ROUGH,
+            )
         except FitError:  # the half-widths leave no room at all
             return
-        row.store_theta(answer)
+        row.store_theta(answer.xi)
 
     def contradiction(self) -> tuple[int, float, int] | None:
         """A sample that no elements within the structure can contain, alone or with others."""

@@ -465,6 +465,21 @@ class Row:
         H[self.r :, self.r :] = gram + 1e-13 * np.diag(diagonal)
         return H, np.concatenate([-weight * self.target, linear])
 
+    def among(self, coupled: Array, widths: list[Array]) -> None:
+        """Take the row's part of (10) with full weights, given the other rows, as its own.
+
+        `coupled` (n q, n q): of `Moments`; `widths` (q,): half-widths of all rows.
+        """
+        q = len(self.d)
+        mine = slice(self.i * q, (self.i + 1) * q)
+        unit = self.unit_psi * self.scale
+        fixed = np.concatenate(widths)
+        fixed[mine] = self.fixed_d
+        gram = self.psi_columns.square(coupled[mine, mine]) * np.outer(unit, unit)
+        self.largest = float(np.diagonal(gram).max(initial=0.0)) or 1.0
+        self.gram = gram / self.largest
+        self.linear = self.psi_columns.take(coupled[mine] @ fixed) * unit / self.largest
+
     def value(self, d: Array) -> float:
         """Return half the mean of the squared half-widths of all samples, in scaled units.
 

@@ -7,11 +7,12 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Small dense programmes to high accuracy: the two solvers that the working set calls, and bounds of the optimum."""
+"""Small dense programmes to high accuracy: the solvers that the working set calls, each with its fallback."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,9 +22,6 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 
 Sense = NDArray[np.int32]
-"""Of [bounds of ξ; rows of G]: 0 not active, 1 at the upper, 3 at the lower bound (DAQP's words)."""
-Within = tuple[Array, Array, Array, Array]
-"""G (K, v), h (K,), lower (v,) and upper (v,) of G ξ >= h and lower <= ξ <= upper; -inf and inf for none."""
 
 FEASIBLE = 1e-9
 """Largest violation, in scaled units, of an answer that counts as solved; the repair covers it."""
@@ -36,63 +34,104 @@ _NEAR = 2
 """Rows per unknown that a programme begins with."""
 
 
-def solve_qp(
-    H: Array, f: Array, within: Within, active: Sense | None = None, feasible: float = FEASIBLE
-) -> tuple[Array, Sense]:
-    """Minimise ½ ξᵀHξ + fᵀξ within bounds, by DAQP (dual active set, exact to rounding): ξ, and what is active.
+@dataclass(frozen=True)
+class Answer:
+    """Minimiser ξ of a programme.
 
-    H must be positive definite, everything scaled to order one. DAQP's tolerance is one on rows in the metric of H,
-    coarse where H hardly weighs an unknown: what it leaves is mended with the step held back.
-
-    `H` (v, v): positive definite; `f` (v,): linear term.
+    `xi` (variables,): ξ; `solver`: who found it; `active`: of [bounds of ξ; rows of G]: 0 not active, 1 at the upper, 3
+    at the lower bound (DAQP's words); None where the solver does not report it.
     """
-    answer, found, violation = _solved(H, f, within, active, feasible)
+
+    xi: Array
+    solver: str
+    active: Sense | None
+
+
+def solve_qp(
+    H: Array,
+    f: Array,
+    G: Array,
+    h: Array,
+    lower: Array,
+    upper: Array,
+    active: Sense | None = None,
+    any_solver: bool = True,
+    feasible: float = FEASIBLE,
+) -> Answer:
+    """Minimise ½ ξᵀHξ + fᵀξ subject to G ξ >= h, lower <= ξ <= upper.
+
+    H must be positive definite, everything scaled to order one. DAQP (dual active set, exact to rounding) first;
+    PIQP if it gives up or returns what violates a row by more than `FEASIBLE`. DAQP's tolerance is one on rows in the
+    metric of H, coarse where H hardly weighs an unknown: what it leaves is mended with the step held back.
+
+    `H` (v, v): positive definite; `f` (v,): linear term; `G` (K, v): rows of the constraints; `h` (K,): their lower
+    limits; `lower` (v,): bounds of ξ; -inf for none; `upper` (v,): bounds of ξ; inf for none.
+    """
+    answer, violation = _solved(H, f, G, h, lower, upper, active, any_solver, feasible)
     hold = _HOLD * float(np.diagonal(H).max(initial=0.0))
-    while violation > _SLIGHT:
+    while violation > _SLIGHT and answer.active is not None:
+        held = H + hold * np.eye(len(f)), f - hold * answer.xi
         try:
-            nearer = _solved(H + hold * np.eye(len(f)), f - hold * answer, within, found, feasible)
+            nearer, left = _solved(*held, G, h, lower, upper, answer.active, False, feasible)
         except FitError:
             break
-        if nearer[2] > 0.1 * violation:
+        if left > 0.1 * violation:
             break
-        answer, found, violation = nearer
-    return answer, found
+        answer, violation = nearer, left
+    return answer
 
 
-def _solved(H: Array, f: Array, within: Within, active: Sense | None, feasible: float) -> tuple[Array, Sense, float]:
-    """The answer of DAQP, what is active there, and by how much it violates a row."""
-    import daqp
-
-    rows, limits, lower, upper = within
-    # a diagonal scaling makes a badly scaled Hessian harmless
+def _solved(
+    H: Array,
+    f: Array,
+    G: Array,
+    h: Array,
+    lower: Array,
+    upper: Array,
+    active: Sense | None,
+    any_solver: bool,
+    feasible: float,
+) -> tuple[Answer, float]:
+    """The answer of the first solver that has a good one, and by how much it violates a row."""
+    # a diagonal scaling makes a badly scaled Hessian harmless to every solver
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-    H, f, G, lower, upper = H * np.outer(s, s), f * s, rows * s, lower / s, upper / s
+    rows, limits = G, h
+    H, f, G, lower, upper = H * np.outer(s, s), f * s, G * s, lower / s, upper / s
     norm = np.maximum(np.abs(G).max(axis=1, initial=0.0), 1e-300)
-    H, G, h = np.ascontiguousarray(H), np.ascontiguousarray(G / norm[:, None]), limits / norm
-    most = np.concatenate([np.minimum(upper, 1e30), np.full(len(h), 1e30)])
-    least = np.concatenate([np.maximum(lower, -1e30), h])
-    cold = np.zeros(len(least), dtype=np.int32)
-    for sense in (cold,) if active is None else (active.copy(), cold):
-        x, _, flag, info = daqp.solve(H, f, G, most, least, sense, primal_tol=1e-11, iter_limit=20_000)
-        if flag == 1:
-            break
-    if flag == 1 and np.isfinite(x).all():
-        answer = np.clip(np.asarray(x, dtype=np.float64), lower, upper) * s
+    G, h = G / norm[:, None], h / norm
+    best: tuple[float, Answer] | None = None
+    for name, solver in _SOLVERS if any_solver else _SOLVERS[:1]:
+        answer, found = solver(H, f, G, h, lower, upper, active)
+        if answer is None or not np.isfinite(answer).all():
+            continue
+        answer = np.clip(answer, lower, upper) * s
         violation = float(np.max(limits - rows @ answer, initial=0.0))  # not that of what was scaled for the solver
-        if violation <= feasible:
-            multiplier = np.asarray(info["lam"])
-            return answer, np.where(multiplier < 0, 3, np.where(multiplier > 0, 1, 0)).astype(np.int32), violation
-    raise FitError("DAQP could not solve the quadratic programme; scale the signals to order one")
+        if best is None or violation < best[0]:
+            best = (violation, Answer(answer, name, found))
+        if violation <= FEASIBLE:
+            break
+    if best is not None and best[0] <= feasible:
+        return best[1], best[0]
+    names = ", ".join(name for name, _ in _SOLVERS)
+    raise FitError(f"no solver ({names}) could solve the quadratic programme; scale the signals to order one")
 
 
 def solve_near(
-    H: Array, f: Array, within: Within, xi: Array, active: Sense | None = None, feasible: float = FEASIBLE
-) -> tuple[Array, Sense]:
+    H: Array,
+    f: Array,
+    G: Array,
+    h: Array,
+    lower: Array,
+    upper: Array,
+    xi: Array,
+    active: Sense | None = None,
+    feasible: float = FEASIBLE,
+    any_solver: bool = False,
+) -> Answer:
     """As `solve_qp`, with the rows that are near at ξ alone, and then those that the answer violates.
 
     A strictly convex programme has one minimiser, so it does not matter which other rows were left out.
     """
-    G, h, lower, upper = within
     slack, size = G @ xi - h, len(f)
     wanted = slack < -_SLIGHT
     if active is not None:
@@ -101,25 +140,56 @@ def solve_near(
     wanted[np.argpartition(slack, near)[:near] if len(slack) > near else slice(None)] = True
     while True:
         start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
-        answer, found = solve_qp(H, f, (G[wanted], h[wanted], lower, upper), start, feasible)
-        active = np.zeros(size + len(h), dtype=np.int32)
-        active[:size] = found[:size]
-        active[size:][wanted] = found[size:]
-        left = ~wanted & (G @ answer - h < -_SLIGHT)
+        answer = solve_qp(H, f, G[wanted], h[wanted], lower, upper, start, any_solver, feasible)
+        if answer.active is None:
+            active = None
+        else:
+            active = np.zeros(size + len(h), dtype=np.int32)
+            active[:size] = answer.active[:size]
+            active[size:][wanted] = answer.active[size:]
+        left = ~wanted & (G @ answer.xi - h < -_SLIGHT)
         if not left.any():
-            return answer, active
+            return Answer(answer.xi, answer.solver, active)
         wanted |= left
 
 
-def _near(within: Within, xi: Array) -> tuple[Array, Array]:
-    """Rows C and limits l of what is active at ξ, of C ξ >= l."""
-    G, h, lower, upper = within
-    rows, limits = np.vstack([np.eye(len(xi)), -np.eye(len(xi)), G]), np.concatenate([lower, -upper, h])
-    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
-    return rows[near], limits[near]
+_Found = tuple[Array | None, Sense | None]
 
 
-def dual_bound(H: Array, f: Array, within: Within, xi: Array) -> float:
+def _daqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, active: Sense | None) -> _Found:
+    import daqp
+
+    size = len(f)
+    bupper = np.concatenate([np.minimum(upper, 1e30), np.full(len(h), 1e30)])
+    blower = np.concatenate([np.maximum(lower, -1e30), h])
+    H, G = np.ascontiguousarray(H), np.ascontiguousarray(G)
+    cold = np.zeros(size + len(h), dtype=np.int32)
+    for sense in (cold,) if active is None else (active.copy(), cold):
+        x, _, flag, info = daqp.solve(H, f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000)
+        if flag == 1:
+            multiplier = np.asarray(info["lam"])
+            found = np.where(multiplier < 0, 3, np.where(multiplier > 0, 1, 0)).astype(np.int32)
+            return np.asarray(x, dtype=np.float64), found
+    return None, None
+
+
+def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _: Sense | None) -> _Found:
+    import piqp
+
+    solver = piqp.DenseSolver()
+    solver.settings.eps_abs = 1e-12
+    solver.settings.eps_rel = 1e-12
+    solver.settings.max_iter = 500
+    solver.setup(H, f, None, None, G, h, np.full(len(h), np.inf), lower, upper)
+    status = solver.solve()
+    done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
+    return (np.array(solver.result.x, dtype=np.float64) if status in done else None), None
+
+
+_SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp))
+
+
+def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
     """A lower bound of the optimum of `solve_qp`, whoever found ξ: the dual objective at multipliers made for ξ.
 
     Any non-negative multipliers λ give a bound, -½ |L⁻¹(Cᵀλ - f)|² + lᵀλ with H = L Lᵀ and C ξ >= l what is active at
@@ -127,14 +197,16 @@ def dual_bound(H: Array, f: Array, within: Within, xi: Array) -> float:
     least squares, in the units of the gradient and in those of L, of which either can be the better. -inf where
     there are none.
 
-    `H` (v, v), `f` (v,): as in `solve_qp`; `xi` (v,): ξ, near the optimum.
+    `H` (v, v): as in `solve_qp`; `f` (v,): as in `solve_qp`; `G` (K, v): as in `solve_qp`; `h` (K,): as in `solve_qp`;
+    `lower` (v,): as in `solve_qp`; `upper` (v,): as in `solve_qp`; `xi` (v,): ξ, near the optimum.
     """
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
 
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))  # as in `solve_qp`
-    rows, limits = _near(within, xi)
-    C = rows.T
+    rows, limits = np.vstack([np.eye(len(f)), -np.eye(len(f)), G]), np.concatenate([lower, -upper, h])
+    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
+    C, limits = rows[near].T, limits[near]
     best = -np.inf
     try:
         L = np.linalg.cholesky(H * np.outer(s, s))
@@ -145,7 +217,7 @@ def dual_bound(H: Array, f: Array, within: Within, xi: Array) -> float:
     for columns, gradient in attempts:
         unit = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         try:
-            multiplier = nnls(columns / unit, gradient)[0] / unit if len(limits) else np.empty(0)
+            multiplier = nnls(columns / unit, gradient)[0] / unit if len(near) else np.empty(0)
         except RuntimeError:  # too many iterations
             continue
         left = whitened @ multiplier - linear
@@ -153,18 +225,19 @@ def dual_bound(H: Array, f: Array, within: Within, xi: Array) -> float:
     return best
 
 
-def linear_bound(cost: Array, within: Within, xi: Array) -> float:
-    """As `dual_bound`, of the linear programme minimise costᵀξ."""
+def linear_bound(cost: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
+    """As `dual_bound`, of the linear programme minimise costᵀξ subject to G ξ >= h, lower <= ξ <= upper."""
     from scipy.optimize import nnls
 
-    rows, limits = _near(within, xi)
-    unit = np.maximum(np.linalg.norm(rows, axis=1), 1e-300)
+    rows, limits = np.vstack([np.eye(len(cost)), -np.eye(len(cost)), G]), np.concatenate([lower, -upper, h])
+    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
+    unit = np.maximum(np.linalg.norm(rows[near], axis=1), 1e-300)
     try:
-        multiplier = nnls(rows.T / unit, cost)[0] / unit
+        multiplier = nnls(rows[near].T / unit, cost)[0] / unit
     except RuntimeError:  # too many iterations
         return -np.inf
-    left = float(np.abs(rows.T @ multiplier - cost).sum())
-    return float(limits @ multiplier) if left <= _SLIGHT else -np.inf
+    left = float(np.abs(rows[near].T @ multiplier - cost).sum())
+    return float(limits[near] @ multiplier) if left <= _SLIGHT else -np.inf
 
 
 _ITERATIONS = 50

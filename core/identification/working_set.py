@@ -17,7 +17,7 @@ from time import perf_counter
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.cores import on_cores, one_by_one
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
@@ -71,17 +71,20 @@ class WorkingSet:
     unknowns change (the size of a sample is linear in |z|), so while they change less than the slack that was
     brought, no other sample can leave its bounds, and the proof of optimality needs no further pass.
 
-    `fleet`: the data; `structure`: as in `fit`; `progress`: called with one line of text per pass.
+    `fleet`: the data; `structure`: as in `fit`; `excluded`: transitions that need not be contained; `progress`: called
+    with one line of text per pass.
     """
 
     def __init__(
         self,
         fleet: Fleet,
         structure: Structure | None = None,
+        excluded: Index | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> None:
         self.fleet = fleet
         self.progress = progress or (lambda text: None)
+        self.excluded = np.empty(0, dtype=np.intp) if excluded is None else excluded
         self.whole = fleet.N <= 2 * SUBSAMPLE
         stride = 1 if self.whole else fleet.N // SUBSAMPLE
         self.sums, self._first = fleet.moments(stride)
@@ -200,18 +203,15 @@ class WorkingSet:
         The rows meet in the objective alone, which is convex and smooth, so going round them descends to the optimum
         of all; and rows whose widths differ by many orders of magnitude never share a programme.
         """
-        coupled = self.sums.coupled
-        assert coupled is not None
-
-        def among(own: Programmes) -> str:
-            return own.among(coupled, [other.d for other in self.rows])
-
+        assert self.sums.coupled is not None
         before = np.inf
         for _number in range(MAX_ROUNDS):
             for row in self.rows:
-                self._settle(self.programmes[row.i], among, polish=True)
+                if row.unknown:
+                    row.among(self.sums.coupled, [other.d for other in self.rows])
+                self._settle(self.programmes[row.i], Programmes.among, polish=True)
             flat = np.concatenate([row.d for row in self.rows])
-            value = float(flat @ coupled @ flat)
+            value = float(flat @ self.sums.coupled @ flat)
             if value >= before * (1.0 - 1e-11):
                 return
             before = value
@@ -501,6 +501,8 @@ class WorkingSet:
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
     def _hold(self, row: Row, samples: Samples) -> None:
+        if len(self.excluded):
+            samples = samples[~np.isin(samples.index, self.excluded)]
         row.hold(samples, self.fleet.columns, self._like)
         self._like = row
 
