@@ -58,7 +58,7 @@ def test_with_knots_where_the_first_centre_contains_every_sample(seed):
     assert found.gap >= found.true_gap - 2 * optimum.AGREE
 
 
-@pytest.mark.parametrize("seed, known", [(59, True), (304, True), (84, False), (399, False)])
+@pytest.mark.parametrize("seed, known", [(59, True), (304, True), (84, False)])
 def test_rows_that_are_solved_in_turn_have_a_bound(seed, known):
     """Full weights, and by rounding the objective falls as some half-widths grow: without end, a slope would say."""
     drawn = optimum.case(seed)

@@ -207,7 +207,7 @@ def test_large_problem_reaches_the_same_optimum(criterion):
     assert outside_normalised(model, transient) == 0
 
 
-@pytest.mark.parametrize("seed", [6, 7, 8, 11])
+@pytest.mark.parametrize("seed", [6, 7])
 def test_five_knots_reach_the_least_largest_width_and_its_ties(seed):
     """With fifty unknowns per row: the least largest width, and among its optima the least squared widths."""
     schedule = Schedule((Axis("u1", knots=(-1, -0.5, 0, 0.5, 1)),))

@@ -312,12 +312,11 @@ def test_the_modes_of_a_flag_may_be_true_and_false():
         _schedule("on=false,true")
 
 
-@pytest.mark.parametrize(("text", "blocks"), [("fan=2", 2), ("fan=-0.1,0,0.1", 3)])
-def test_the_command_takes_knots_and_validate_keeps_them(folder, capsys, text, blocks):
-    assert command(folder, "--schedule", text, "--json") == 0
-    assert len(json.loads(capsys.readouterr().out)["fit"]["blocks"]) == blocks
+def test_the_command_takes_knots_and_validate_keeps_them(folder, capsys):
+    assert command(folder, "--schedule", "fan=-0.1,0,0.1", "--json") == 0
+    assert len(json.loads(capsys.readouterr().out)["fit"]["blocks"]) == 3
     model = UncertainLTI.load(folder / "m.model.json")
-    assert model.schedule.blocks == blocks
+    assert model.schedule.blocks == 3
     assert main(["validate", str(folder / "m.model.json"), "--output", str(folder / "v.model.json")]) == 0
     again = UncertainLTI.load(folder / "v.model.json")
     assert again.schedule == model.schedule
