@@ -10,7 +10,7 @@
 """Do the intervals of validation contain the truth as often as they promise? Studies on simulated plants, seeded.
 
     ./run python benchmarks/validity.py                     # all studies with all their plants, some minutes
-    ./run python benchmarks/validity.py --plants 40         # as tests/test_validation.py has them
+    ./run python benchmarks/validity.py --plants 40         # fewer; tests/test_validation.py has eight or three
     ./run python benchmarks/validity.py --only recordings
     ./run python benchmarks/validity.py --only detectable --plants 100 --first 5000    # plants that nobody has seen
 

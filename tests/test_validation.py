@@ -379,7 +379,7 @@ def test_groups_that_are_likely_are_named_if_none_were_given(runs, hours, words)
 @pytest.mark.slow
 @pytest.mark.parametrize("study", list(validity.STUDIES))
 def test_intervals_contain_the_truth_as_often_as_they_say(study):
-    """The first plants of `benchmarks/validity.py`, which has 60: as few would fail by chance once in a hundred."""
+    """The first plants of `benchmarks/validity.py`, which has 200: as few would fail by chance once in a hundred."""
     held = validity.STUDIES[study](range(3 if study in validity.SLOW else 8))
     held = {what: hits for what, hits in held.items() if not what.startswith(validity.PART)}
     promised = [what for what in held if not what.startswith((validity.IN_VAIN, validity.NEITHER))]
