@@ -110,8 +110,7 @@ def run_over(model: Any, transient: Transient) -> Array:
 def free_run(model: Any, transient: Transient) -> Transient:
     """Free run of the nominal model over a recording: its controls, and nothing of its states but the first.
 
-    The run begins again from the recorded sample at the start of every segment, and after every sample that is not
-    finite. `simulate` does the same for arrays of normalised quantities.
+    The run begins again from the recorded sample at the start of every segment and after one that is not finite.
 
     Parameters
     ----------
@@ -135,10 +134,7 @@ def free_run(model: Any, transient: Transient) -> Transient:
 
 
 def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) -> tuple[float, Array]:
-    """Discrepancies (4) and (5) between the free-running nominal model and a recorded transient.
-
-    The run starts again from the recorded sample at the start of every segment, and after every sample that
-    is not finite.
+    """Discrepancies (4) and (5) between the free-running nominal model (`free_run`) and a recorded transient.
 
     Parameters
     ----------
