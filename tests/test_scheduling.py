@@ -256,6 +256,11 @@ def test_pieces_hold_transitions_of_the_recording_alone():
     at = [place[x.tobytes()] for x in steps.x]
     assert (steps.x_next == whole.x_next[at]).all() and (steps.u == whole.u[at]).all()
     assert max(at) > 19_000 and thinned([long], 30_000) == [long]
+    both = long.controls_at("both")
+    (some,) = thinned([both], 1000)
+    place = {x.tobytes(): k for k, x in enumerate(both.transitions().x)}
+    at = [place[x.tobytes()] for x in some.transitions().x]
+    assert some.ends == both.ends and (some.transitions().u == both.transitions().u[at]).all()
 
 
 def test_promise_is_largest_for_the_signal_that_bends_the_plant():

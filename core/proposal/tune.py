@@ -266,26 +266,7 @@ def _pieces(transient: Transient, share: float) -> Transient:
     keep = np.unique((starts[:, None] + np.arange(length + 2)).ravel())
     x = transient.x[keep]
     x[np.isin(keep, starts + length + 1)] = np.nan  # no transition from one piece to the next
-    names: dict[str, Any] = {}
-    if transient.signals is None:
-        names = {
-            "state_names": transient.state_names,
-            "control_names": transient.control_names,
-            "scheduling_names": transient.scheduling_names,
-        }
-    return Transient(
-        transient.t_ns[keep],
-        x,
-        transient.u[keep],
-        s=transient.s[keep],
-        name=transient.name,
-        signals=transient.signals,
-        max_gap=transient.max_gap,
-        min_step=transient.min_step,
-        step=transient.step or "recorded",
-        sources=transient.sources,
-        **names,
-    )
+    return transient.replace(keep, x=x)
 
 
 def promise(transients: Sequence[Transient]) -> dict[str, float]:

@@ -249,13 +249,13 @@ class Transient:
         changed.u.flags.writeable = False
         return changed
 
-    def replace(self, part: slice = slice(None), **changes: Any) -> Transient:
+    def replace(self, part: slice | NDArray[np.intp] = slice(None), **changes: Any) -> Transient:
         """The same run, or a part of it, with some constructor arguments replaced.
 
         Parameters
         ----------
-        part : slice, optional
-            Samples; a part has neither counters nor notes of its own. Default all.
+        part : slice or array of int, optional
+            Samples, in order; a part has neither counters nor notes of its own. Default all.
         **changes : object
             Constructor arguments by name; x and u with as many rows as the part.
 
@@ -276,7 +276,7 @@ class Transient:
                 )
             },
         }  # fmt: skip
-        if part == slice(None):
+        if isinstance(part, slice) and part == slice(None):
             arguments |= {"counters": self.counters, "notes": self.notes}
         arguments |= changes
         if changes.get("signals") is not None:  # it has the names
