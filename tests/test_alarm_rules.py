@@ -246,7 +246,8 @@ def test_two_of_three_verdicts_of_a_horizon_and_no_verdict_changes_nothing() -> 
     rows = np.array([inside, beyond, none, beyond, none, inside, inside, [0.0, 0.0, 1.6, np.nan], none])
     alarms = [window.push(0.1, True, row) for row in rows]
     assert alarms == [False, False, False, True, True, True, False, False, False]
-    again, _ = window.push_all(np.full(len(rows), 0.1), np.ones(len(rows), dtype=bool), rows[:, None])
+    again, dt = np.empty(len(rows), dtype=bool), np.full(len(rows), 0.1)
+    window.push_all(dt, np.ones(len(rows), dtype=bool), rows[:, None], again, np.empty((len(rows), 0)))
     assert again.tolist() == alarms
 
 
