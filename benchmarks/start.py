@@ -160,10 +160,11 @@ def watch(model: str, executor: str) -> None:
     received, judged = [], []
     take, judge = MatchedSubscription._take, Session.take
 
-    def noting(subscription: Any, data: bytes) -> None:
+    def noting(subscription: Any, *given: Any) -> None:
+        data, _ = given if len(given) == 2 else given[0]
         seconds, nanoseconds = (int.from_bytes(data[at : at + 4], "little") for at in (4, 8))
         received.append((time.monotonic(), subscription.topic, seconds * 10**9 + nanoseconds))
-        take(subscription, data)
+        take(subscription, *given)
 
     def judging(session: Any, *message: Any) -> Any:
         verdicts, opened = judge(session, *message)
