@@ -90,10 +90,6 @@ class DiskPartition:
                 s = table[self.p : first] if self.q else None
                 yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
 
-    def with_columns(self, columns: Columns) -> DiskPartition:
-        """The same transitions with other unknown terms."""
-        return replace(self, columns=columns)
-
 
 class CacheWriter:
     """Writes a `DiskPartition` from problems that come one after the other, each of which fits in memory.

@@ -287,11 +287,6 @@ def horizons_asked_for(
         raise FitError(str(error)) from None
 
 
-def is_auto(schedule: Schedule | Mapping[str, Knots]) -> bool:
-    """Whether the knots of some signal are to be chosen."""
-    return isinstance(schedule, Mapping) and any(_is_auto(knots) for knots in schedule.values())
-
-
 def _no_knots_named(signals: SignalMap | None, name: str) -> None:
     """Refuse a structure that names knots which are not chosen yet."""
     if signals is None or not isinstance(signals.structure, list):
