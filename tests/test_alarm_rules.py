@@ -241,13 +241,13 @@ def test_time_has_stepped_back_where_an_instant_is_not_after_the_one_before_the_
 
 
 def test_two_of_three_verdicts_of_a_horizon_and_no_verdict_changes_nothing() -> None:
-    window = AlarmWindow(AlarmRule(2, 3, margin=1.5, horizon=4), [2, 3])
+    window = AlarmWindow(AlarmRule(2, 3, margin=1.5, horizon=4), np.array([True, True]), 1)
     inside, beyond, none = ([9.0, 9.0, -1.5, 1.5], [0.0, 0.0, 0.0, -1.6], [9.0, 9.0, np.nan, np.nan])
     rows = np.array([inside, beyond, none, beyond, none, inside, inside, [0.0, 0.0, 1.6, np.nan], none])
     alarms = [window.push(0.1, True, row) for row in rows]
     assert alarms == [False, False, False, True, True, True, False, False, False]
-    again, dt = np.empty(len(rows), dtype=bool), np.full(len(rows), 0.1)
-    window.push_all(dt, np.ones(len(rows), dtype=bool), rows[:, None], again, np.empty((len(rows), 0)))
+    again, dt, every = np.empty(len(rows), dtype=bool), np.full(len(rows), 0.1), np.ones(len(rows), dtype=bool)
+    window.push_all(dt, every, [rows[:, :2], rows[:, 2:]], every, again, np.empty((len(rows), 0)))
     assert again.tolist() == alarms
 
 

@@ -189,6 +189,7 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
     with pytest.raises(ValueError, match="fit"):
         arithmetic.Judge(one, one, two, point[0][:1], *point[1:], 1.0, np.array([True, True]))
     judge = arithmetic.Judge(one, one, two, *point, 1.0, np.array([True, True]))
+    samples = np.zeros((4, 2)), np.zeros((4, 1)), np.zeros((4, 0))
     for before, after in (([0.0], [0.0, 0.0]), ([0.0] * 3, [0.0]), ([], [])):
         with pytest.raises(ValueError, match="values for"):
             judge.judge(before, after, 0.1)
@@ -197,4 +198,7 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
     with pytest.raises(ValueError, match="fit"):
         arithmetic.centre_and_half((one, one, two), np.zeros((3, 5)), np.zeros(4), np.zeros((2, 5)), np.zeros((2, 5)))
     with pytest.raises(ValueError, match="fit"):
-        arithmetic.judged(np.zeros((2, 5)), np.zeros((2, 4)), np.zeros((2, 5)), 1.0)
+        judge.judge_rows(*samples, [0], [0.1], 0, np.empty((5, 3, 3)), np.empty(4, np.uint8))
+    for k in ([-1], [4]):
+        with pytest.raises(ValueError, match="fit the recording"):
+            judge.judge_rows(*samples, k, [0.1], 0, np.empty((5, 4, 2)), np.empty(4, np.uint8))

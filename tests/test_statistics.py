@@ -103,6 +103,12 @@ def test_one_at_a_time_and_all_at_once_are_the_same_bits(kind: str) -> None:
         assert every.push(dt[k], array("d", [7.0, *rows[k]])) == alarm[k]
         assert np.array(one.values()).tobytes() == np.array(every.values()).tobytes() == values[k].tobytes()
     assert np.isfinite(values[1:]).all()
+    judged = np.arange(500) % 7 != 3
+    without = statistic(kind, 0.1).push_all(dt, rows, judged)
+    some = statistic(kind, 0.1).push_all(dt[judged], rows[judged])
+    assert without[1][judged].tobytes() == some[1].tobytes() and np.isnan(without[1][~judged]).all()
+    held = np.concatenate([[False], some[0]])[np.cumsum(judged)]  # without a verdict the alarm stays
+    assert np.array_equal(without[0], held)
 
 
 def test_several_take_their_parts_of_one_table_and_refuse_one_that_is_too_short() -> None:

@@ -18,6 +18,12 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 
+JUDGED: int
+LEFT: int
+VIOLATION: int
+OUTSIDE: int
+UNKNOWN: int
+UNLISTED: int
 LOWER: int
 UPPER: int
 RESIDUAL: int
@@ -61,6 +67,17 @@ class Judge:
         known: Any = None,
     ) -> None: ...
     def judge(self, before: Sequence[float], after: Sequence[float], dt: float) -> Judgement | None: ...
+    def judge_rows(
+        self,
+        x: Array,
+        u: Array,
+        s: Array,
+        k: NDArray[np.intp],
+        dt: Array,
+        first: int,
+        numbers: Array,
+        marks: NDArray[np.uint8],
+    ) -> None: ...
     def advance(
         self, x: Array, time: Array, control: Array, z: Array, dt: Array, begin: Any, a: int, b: int
     ) -> None: ...
@@ -89,7 +106,12 @@ class Statistic:
     def reset(self) -> None: ...
     def values(self) -> array[float]: ...
     def push_all(
-        self, dt: Any, rows: Any, raised: NDArray[np.bool_] | None = None, found: Array | None = None
+        self,
+        dt: Any,
+        rows: Any,
+        judged: NDArray[np.bool_] | None = None,
+        raised: NDArray[np.bool_] | None = None,
+        found: Array | None = None,
     ) -> tuple[NDArray[np.bool_], Array]: ...
 
 class Statistics:
@@ -113,7 +135,6 @@ def edges(centre: Array, half: Array, margin: float) -> tuple[Array, Array]: ...
 def utilisations(difference: Array, half: Array) -> Array: ...
 def settled(utilisation: Array, inside: NDArray[np.bool_]) -> Array: ...
 def arrivals(x: Array, centre: Array, half: Array) -> tuple[Array, Array]: ...
-def judged(x: Array, centre: Array, half: Array, margin: float) -> Array: ...
 def pair_count(size: int) -> int: ...
 def outside_domain(z: Array, least: Any, greatest: Any, occupied: Any = None) -> NDArray[np.bool_]: ...
 def occupy(z: Array, least: Array, greatest: Array, occupied: NDArray[np.bool_]) -> None: ...

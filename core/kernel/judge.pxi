@@ -11,6 +11,16 @@
 
 LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION = range(5)
 """What a `Judgement` holds of each state."""
+JUDGED, LEFT, VIOLATION, OUTSIDE, UNKNOWN, UNLISTED = 1, 2, 4, 8, 16, 32
+"""Bits of what is said of a transition: there is a verdict; some state left its bounds; one that counts did; it leaves
+the fitted domain; its regime is unknown; its mode is not listed, so that there is no verdict."""
+cdef enum:
+    _JUDGED = 1
+    _LEFT = 2
+    _VIOLATION = 4
+    _OUTSIDE = 8
+    _UNKNOWN = 16
+    _UNLISTED = 32
 
 
 @cython.final
@@ -54,6 +64,7 @@ cdef class Judge:
     cdef const double* per_unit
     cdef double* phi  # [x; u; 1] of the last transition, and
     cdef double* z  # [x; u; s] of it
+    cdef double* end  # arrival, normalised
     cdef double* rates  # (n, _TOGETHER)
     cdef const unsigned char* counted
     cdef const unsigned char* occupied
@@ -88,7 +99,7 @@ cdef class Judge:
         cdef arrays.array numbers = doubles(
             np.concatenate([steady, scale, least, greatest, cells_per_unit(least, greatest, self.cells)])
         )
-        cdef arrays.array room = doubles(np.ones(p + self.total + n * _TOGETHER))  # beyond z the regressors are 1
+        cdef arrays.array room = doubles(np.ones(p + self.total + n + n * _TOGETHER))  # beyond z the regressors are 1
         cdef arrays.array place = array("i", bytes(4 * (size or 1)))
         cdef bytes flags = np.asarray(counted, dtype=np.uint8).tobytes()
         cdef bytes cells = b"" if occupied is None else np.ascontiguousarray(occupied, dtype=np.uint8).tobytes()
@@ -97,7 +108,8 @@ cdef class Judge:
         self.scale, self.least = self.steady + self.total, self.steady + 2 * self.total
         self.greatest, self.per_unit = self.least + size, self.least + 2 * size
         self.phi = room.data.as_doubles
-        self.z, self.rates = self.phi + p, self.phi + p + self.total
+        self.z, self.end = self.phi + p, self.phi + p + self.total
+        self.rates = self.end + n
         self.place, self.counted, self.occupied = place.data.as_ints, flags, cells
         for i, position in enumerate(positions):
             self.positions[i] = position
@@ -111,28 +123,89 @@ cdef class Judge:
         if regime < 0:
             return None
         cdef Judgement found = Judgement.__new__(Judgement)
-        cdef arrays.array kept = arrays.clone(array_of_doubles, 5 * n, False)
-        cdef double* values = kept.data.as_doubles
-        cdef Elements elements = self.elements
-        cdef double x_next, centre, half, lower, upper
-        cdef bint inside
-        found._values, found.contained, found.unknown_regime = kept, True, regime > 0
-        found.outside_domain = regime > 0 or self.left_domain()
-        elements.sum(self.phi, self.places, self.weights, self.blocks.corners)
+        found._values = arrays.clone(array_of_doubles, 5 * n, False)
         for i in range(n):
-            x_next = normalised(after[i], self.steady[i], self.scale[i])
-            centre = centre_of(self.phi[i], dt, elements.rate[i])
-            half = half_of(dt, elements.spread[i], elements.still[i])
-            lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
-            inside = is_contained(lower, x_next, upper)
-            found.contained &= inside
-            found.violation |= not inside and self.counted[i] != 0
-            values[i] = recorded(lower, self.steady[i], self.scale[i])
-            values[n + i] = recorded(upper, self.steady[i], self.scale[i])
-            values[2 * n + i] = x_next - centre
-            values[3 * n + i] = not inside
-            values[4 * n + i] = utilisation_of(x_next - centre, half)
+            self.end[i] = normalised(after[i], self.steady[i], self.scale[i])
+        cdef int marks = self.compare(dt, regime, found._values.data.as_doubles, n)
+        found.contained, found.violation = not marks & _LEFT, (marks & _VIOLATION) != 0
+        found.outside_domain, found.unknown_regime = (marks & _OUTSIDE) != 0, (marks & _UNKNOWN) != 0
         return found
+
+    def judge_rows(self, x, u, s, k, dt, Py_ssize_t first, numbers, marks):
+        """Judge the transitions that arrive at rows `first` and on of a recording.
+
+        `x, u, s`: states, controls and further scheduling signals of its samples, recorded units; `k` (K,): samples
+        that the transitions begin with, increasing; `dt` (K,): s; `numbers` (5, rows, n): takes what a `Judgement`
+        holds, NaN without a transition; `marks` (rows,): takes the bits above.
+        """
+        cdef const double[:, :] states = x
+        cdef const double[:, :] controls = u
+        cdef const double[:, :] others = s
+        cdef const Py_ssize_t[::1] begins = np.ascontiguousarray(k, dtype=np.intp)
+        cdef const double[::1] steps = np.ascontiguousarray(dt, dtype=np.float64)
+        cdef double[:, :, :] values = numbers
+        cdef unsigned char[:] flags = marks
+        cdef Py_ssize_t i, j, at, row, n = self.n, m = self.size - self.n, count = flags.shape[0], begin = 0
+        cdef Py_ssize_t samples = states.shape[0]
+        fits = states.shape[1] == n and controls.shape[1] == m and others.shape[1] == self.total - self.size
+        fits = fits and controls.shape[0] == others.shape[0] == samples >= first + count and first >= 0
+        rows = values.shape[0] == 5 and values.shape[1] == count and values.shape[2] == n and values.strides[2] == 8
+        if not (fits and rows and begins.shape[0] == steps.shape[0]):
+            raise ValueError("the transitions do not fit the model")
+        if len(begins) and (begins[0] < 0 or begins[len(begins) - 1] >= samples):
+            raise ValueError("the transitions do not fit the recording")
+        cdef Py_ssize_t apart = values.strides[0] // 8 if count else 0
+        cdef int regime
+        with nogil:
+            for row in range(count):
+                at = first + row - 1
+                while begin < begins.shape[0] and begins[begin] < at:
+                    begin += 1
+                flags[row], regime = 0, -1
+                if begin < begins.shape[0] and begins[begin] == at:
+                    for i in range(n):
+                        self.z[i] = normalised(states[at, i], self.steady[i], self.scale[i])
+                    for i in range(n, self.size):
+                        self.z[i] = normalised(controls[at, i - n], self.steady[i], self.scale[i])
+                    for i in range(self.size, self.total):
+                        self.z[i] = normalised(others[at, i - self.size], self.steady[i], self.scale[i])
+                    regime = self.take(self.z, 1)
+                    if regime < 0:
+                        flags[row] = _UNLISTED
+                if regime < 0:
+                    for j in range(5):
+                        for i in range(n):
+                            values[j, row, i] = NAN
+                    continue
+                for i in range(n):
+                    self.end[i] = normalised(states[at + 1, i], self.steady[i], self.scale[i])
+                flags[row] = self.compare(steps[begin], regime, &values[0, row, 0], apart)
+
+    cdef int compare(self, double dt, int regime, double* values, Py_ssize_t apart) noexcept nogil:
+        """Compare the arrival `end` with the bounds of the transition that was taken; one kind of number after another.
+        """
+        cdef Py_ssize_t i
+        cdef double centre, half, lower, upper
+        cdef int marks = _JUDGED | (_UNKNOWN if regime > 0 else 0)
+        if regime > 0 or self.left_domain():
+            marks |= _OUTSIDE
+        self.elements.sum(self.phi, self.places, self.weights, self.blocks.corners)
+        cdef const double* rate = self.elements.rate
+        cdef const double* spread = self.elements.spread
+        cdef const double* still = self.elements.still
+        for i in range(self.n):
+            centre = centre_of(self.phi[i], dt, rate[i])
+            half = half_of(dt, spread[i], still[i])
+            lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
+            values[i] = recorded(lower, self.steady[i], self.scale[i])
+            values[apart + i] = recorded(upper, self.steady[i], self.scale[i])
+            values[2 * apart + i] = self.end[i] - centre
+            values[3 * apart + i] = 0.0
+            values[4 * apart + i] = utilisation_of(self.end[i] - centre, half)
+            if not is_contained(lower, self.end[i], upper):
+                values[3 * apart + i] = 1.0
+                marks |= _LEFT | (_VIOLATION if self.counted[i] else 0)
+        return marks
 
     cdef int read(self, before) except -2:
         """Normalise [x; u; s] and find the blocks that hold there: -1 for no mode that is listed, 1 if unknown."""

@@ -181,25 +181,3 @@ def occupy(z, least, greatest, occupied):
                     flags[pair, at[i], at[j]] = 1
                     pair += 1
 
-
-def judged(x, centre, half, double margin):
-    """What a `Judgement` holds (5, n, K), with normalised bounds, of K samples by their centre and half-width (n, K)."""
-    cdef const double[:, :] there = x
-    cdef const double[:, :] middle = centre
-    cdef const double[:, :] width = half
-    found = np.empty((5, *x.shape))
-    cdef double[:, :, ::1] numbers = found
-    cdef Py_ssize_t i, k
-    cdef double lower, upper
-    if not x.shape == centre.shape == half.shape:
-        raise ValueError("the samples do not fit the bounds")
-    with nogil:
-        for i in range(there.shape[0]):
-            for k in range(there.shape[1]):
-                lower = lower_of(middle[i, k], width[i, k], margin)
-                upper = upper_of(middle[i, k], width[i, k], margin)
-                numbers[0, i, k], numbers[1, i, k] = lower, upper
-                numbers[2, i, k] = there[i, k] - middle[i, k]
-                numbers[3, i, k] = not is_contained(lower, there[i, k], upper)
-                numbers[4, i, k] = utilisation_of(numbers[2, i, k], width[i, k])
-    return found

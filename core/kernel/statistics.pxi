@@ -47,11 +47,12 @@ cdef class Statistic:
     cdef const unsigned char* counted
     cdef const double* mean
     cdef const double* whitening
-    cdef double* terms  # what this verdict adds; of mewma the uncorrelated components
-    cdef double* now  # the statistic over its threshold
+    cdef double* now  # (size,): the statistic over its threshold
     cdef double* up  # sum of the newer half; moving average; sum upwards
-    cdef double* down  # the same downwards; of chi2 and mewma this verdict less the mean
-    cdef long long* given  # whether this verdict has a number of it
+    cdef double* down  # the same downwards
+    cdef double* terms  # (n, _TOGETHER): what each of some verdicts adds, NaN for nothing
+    cdef double* after  # (size, _TOGETHER): the statistic after each of them, over its threshold
+    cdef long long* step_ns  # (_TOGETHER,): step of each of them
     cdef long long* begin  # of the window of each state in its part of the queue
     cdef long long* middle  # of its newer half
     cdef long long* end
@@ -76,15 +77,17 @@ cdef class Statistic:
         self.window, self.window_ns, self.allowance = window_s, round(window_s * 1e9), allowance
         cdef arrays.array given = doubles([float(threshold) for threshold in thresholds])
         cdef arrays.array law = doubles(np.concatenate([mean, np.reshape(whitening, -1)]) if joint else [])
-        cdef arrays.array room = doubles(np.zeros(4 * n)), places = array("q", bytes(8 * 5 * n))
+        cdef arrays.array room = doubles(np.zeros(3 * n + 2 * n * _TOGETHER))
+        cdef arrays.array places = array("q", bytes(8 * (4 * n + _TOGETHER)))
         cdef bytes flags = bytes([1]) if joint else bytes(map(bool, counted))
         self._keep = [given, law, room, places, flags]
         self.thresholds, self.counted, self.mean = given.data.as_doubles, flags, law.data.as_doubles
-        self.whitening, self.terms = self.mean + n, room.data.as_doubles
-        self.now, self.up, self.down = self.terms + n, self.terms + 2 * n, self.terms + 3 * n
-        self.given = places.data.as_longlongs
-        self.begin, self.middle = self.given + n, self.given + 2 * n
-        self.end, self.total = self.given + 3 * n, self.given + 4 * n
+        self.whitening, self.now = self.mean + n, room.data.as_doubles
+        self.up, self.down, self.terms = self.now + n, self.now + 2 * n, self.now + 3 * n
+        self.after = self.terms + n * _TOGETHER
+        self.begin = places.data.as_longlongs
+        self.middle, self.end, self.total = self.begin + n, self.begin + 2 * n, self.begin + 3 * n
+        self.step_ns = self.begin + 4 * n
         self.capacity = 64
         self.hold(array("d", bytes(8 * size * 64)), array("q", bytes(8 * size * 64)))
         self.reset()
@@ -114,148 +117,185 @@ cdef class Statistic:
             found.data.as_doubles[i] = self.now[i]
         return found
 
-    def push_all(self, dt, rows, raised=None, found=None):
+    def push_all(self, dt, rows, judged=None, raised=None, found=None):
         """Take many verdicts.
 
         `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. NaN
-        is no verdict on that state, and changes nothing of it, nor of any state if all are seen together; Returns (K,):
-        the alarm after each; Returns (K, n): `values` after each; both in `raised` and `found` where these are given.
+        is no verdict on that state, and changes nothing of it, nor of any state if all are seen together; `judged`
+        (K,): where there is a verdict, default everywhere. Returns (K,): the alarm after each; Returns (K, size):
+        `values` after each, NaN without a verdict; both in `raised` and `found` where these are given.
         """
-        cdef Py_ssize_t i, k, count = len(dt)
+        cdef Py_ssize_t k, count = len(dt)
         rows = np.asarray(rows, dtype=np.float64)
         if rows.shape != (count, self.n):
             raise ValueError("the numbers of the verdicts do not fit the states")
-        if rows.strides[1] != 8:
+        if rows.strides[1] != 8 or rows.strides[0] % 8:
             rows = np.ascontiguousarray(rows)
         cdef const double[:, :] table = rows  # a row of numbers, however far from the next
         cdef const double[::1] times = np.ascontiguousarray(dt, dtype=np.float64)
+        cdef const unsigned char[::1] given = np.ascontiguousarray(
+            np.ones(count, dtype=bool) if judged is None else judged
+        ).view(np.uint8)
         raised = np.empty(count, dtype=bool) if raised is None else raised
         found = np.empty((count, self.size)) if found is None else found
         cdef double[:, :] values = found
         cdef unsigned char[:] alarm = raised.view(np.uint8)
-        if not (alarm.shape[0] == values.shape[0] == times.shape[0] == count and values.shape[1] == self.size):
+        fits = alarm.shape[0] == values.shape[0] == times.shape[0] == given.shape[0] == count
+        if not fits or values.shape[1] != self.size:
             raise ValueError("the numbers of the verdicts do not fit the states")
+        cdef Py_ssize_t i, q, many, apart = table.strides[0] // 8
         with nogil:
-            for k in range(count):
-                self.push(times[k], &table[k, 0])
-                alarm[k] = self.alarm
-                for i in range(self.size):
-                    values[k, i] = self.now[i]
+            for k from 0 <= k < count by _TOGETHER:
+                many = count - k if count - k < _TOGETHER else _TOGETHER
+                self.push(&times[k], &table[k, 0], apart, &given[k], many)
+                for q in range(many):
+                    for i in range(self.size):
+                        values[k + q, i] = self.after[i * _TOGETHER + q] if given[k + q] else NAN
+                    alarm[k + q] = self.raises(q)
         return raised, found
 
-    cdef int push(self, double dt, const double* row) except -1 nogil:
-        """Take one verdict."""
-        cdef Py_ssize_t i
-        cdef double value, weight, kept, down
-        if not self.take(row):
-            return 0
-        if self.kind == _EWMA:
-            weight = dt / (self.window + dt)
-            for i in range(self.size):
-                if not self.given[i]:
-                    continue
-                self.up[i] += (self.terms[i] - self.up[i]) * weight
-                self.now[i] = self.up[i] / self.thresholds[i]
-        elif self.kind == _CUSUM:
-            weight = dt / self.window
-            kept = self.window / (self.window + dt)
-            for i in range(self.size):
-                if not self.given[i]:
-                    continue
-                value = self.up[i] * kept + (self.terms[i] - self.allowance) * weight
-                down = self.down[i] * kept + (-self.terms[i] - self.allowance) * weight
-                self.up[i] = value = value if value > 0.0 else 0.0
-                self.down[i] = down = down if down > 0.0 else 0.0
-                self.now[i] = (value if value >= down else -down) / self.thresholds[i]
-        elif self.kind == _MEWMA:
-            weight = dt / (self.window + dt)
-            kept = 1.0 - weight
-            if self.spread == 0.0:
-                self.spread = weight / (2.0 - weight)
+    cdef int push(
+        self, const double* dt, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count
+    ) except -1 nogil:
+        """Take some verdicts, of which `after` holds the statistic; `raises` then takes one after the other."""
+        cdef Py_ssize_t i, q
+        for q in range(count):
+            self.step_ns[q] = <long long>(dt[q] * 1e9 + 0.5)
+            if given[q]:
+                self.take(rows + q * apart, self.terms + q)
             else:
-                self.spread = kept * kept * self.spread + weight * weight
-            value = 0.0
-            for i in range(self.n):
-                self.up[i] += (self.terms[i] - self.up[i]) * weight
-                value += self.up[i] * self.up[i]
-            self.now[0] = value / self.spread / self.thresholds[0]
-        else:
-            for i in range(self.size):
-                if not self.given[i]:
-                    continue
-                self.move(i, dt)
-                weight = self.window if self.total[i] <= self.window_ns else dt
-                value = self.up[i]
-                if self.begin[i] < self.middle[i]:
-                    value = self.queue[i * self.capacity + self.begin[i]] + value
-                self.now[i] = value / weight / self.thresholds[i]
-        self.alarm = False
+                for i in range(self.n):
+                    self.terms[i * _TOGETHER + q] = NAN
+        if self.kind == _MEWMA:
+            self.average_together(dt, count)
         for i in range(self.size):
-            if self.counted[i] and (self.now[i] > 1.0 or self.now[i] < -1.0):
-                self.alarm = True
+            if self.kind == _EWMA or self.kind == _CUSUM:
+                self.average(i, dt, count)
+            elif self.kind != _MEWMA:
+                self.slide(i, dt, count)
         return 0
 
-    cdef bint take(self, const double* row) noexcept nogil:
-        """What the verdict adds, to `terms`, for the states that are `given`; false if there is none."""
+    cdef bint raises(self, Py_ssize_t q) noexcept nogil:
+        """The alarm after verdict q; without a number it stays as it was."""
+        cdef Py_ssize_t i
+        cdef double value
+        cdef bint over = False, there = False
+        for i in range(self.size):
+            value = self.after[i * _TOGETHER + q]
+            there |= self.terms[i * _TOGETHER + q] == self.terms[i * _TOGETHER + q]
+            over |= (self.counted[i] != 0) & ((value > 1.0) | (value < -1.0))
+        if there:
+            self.alarm = over
+        return self.alarm
+
+    cdef void take(self, const double* row, double* terms) noexcept nogil:
+        """What a verdict adds of each state, `_TOGETHER` apart; NaN where it adds nothing."""
         cdef Py_ssize_t i, j, n = self.n
         cdef double value, total, limit, square = 0.0
-        cdef bint there = False
         if self.kind == _CHI2 or self.kind == _MEWMA:
             for i in range(n):
                 value = row[i]
                 if value != value:
-                    return False
-                value = _MOST if value > _MOST else -_MOST if value < -_MOST else value  # infinite where half is 0
-                self.down[i] = value - self.mean[i]
+                    terms[0] = NAN
+                    return
+            for i in range(n):
                 total = 0.0
                 for j in range(i + 1):
-                    total += self.whitening[i * n + j] * self.down[j]
+                    value = row[j]  # infinite where half is 0
+                    value = _MOST if value > _MOST else -_MOST if value < -_MOST else value
+                    total += self.whitening[i * n + j] * (value - self.mean[j])
                 if self.kind == _MEWMA:
-                    self.terms[i] = -_LIMIT if total < -_LIMIT else total if total <= _LIMIT else _LIMIT
+                    terms[i * _TOGETHER] = -_LIMIT if total < -_LIMIT else total if total <= _LIMIT else _LIMIT
                 square += total * total
             if self.kind == _CHI2:
-                self.terms[0] = square if square <= _MOST else _MOST
-            self.given[0] = True
-            return True
+                terms[0] = square if square <= _MOST else _MOST
+            return
         limit = _LIMIT if self.kind == _EWMA or self.kind == _CUSUM else _MOST
         for i in range(n):
             value = row[i]
-            self.given[i] = value == value
-            there |= value == value
             value = limit if value > limit else -limit if value < -limit else value
-            self.terms[i] = value * value if self.kind == _ENERGY else value
-        return there
+            terms[i * _TOGETHER] = value * value if self.kind == _ENERGY else value
 
-    cdef int move(self, Py_ssize_t i, double dt) except -1 nogil:
-        """Add the term of a state to its window, and drop what is older than it."""
-        cdef Py_ssize_t k
-        if self.end[i] == self.capacity:
+    cdef void average(self, Py_ssize_t i, const double* dt, Py_ssize_t count) noexcept nogil:
+        """Moving average of a state, or its sums upwards and downwards, after each of some verdicts."""
+        cdef Py_ssize_t q
+        cdef double weight, kept, value, down
+        for q in range(count):
+            value = self.terms[i * _TOGETHER + q]
+            if value != value:
+                pass
+            elif self.kind == _EWMA:
+                self.up[i] += (value - self.up[i]) * (dt[q] / (self.window + dt[q]))
+                self.now[i] = self.up[i] / self.thresholds[i]
+            else:
+                weight = dt[q] / self.window
+                kept = self.window / (self.window + dt[q])
+                down = self.down[i] * kept + (-value - self.allowance) * weight
+                value = self.up[i] * kept + (value - self.allowance) * weight
+                self.up[i] = value = value if value > 0.0 else 0.0
+                self.down[i] = down = down if down > 0.0 else 0.0
+                self.now[i] = (value if value >= down else -down) / self.thresholds[i]
+            self.after[i * _TOGETHER + q] = self.now[i]
+
+    cdef void average_together(self, const double* dt, Py_ssize_t count) noexcept nogil:
+        """Size of the moving average of all states after each of some verdicts."""
+        cdef Py_ssize_t i, q
+        cdef double weight, kept, value
+        for q in range(count):
+            if self.terms[q] == self.terms[q]:
+                weight = dt[q] / (self.window + dt[q])
+                kept = 1.0 - weight
+                if self.spread == 0.0:
+                    self.spread = weight / (2.0 - weight)
+                else:
+                    self.spread = kept * kept * self.spread + weight * weight
+                value = 0.0
+                for i in range(self.n):
+                    self.up[i] += (self.terms[i * _TOGETHER + q] - self.up[i]) * weight
+                    value += self.up[i] * self.up[i]
+                self.now[0] = value / self.spread / self.thresholds[0]
+            self.after[q] = self.now[0]
+
+    cdef int slide(self, Py_ssize_t i, const double* dt, Py_ssize_t count) except -1 nogil:
+        """Sum over the window of a state after each of some verdicts: add its term, and drop what is older."""
+        if self.end[i] + count > self.capacity:
             with gil:
-                self.make_room(i)
+                self.make_room(i, count)
+        cdef Py_ssize_t k, q, begin = self.begin[i], middle = self.middle[i], end = self.end[i]
+        cdef long long total = self.total[i], most = self.window_ns
+        cdef double up = self.up[i], now = self.now[i], threshold = self.thresholds[i], value
         cdef double* queue = self.queue + i * self.capacity
         cdef long long* steps = self.steps + i * self.capacity
-        cdef Py_ssize_t end = self.end[i]
-        queue[end] = self.terms[i] * dt
-        steps[end] = <long long>(dt * 1e9 + 0.5)
-        self.up[i] += queue[end]
-        self.total[i] += steps[end]
-        self.end[i] = end = end + 1
-        while end - self.begin[i] > 1 and (self.total[i] > self.window_ns or end - self.begin[i] > _LONGEST):
-            if self.begin[i] == self.middle[i]:  # the newer half becomes the older one
-                for k in range(end - 2, self.begin[i] - 1, -1):
-                    queue[k] += queue[k + 1]
-                self.middle[i] = end
-                self.up[i] = 0.0
-            self.total[i] -= steps[self.begin[i]]
-            self.begin[i] += 1
+        for q in range(count):
+            value = self.terms[i * _TOGETHER + q]
+            if value == value:
+                value *= dt[q]
+                queue[end], steps[end] = value, self.step_ns[q]
+                up += value
+                total += self.step_ns[q]
+                end += 1
+                while end - begin > 1 and (total > most or end - begin > _LONGEST):
+                    if begin == middle:  # the newer half becomes the older one
+                        for k in range(end - 2, begin - 1, -1):
+                            queue[k] += queue[k + 1]
+                        middle = end
+                        up = 0.0
+                    total -= steps[begin]
+                    begin += 1
+                value = queue[begin] + up if begin < middle else up
+                now = value / (self.window if total <= most else dt[q]) / threshold
+            self.after[i * _TOGETHER + q] = now
+        self.begin[i], self.middle[i], self.end[i], self.total[i] = begin, middle, end, total
+        self.up[i], self.now[i] = up, now
         return 0
 
-    cdef make_room(self, Py_ssize_t i):
-        """Move the window of a state to the front of its part of the queue; if it fills half, double all first."""
+    cdef make_room(self, Py_ssize_t i, Py_ssize_t more):
+        """Move the window of a state to the front of its part of the queue; if half is not enough, double all first."""
         cdef Py_ssize_t j, k, begin = self.begin[i], count = self.end[i] - self.begin[i], before = self.capacity
         cdef arrays.array queue = self._queue, steps = self._steps
-        if 2 * count > before:
+        while 2 * (count + more) > self.capacity:
             self.capacity *= 2
+        if self.capacity > before:
             self.hold(
                 arrays.clone(queue, self.size * self.capacity, True),
                 arrays.clone(steps, self.size * self.capacity, True),
@@ -289,11 +329,12 @@ cdef class Statistics:
         cdef Statistic part
         cdef Py_ssize_t begin
         cdef bint raised = False
+        cdef unsigned char given = True
         for part, begin in zip(self.parts, self.begins):
             if begin < 0 or begin + part.n > row.shape[0]:
                 raise ValueError("the numbers of the verdict do not fit the states")
-            part.push(dt, &row[begin])
-            raised |= part.alarm
+            part.push(&dt, &row[begin], part.n, &given, 1)
+            raised |= part.raises(0)
         return raised
 
     def values(self):

@@ -206,17 +206,16 @@ def _over(size: float, half: float) -> float:
 
 
 def walk(
-    model: Any, t_ns: NDArray[np.int64], steps: Any, z: Array, lower: Array, upper: Array
+    model: Any, t_ns: NDArray[np.int64], steps: Any, lower: Array, upper: Array
 ) -> Iterator[tuple[int, bool, Transition]]:
     """Transitions in which some state repeats, and those right after: where each begins, and whether it follows on.
 
-    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `z` (n + m + q, K): normalised; `lower, upper` (K, n):
-    bounds, recorded units.
+    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `lower, upper` (K, n): bounds, recorded units.
     """
-    repeats = np.asarray((steps.x == steps.x_next).any(axis=1))
+    repeats = changes(steps.transient.x, steps.k)[0]
     follows = np.concatenate([[False], np.diff(steps.k) == 1])[: len(steps.k)]
     rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
-    z = z[:, rows]
+    z = model.normalised_columns(steps.take(rows))
     outside = model.domain.beyond(z) | model.regime(z)[1]
     given = steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[rows], upper[rows], model.own_rates(z).T, outside
     on = np.append(False, np.diff(steps.k[rows]) == 1) if len(rows) else rows
@@ -259,7 +258,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
         model.columns_centre_and_half(z, steps.dt, centre, half)
         lower, upper = (point.recorded_x(bound.T) for bound in edges(centre, half, 1.0))
     follow = Repeating(model.n)
-    for _, follows, step in walk(model, transient.t_ns, steps, z, lower, upper):
+    for _, follows, step in walk(model, transient.t_ns, steps, lower, upper):
         if not follows:
             follow.forget()
         for moved in follow.push(step):

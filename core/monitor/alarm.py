@@ -77,16 +77,16 @@ class Nearest(NamedTuple):
 class AlarmWindow:
     """Containment: the last verdicts and the alarm that they raise, one verdict after another.
 
-    `rule`: m, n; for a horizon of several steps its margin, too; `places`: for such a horizon, where the utilisation of
-    each state that counts is in the table; `rule`: as given; `alarm`: `violations` of the last `window` verdicts are
-    violations.
+    `rule`: m, n; for a horizon of several steps its margin, too; `counted` (n,): states that count; `row`: of the table
+    that it looks at, 0 for none; `alarm`: `violations` of the last `window` verdicts are violations.
     """
 
-    __slots__ = ("_margin", "_needed", "_places", "_recent", "_violations", "alarm", "rule")
+    __slots__ = ("_margin", "_needed", "_places", "_recent", "_row", "_states", "_violations", "alarm", "rule")
 
-    def __init__(self, rule: AlarmRule, places: Sequence[int] = ()) -> None:
+    def __init__(self, rule: AlarmRule, counted: NDArray[np.bool_], row: int = 0) -> None:
         self.rule: Rule = rule
-        self._needed, self._margin, self._places = rule.violations, rule.margin, array("q", places)
+        self._needed, self._margin, self._row, self._states = rule.violations, rule.margin, row, np.flatnonzero(counted)
+        self._places = array("q", (row * len(counted) + self._states).tolist() if row else ())
         self._recent: deque[bool] = deque(maxlen=rule.window)
         self.reset()
 
@@ -117,20 +117,16 @@ class AlarmWindow:
         return self.alarm
 
     def push_all(
-        self, dt: Array, violated: NDArray[np.bool_], table: Array, after: NDArray[np.bool_], values: Array
-    ) -> None:
-        """After each of many verdicts what `Alarm.push` gives, from a cleared alarm.
-
-        `dt` (K,): steps, s; `violated` (K,): as for `push`; `table` (K, rows, n): as of `Alarm.push`; `after`
-        (K,): takes the alarm after each; `values` (K, 0): takes nothing.
-        """
+        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Array], judged: NDArray[np.bool_],
+        after: NDArray[np.bool_], values: Array,
+    ) -> None:  # fmt: skip
+        """As `Alarm.over`, from a cleared alarm; `after` (K,) takes the alarm after each, `values` (K, 0) nothing."""
         assert isinstance(self.rule, AlarmRule)
-        given: NDArray[np.bool_] = np.ones(len(violated), dtype=bool)
         if self._places:
-            sizes = np.abs(table.reshape(len(table), table.shape[1] * table.shape[2])[:, self._places])
-            given = np.asarray(~np.isnan(sizes).all(axis=1))
+            sizes = np.abs(rows[self._row][:, self._states])
+            judged = np.asarray(judged & ~np.isnan(sizes).all(axis=1))
             violated = np.asarray((sizes > self._margin).any(axis=1))
-        after[:] = np.concatenate([[False], raised(violated[given], self.rule)])[np.cumsum(given)]
+        after[:] = np.concatenate([[False], raised(violated[judged], self.rule)])[np.cumsum(judged)]
 
     def values(self) -> Any:
         """None: it has no statistic."""
@@ -170,14 +166,11 @@ class AlarmOverThreshold:
         self.statistic.reset()
 
     def push_all(
-        self, dt: Array, violated: NDArray[np.bool_], table: Array, after: NDArray[np.bool_], values: Array
-    ) -> None:
-        """After each of many verdicts what `Alarm.push` gives.
-
-        `dt` (K,): steps, s; `violated` (K,): not looked at; `table` (K, rows, n): as of `Alarm.push`; `after`
-        (K,): takes the alarm after each; `values` (K, n): takes `values` after each.
-        """
-        self.statistic.push_all(dt, table[:, self._row], after, values)
+        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Array], judged: NDArray[np.bool_],
+        after: NDArray[np.bool_], values: Array,
+    ) -> None:  # fmt: skip
+        """As `Alarm.over`; `after` (K,) takes the alarm after each, `values` (K, n) takes `values` after each."""
+        self.statistic.push_all(dt, rows[self._row], judged, after, values)
 
     def values(self) -> Any:
         """The statistic over its threshold.
@@ -212,13 +205,12 @@ class Alarm:
     def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
         self.rules, self.labels, self.alarm = tuple(rules), labels(rules), False
         self._model, self._counted = model, counted
-        n, parts, names = model.n, list[AlarmWindow | AlarmOverThreshold](), list[str]()
+        parts, names = list[AlarmWindow | AlarmOverThreshold](), list[str]()
         self._begins: list[int] = []  # of each rule, where its numbers begin in `values`
         for rule, label in zip(self.rules, self.labels, strict=True):
             self._begins.append(len(names))
             if isinstance(rule, AlarmRule):
-                begin = row_of(rule, model) * n
-                parts.append(AlarmWindow(rule, (begin + np.flatnonzero(counted)).tolist() if begin else ()))
+                parts.append(AlarmWindow(rule, counted, row_of(rule, model)))
             else:
                 parts.append(AlarmOverThreshold(rule, model, counted))
                 names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind in JOINT else model.state_names)]
@@ -294,17 +286,28 @@ class Alarm:
         return tuple(found)
 
     def over(
-        self, dt: Array, violated: NDArray[np.bool_], table: Array
+        self,
+        dt: Array,
+        violated: NDArray[np.bool_],
+        rows: Sequence[Array],
+        judged: NDArray[np.bool_] | None = None,
+        each: NDArray[np.bool_] | None = None,
+        values: Array | None = None,
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
         """Many verdicts from a cleared alarm; after each what `push` gives.
 
-        `dt` (K,): steps, s; `violated` (K,): as for `push`; `table` (K, rows, n): as for `push`; Returns (K,): the
-        alarm after each; Returns (K, rules): which rules raise it; Returns (K, statistics): `values` after each.
+        `dt` (K,): steps, s; `violated` (K,): as for `push`; `rows`: of the table of `push`, (K, n) each; `judged` (K,):
+        where there is a verdict, default everywhere; without one the alarm stays as it was. Returns (K,): the alarm
+        after each; (K, rules): which rules raise it; (K, statistics): `values` after each, NaN without a verdict; the
+        latter two in `each` and `values` where these are given.
         """
         self.reset()
-        each, values = np.empty((len(dt), len(self.parts)), dtype=bool), np.empty((len(dt), len(self.names)))
+        count = len(dt)
+        judged = np.ones(count, dtype=bool) if judged is None else judged
+        each = np.empty((count, len(self.parts)), dtype=bool) if each is None else each
+        values = np.empty((count, len(self.names))) if values is None else values
         parts = zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True)
-        on_cores(lambda part, after, own: part.push_all(dt, violated, table, after, own), list(parts))
+        on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), list(parts))
         self.reset()
         return np.asarray(np.logical_or.reduce(list(each.T))), each, values
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Sequence
 from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import cython
@@ -21,15 +22,27 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.limits import LARGEST
-from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, judged
+from uncertain_lti.kernel.arithmetic import (
+    JUDGED,
+    LOWER,
+    OUTSIDE,
+    RESIDUAL,
+    UNKNOWN,
+    UNLISTED,
+    UPPER,
+    UTILISATION,
+    VIOLATION,
+    Judgement,
+)
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
 from uncertain_lti.model.repeats import walk
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, residual_row, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
 from uncertain_lti.sampling.sampler import Step, all_finite
@@ -52,6 +65,7 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
 
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
 _BEYOND_NS = 2**63 - 1  # later than any instant
+_PIECE = 100_000  # rows that one thread takes at a time
 
 
 @cython.cfunc
@@ -420,82 +434,62 @@ class EnvelopeMonitor:
         steps = transient.transitions()
         count, n = len(transient), model.n
         fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)
-        unfitted_step, unlisted_mode = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+        unfitted_step = np.zeros(count, dtype=bool)
         if not fitted.all():
             unfitted_step[steps.k[~fitted] + 1] = True
             steps = steps.take(fitted)
         given = steps.x, steps.u, steps.s
         if any(max(values.max(initial=0.0), -values.min(initial=0.0)) > LARGEST for values in given):
             steps = steps.take(np.max([np.abs(values).max(axis=1, initial=0.0) for values in given], axis=0) <= LARGEST)
-        z, x_next = model.normalised_columns(steps), np.empty((n, len(steps.k)))
-        normalise_columns(transient.x[1:], steps.k, point.x_s, point.X, x_next)
-        listed, unknown = model.regime(z)
-        if not listed.all():
-            unlisted_mode[steps.k[~listed] + 1] = True
-            steps, unknown, z, x_next = steps.take(listed), unknown[listed], z[:, listed], x_next[:, listed]
-        arrival = steps.k + 1
-        flags, lower = np.full((count, n), np.nan), np.full((count, n), np.nan)
-        upper, utilisation = np.full((count, n), np.nan), np.full((count, n), np.nan)
-        judged, outside = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
-        with np.errstate(over="ignore", invalid="ignore"):
-            flags[arrival], low, high, utilisation[arrival], residual = self._judge_all(z, steps.dt, x_next)
-            lower[arrival], upper[arrival] = point.recorded_x(low), point.recorded_x(high)
-        frozen, withheld, repeating, why = self._look_all(transient, steps, z, lower, upper)
-        longer, longer_residual = np.full((2, count, len(model.horizons), n), np.nan)
-        whole: Any = slice(None)
+        numbers, marks = np.empty((5, count, n)), np.empty(count, dtype=np.uint8)
+        self._judge_rows(transient, steps, numbers, marks)
+        lower, upper, residual, flags, utilisation = numbers
+        unlisted_mode = (marks & UNLISTED) > 0
+        steps = steps.take((marks[steps.k + 1] & JUDGED) > 0) if unlisted_mode.any() else steps
+        frozen, withheld, repeating, why = self._look_all(transient, steps, lower, upper)
+        longer, longer_residual = np.full((2, len(model.horizons), count, n), np.nan)
+        judged, violated, whole = (marks & JUDGED) > 0, (marks & VIOLATION) > 0, steps
         if withheld.any():
-            without = np.asarray(withheld[:, self._counted].all(axis=1))
-            for numbers in (flags, lower, upper, utilisation):
-                numbers[withheld | without[:, None]] = np.nan
-            residual[withheld[arrival]] = np.nan
-            kept = ~without[arrival]
-            steps, arrival, z, x_next = steps.take(kept), arrival[kept], z[:, kept], x_next[:, kept]
-            residual, unknown = residual[kept], unknown[kept]
-            whole = ~withheld[arrival].any(axis=1)  # the run of a horizon needs every state
-        at = arrival[whole]
-        longer[at], longer_residual[at] = model.over_horizons(
-            steps.k[whole], z[:, whole], steps.dt[whole], x_next[:, whole].T
-        )
-        judged[arrival] = True
-        unknown_regime = np.zeros(count, dtype=bool)
-        unknown_regime[arrival] = unknown
-        outside[arrival] = unknown | model.domain.outside_columns(z[: n + model.m])
-        violated = ((flags == 1.0) & self._counted).any(axis=1)
+            judged &= ~withheld[:, self._counted].all(axis=1)
+            numbers[:, withheld | ~judged[:, None]] = np.nan
+            violated = ((flags == 1.0) & self._counted).any(axis=1)
+            whole = steps.take((judged & ~withheld.any(axis=1))[steps.k + 1])  # the run of a horizon needs every state
+        if model.horizons:
+            arrival, x_next = whole.k + 1, np.empty((n, len(whole.k)))
+            normalise_columns(transient.x[1:], whole.k, point.x_s, point.X, x_next)
+            found = model.over_horizons(whole.k, model.normalised_columns(whole), whole.dt, x_next.T)
+            for over, one in zip((longer, longer_residual), found, strict=True):
+                over[:, arrival] = one.transpose(1, 0, 2)
+        outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (OUTSIDE, UNKNOWN))
         alarms = Alarm(self.alarms.rules, model, self._counted)
-        statistics = np.full((count, len(alarms.names)), np.nan)
+        statistics = np.empty((count, len(alarms.names)))
         alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(alarms.rules)), dtype=bool)
-        dt, half = np.zeros(count), residual_row(model) if alarms.needs_table else 0
-        dt[arrival] = steps.dt
-        table = np.empty((count, 2 * half, n))
-        if half:
-            table[:, 0], table[:, 1:half] = utilisation, longer
-            table[arrival, half], table[:, half + 1 :] = residual, longer_residual
+        if armed is not None:
+            statistics[~armed.counts] = np.nan
+        dt = np.zeros(count)
+        dt[steps.k + 1] = steps.dt
+        rows = [utilisation, *longer, residual, *longer_residual]
         for start, stop in _alarm_spans(transient.t_ns, armed):
-            part = slice(start, stop)
-            on: Any = np.flatnonzero(judged[part]) + start
-            if len(on) and on[-1] - on[0] + 1 == len(on):
-                on = slice(on[0], on[-1] + 1)  # without a copy
-            after, by_rule, statistics[on] = alarms.over(dt[on], violated[on], table[on])
-            held = np.cumsum(judged[part])  # without a verdict the alarm stays as it was
-            alarm[part] = np.concatenate([[False], after])[held]
-            each[part] = np.concatenate([np.zeros((1, len(alarms.rules)), dtype=bool), by_rule])[held]
+            on = slice(start, stop)
+            span = [row[on] for row in rows]
+            alarm[on] = alarms.over(dt[on], violated[on], span, judged[on], each[on], statistics[on])[0]
         alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer,
+            unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer.transpose(1, 0, 2),
             why_frozen=why,
         )  # fmt: skip
 
     def _look_all(
-        self, transient: Transient, steps: Transitions, z: Array, lower: Array, upper: Array
+        self, transient: Transient, steps: Transitions, lower: Array, upper: Array
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], dict[tuple[int, int], str]]:
         """`frozen`, `withheld`, `repeating`, `why_frozen` of `Verdicts`, by the watch of `judge`."""
         frozen, withheld, repeating = (np.zeros(lower.shape, dtype=bool) for _ in range(3))
         why: dict[tuple[int, int], str] = {}
-        watch, at = self._watch(), steps.k + 1
+        watch = self._watch()
         if watch is None:
             return frozen, withheld, repeating, why
-        for k, follows, step in walk(self.model, transient.t_ns, steps, z, lower[at], upper[at]):
+        for k, follows, step in walk(self.model, transient.t_ns, steps, steps.rows(lower, 1), steps.rows(upper, 1)):
             if not follows:
                 watch.forget()
             looked = watch.take(step)
@@ -507,9 +501,13 @@ class EnvelopeMonitor:
                 repeating[k + 1, moved.state] = True
         return frozen, withheld, repeating, why
 
-    def _judge_all(self, z: Array, dt: Array, x_next: Array) -> tuple[Array, Array, Array, Array, Array]:
-        """flags, lower, upper, utilisation, residual of transitions [x; u; s] (n + m + q, K), (K,), (n, K)."""
-        columns = np.empty((self.model.n, len(dt))), np.empty((self.model.n, len(dt)))
-        self.model.columns_centre_and_half(z, dt, *columns)
-        lower, upper, residual, flags, utilisation = judged(x_next, *columns, self.rule.margin).transpose(0, 2, 1)
-        return flags, lower, upper, utilisation, residual
+    def _judge_rows(self, transient: Transient, steps: Transitions, numbers: Array, marks: NDArray[np.uint8]) -> None:
+        """What `Judge.judge_rows` says of every row, on all cores."""
+        rows = np.linspace(0, len(marks), max(len(marks) // _PIECE, 1) + 1).astype(int).tolist()
+        given = []
+        for a, b in pairwise(rows):
+            some = slice(*np.searchsorted(steps.k, [a - 1, b - 1]).tolist())
+            judge = self.model.judge_of(self.rule.margin, self._counted)  # each has room of its own
+            given.append((judge, steps.k[some], steps.dt[some], a, numbers[:, a:b], marks[a:b]))
+        x, u, s = transient.x, transient.u, transient.s
+        on_cores(lambda judge, *some: judge.judge_rows(x, u, s, *some), given)

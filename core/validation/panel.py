@@ -142,7 +142,7 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     values = np.zeros((part.judged, len(alarm.names)))
     for start, stop in part.spans:
         span = slice(start, stop)
-        values[span] = alarm.over(part.dt[span], np.zeros(stop - start, dtype=bool), part.table[span])[2]
+        values[span] = alarm.over(part.dt[span], np.zeros(stop - start, dtype=bool), part.rows(span))[2]
     sizes = np.minimum(np.nan_to_num(np.abs(values)), LARGEST)
     ends = np.cumsum([len(rule.thresholds(model.n)) for rule in rules])[:-1]
     each = zip(rules, np.split(sizes, ends, axis=1), strict=True)

@@ -154,11 +154,10 @@ class Part:
         """[start, stop) of the verdicts over which the alarm goes on from a cleared one."""
         return list(zip(self.starts, [*self.starts[1:], self.judged], strict=True))
 
-    @property
-    def table(self) -> Array:
-        """(K, rows, n), for `Alarm.over`: utilisation for one step and for each horizon, then the residuals."""
-        rows = [self.utilisation[:, None], self.longer, self.residual[:, None], self.longer_residual]
-        return np.concatenate([row for row in rows if row.size or not self.judged], axis=1)
+    def rows(self, span: slice) -> list[Array]:
+        """For `Alarm.over`: utilisation for one step and for each horizon, then the residuals."""
+        longer, far = self.longer.transpose(1, 0, 2), self.longer_residual.transpose(1, 0, 2)
+        return [row[span] for row in (self.utilisation, *longer, self.residual, *far)]
 
 
 def judge(

@@ -37,11 +37,11 @@ def raised_on(rules: Sequence[Rule], part: Part) -> NDArray[np.bool_]:
     one_step = containment(rules)
     margin = 1.0 if one_step is None else one_step.margin
     violated = ~(np.nan_to_num(part.severity) <= margin)
-    found, table = np.zeros(part.judged, dtype=bool), part.table
+    found = np.zeros(part.judged, dtype=bool)
     for start, stop in part.spans:
         span = slice(start, stop)
         alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
-        found[span] = alarm.over(part.dt[span], violated[span], table[span])[0]
+        found[span] = alarm.over(part.dt[span], violated[span], part.rows(span))[0]
     return found
 
 
