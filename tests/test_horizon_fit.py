@@ -21,7 +21,7 @@ from scipy.optimize import linprog
 import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import FitError, ModelError
-from uncertain_lti.identification import fit, horizon_fit
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons, run_of
@@ -141,35 +141,15 @@ def test_what_is_run_are_the_least_squares_of_the_elements_that_the_model_has(
     np.testing.assert_allclose(run.c.reshape(-1, 2), expected[:, 3] if one else 0.0 * run.c.reshape(-1, 2), atol=1e-8)
 
 
-def test_the_run_that_stays_nearer_to_the_recordings_is_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(horizon_fit, "PAYS", 0.1)
-    transients = runs()
-    model = fit(transients, additive="noise", horizons=[20])
-    problem = assemble(transients, model.operating_point, None, "noise")
-    least_squares = run_of(problem)
-    worse = model.replace(A=model.A + 2.0 * np.eye(2), run=None)
-    taken, corrected = better_run(worse, problem, [20], None)
-    assert taken is not None and not corrected
-    left = []
-    for run in (taken, least_squares, None):  # over all states; of one step with what a linear correction leaves
-        phi, far = windows_naively(worse.replace(run=run), transients, 20)
-        if run is not taken:
-            far -= phi @ np.linalg.lstsq(phi, far, rcond=None)[0]
-        left.append(np.log(np.abs(far).max(axis=0)).mean())
-    assert left[0] + 0.1 < left[1] < left[2]
-    monkeypatch.undo()  # nearer by less than a third is no reason
-    assert better_run(worse, problem, [20], None)[1]
-
-
-def test_several_steps_are_not_run_where_they_are_hardly_nearer() -> None:
+def test_the_run_that_stays_nearer_to_the_recordings_is_taken() -> None:
     transients = runs(noise=0.0, bend=0.0)  # exact
     model = fit(transients, additive="noise", horizons=[20])
     problem = assemble(transients, model.operating_point, None, "noise")
     least_squares = run_of(problem)
-    taken, corrected = better_run(model.replace(A=model.A + 2.0 * np.eye(2), run=None), problem, [20], None)
-    assert corrected and taken is not None and taken.A.tobytes() == least_squares.A.tobytes()
+    taken = better_run(model.replace(A=model.A + 2.0 * np.eye(2), run=None), problem, [20], None)
+    assert taken is not None and taken.A.tobytes() == least_squares.A.tobytes()
     same = model.replace(A=least_squares.A, B=least_squares.B, c=least_squares.c, run=None)
-    assert better_run(same, problem, [20], None) == (None, True)
+    assert better_run(same, problem, [20], None) is None
 
 
 def test_a_window_with_a_discarded_transition_is_left_out() -> None:

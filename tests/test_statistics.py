@@ -17,6 +17,7 @@ import pytest
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.fleet import likelier_alone
 from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, PER_STATE, AlarmRule, StatisticRule
@@ -432,3 +433,17 @@ def test_a_fit_knows_the_utilisation_of_its_windows() -> None:
     again = UncertainLTI.from_dict(fitted.to_dict())
     assert again.to_dict() == fitted.to_dict()
     assert np.array_equal(again.residuals_at(10).covariance, fitted.residuals_at(10).covariance)
+
+
+def test_the_likelier_form_of_the_covariance_is_taken() -> None:
+    rng = np.random.default_rng(4)
+    half = np.exp(rng.uniform(-1.0, 1.0, (4000, 1))) * [1.0, 2.0]
+    noise = rng.standard_normal((4000, 2)) @ [[1.0, 0.3], [0.0, 1.0]]
+    assert likelier_alone(noise, half) and not likelier_alone(noise * half, half)
+    assert not likelier_alone(noise, np.broadcast_to(half[:1], half.shape)), "one half-width: the same"
+    few = noise.copy()
+    few[:100] *= 20.0 * half[:100]  # pulses
+    assert likelier_alone(few, np.where(np.arange(4000)[:, None] < 100, 20.0 * half, half))
+    half[0] = 0.0
+    assert not likelier_alone(noise, half)
+    assert not likelier_alone(np.column_stack([noise, noise[:, 0]]), np.ones((4000, 3)))

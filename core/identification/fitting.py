@@ -203,11 +203,8 @@ def fit(
     if not horizons:
         return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]
-    run, corrected = better_run(model, problem, lengths, structure)
-    model = model.replace(run=run)
-    over, facts["horizons"], dropped, solvers = fit_horizons(
-        model, problem, lengths, widths, criterion, progress, corrected
-    )
+    model = model.replace(run=better_run(model, problem, lengths, structure))
+    over, facts["horizons"], dropped, solvers = fit_horizons(model, problem, lengths, widths, criterion, progress)
     if dropped and not drop_horizons:
         raise FitError(dropped[0])
     if "messages" in facts or dropped:

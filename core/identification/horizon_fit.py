@@ -10,13 +10,13 @@
 """Envelopes over several steps: the same programmes, whose transitions are windows.
 
 A window of h transitions in a row gives one transition of step T from x_k with the mean control ū; the state at its end
-is counted from x̂, the run of the model or of the least squares of its elements, one step or several ahead. What is
+is counted from x̂, the run of the model or of the least squares of its elements. What is
 unknown is linear again, so working set, proof and repair are those of one step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -30,8 +30,6 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.row import Row
-from uncertain_lti.identification.several_steps import Elements, nearest_to_all, runs_over_steps
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths
@@ -41,8 +39,6 @@ _UNKNOWN = frozenset({"c", "v"})
 _COMPARED = 20_000  # transitions, about, on which two runs are compared
 _ROUNDING = 1e-12  # a smaller distance is none
 _LOOKED_AT = 100_000  # windows, about, that mean and covariance of the residuals are taken from
-PAYS = 0.4
-"""Share, as a logarithm, by which least squares several steps ahead must bring the run nearer to be taken."""
 WIDER = 1.1
 """An envelope whose mean half-width is this many times the largest move of a state over as many steps is useless: that
 the state stays where it is, give or take what it ever moved, says more."""
@@ -50,80 +46,45 @@ the state stays where it is, give or take what it ever moved, says more."""
 
 def run_of(problem: Problem, structure: Structure | None = None) -> Run:
     """The least squares of the elements of a model, one step ahead."""
-    return _as_run(problem, _started(problem, structure)[1])
-
-
-def _started(problem: Problem, structure: Structure | None) -> tuple[list[Row], Array]:
-    """Rows with the elements by least squares of one step, and these elements (blocks, q, n)."""
-    rows = list(WorkingSet(Fleet.of(problem), structure).rows)
+    n, p, columns = problem.n, problem.p, problem.columns
+    rows = WorkingSet(Fleet.of(problem), structure).rows
     for row in rows:
         row.start()
-    return rows, np.column_stack([row.theta for row in rows]).reshape(problem.columns.count, -1, problem.n)
-
-
-def _as_run(problem: Problem, theta: Array) -> Run:
-    """Elements (blocks, q, n) as what is run."""
-    n, p, columns = problem.n, problem.p, problem.columns
+    theta = np.column_stack([row.theta for row in rows]).reshape(columns.count, -1, n)
     names = [term.nominal for term in columns.nominal]
     drift = theta[:, p + names.index("c")] if "c" in names else np.zeros((columns.count, n))
     found = theta[:, :n].transpose(0, 2, 1), theta[:, n:p].transpose(0, 2, 1), drift
     return Run(*(found if columns.regimes is not None else (values[0] for values in found)))
 
 
-def better_run(
-    model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None
-) -> tuple[Run | None, bool]:
-    """What is to be run over the windows: least squares of one step, of several, or of segments, where nearer.
+def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None) -> Run | None:
+    """What is to be run over the windows: the least squares of one step where nearer than the model, which is None.
 
     Compared is the largest distance of a window's end from the run with a linear correction, which is what widths are
     made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
-    Least squares several steps ahead go without the correction: it would follow the largest errors, as the narrowest
-    envelope does, and move the mean, which statistics look at, from 0. They have to be nearer by a third without it.
     """
     lengths = sorted(set(steps))
-    order, signals = _in_order(problem)
-    k, dt, after = order, problem.dt, problem.next_columns
+    k, signals = _in_order(problem)
+    dt, after = problem.dt, problem.next_columns
     piece = max(20 * lengths[-1], 1000)
     if len(dt) > _COMPARED:
         starts = np.linspace(0, len(dt) - piece, max(_COMPARED // piece, 1)).astype(np.intp)
         some = np.unique((starts[:, None] + np.arange(piece)).ravel())
         k, signals, dt, after = k[some], signals[:, some], dt[some], after[:, some]
 
-    def distance(which: UncertainLTI, corrected: bool = True) -> float:
+    def distance(which: UncertainLTI) -> float:
         logs = []
         for windows in which.windows(k, signals, dt, lengths):
             left = (after[:, windows.last] - windows.run).T
             if not np.isfinite(left).all():
                 return np.inf
-            if corrected:
-                phi = np.vstack([windows.z[: problem.p], np.ones(len(left))]).T
-                left = left - phi @ np.linalg.lstsq(phi, left, rcond=None)[0]
+            phi = np.vstack([windows.z[: problem.p], np.ones(len(left))]).T
+            left = left - phi @ np.linalg.lstsq(phi, left, rcond=None)[0]
             logs.append(np.log(np.maximum(np.abs(left).max(axis=0, initial=0.0), _ROUNDING)))
         return float(np.mean(logs)) if logs else 0.0
 
-    rows, one = _started(problem, structure)
-    found, corrected, nearest = None, True, distance(model)
-    for several, theta in enumerate(_tried(problem, order, rows, one, lengths[-1])):
-        if not np.isfinite(theta).all():
-            continue
-        run = _as_run(problem, theta)
-        far = distance(model.replace(run=run), not several)
-        if far < nearest - (PAYS if several and corrected else 0.0):
-            found, corrected, nearest = run, not several, far
-    return found, corrected
-
-
-def _tried(problem: Problem, order: NDArray[np.intp], rows: Sequence[Row], one: Array, longest: int) -> Iterator[Array]:
-    """Elements (blocks, q, n) by least squares of one step, of several, and of whole segments."""
-    tried = [one]
-    yield one
-    for theta in runs_over_steps(problem, order, rows, longest):
-        tried.append(theta)
-        yield theta
-    if len(tried) > 1:
-        found = nearest_to_all(problem, order, Elements(rows, problem.columns.count), tried, longest)
-        if found is not None:
-            yield found
+    run = run_of(problem, structure)
+    return run if distance(model.replace(run=run)) < distance(model) else None
 
 
 def _in_order(problem: Problem) -> tuple[NDArray[np.intp], Array]:
@@ -139,7 +100,6 @@ def fit_horizons(
     widths: Widths | Mapping[int, Widths] = "growing",
     criterion: str = "qp",
     progress: Callable[[str], None] | None = None,
-    corrected: bool = True,
 ) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str], set[str]]:
     """Envelopes of a fitted model over several steps: with facts of each, what was left out, and solvers."""
     solvers: set[str] = set()
@@ -152,7 +112,6 @@ def fit_horizons(
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
     columns = Columns(_UNKNOWN, regimes)
     halves = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
-    centre = {} if corrected else {"A": np.zeros((n, n)), "B": np.zeros((n, p - n)), "c": np.zeros(n)}
     lengths = sorted(set(steps))
     for windows in model.windows(k, signals, problem.dt, lengths):
         if progress is not None:
@@ -186,8 +145,7 @@ def fit_horizons(
             windows.run,
         )
         kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
-        fixed = centre | (halves if kind == "constant" else {})
-        structure = Structure(n, p - n, fixed=fixed) if fixed else None
+        structure = Structure(n, p - n, fixed=halves) if kind == "constant" else None
         horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
         solvers |= fact.pop("solvers")
         move = np.max([np.abs(block.x_next - block.z[:n]).max(axis=1) for block in part.blocks()], axis=0)
