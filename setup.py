@@ -117,6 +117,7 @@ setup(
         "uncertain_lti.plants": ["*.json"],
         "uncertain_lti.recordings": ["*.pyi", "*.pyx"],
         "uncertain_lti.reports": ["assets/*"],
+        "uncertain_lti.sampling": ["*.pyi", "*.pyx"],
         NAME: ["*.xml"],
     },
     data_files=[

@@ -38,7 +38,7 @@ from recorded import COMPRESSIONS, FRAMES, JAZZY, ROBOT, payloads, write
 
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.mcap_records import crc32
-from uncertain_lti.sampling.reading import read_transients, sample, sample_by_message
+from uncertain_lti.sampling.reading import read_transients, sample
 from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -178,7 +178,7 @@ def robot():
 
 
 def samples(folder, scale, share):
-    """The whole way to samples, its halves, and the second half as the live monitor goes it."""
+    """The whole way to samples, and its halves."""
     count = int(1e6 * scale)
     rows = []
     path = recording(folder, count, "zstd", "768 KiB", "one")
@@ -186,14 +186,8 @@ def samples(folder, scale, share):
     signals = transient.signals
     reading, stream = best(lambda: read_stream(Bag(path, indexed=True), signals))
     sampling, _ = best(lambda: sample(stream, signals))
-    alone, slow = best(lambda: sample_by_message(stream, signals), 1)
-    assert (slow.t_ns.tobytes(), slow.x.tobytes(), slow.held.tobytes()) == (
-        transient.t_ns.tobytes(),
-        transient.x.tobytes(),
-        transient.u.tobytes(),
-    )
-    rows.append([f"{both:.2f} s", f"{reading:.2f} s", f"{sampling:.2f} s", f"{alone:.2f} s", f"{alone / sampling:.0f}"])
-    header = ["read_transients", "reading", "sampling", "message by message", "× faster"]
+    rows.append([f"{both:.2f} s", f"{reading:.2f} s", f"{sampling:.2f} s"])
+    header = ["read_transients", "reading", "sampling"]
     table(f"{len(stream.topic)} messages of three topics into {len(transient)} samples", header, rows)
     keep_or_drop(folder, path)
 

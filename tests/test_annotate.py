@@ -21,15 +21,12 @@ import numpy as np
 import pytest
 from bag_writer import COMPRESSIONS, Message, Topic, metadata_yaml, ramp, write, write_folder
 from engine_bag import SIGNALS, engine_bag
-from hypothesis import given
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as Recorded
 from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
-from test_sampler import cases, loops
-from test_sampler_arrays import columns
 
 from uncertain_lti import EnvelopeMonitor, read_transients
 from uncertain_lti.base.errors import BagError, ModelError
@@ -43,9 +40,7 @@ from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.reports.annotate import METADATA, annotate, targets
-from uncertain_lti.sampling.reading import read_as_fitted, read_as_fitted_with_decisions
-from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.sampler_arrays import Decisions, decided
+from uncertain_lti.sampling.reading import Decisions, read_as_fitted, read_as_fitted_with_decisions
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 JUDGED = [output for output in outputs.JUDGED if output.of == "states"]
@@ -555,16 +550,3 @@ def test_memory_does_not_grow_with_the_recording(engine, tmp_path):
         peaks.append(int(done.stdout.split()[-1]))
     assert (tmp_path / "big_out.mcap").stat().st_size > source.stat().st_size > 400_000_000
     assert peaks[1] - peaks[0] < 60, peaks
-
-
-@given(cases() | loops())
-def test_decisions_are_those_of_the_sampler(case):
-    signals, messages = case
-    data = columns(signals, messages)
-    found = decided(signals, **data)
-    sampler, rows = Sampler(signals), [iter(v.tolist()) for v in data["values"]]
-    expected = []
-    for topic, arrival, stamp in zip(*(data[k].tolist() for k in ("topic", "arrival", "stamp")), strict=True):
-        for step in sampler.push(signals.topics[topic], arrival, stamp if stamp >= 0 else None, next(rows[topic])):
-            expected.append((arrival, step.t_ns, step.status.dropped))
-    assert list(zip(found.arrival.tolist(), found.t_ns.tolist(), found.dropped.tolist(), strict=True)) == expected

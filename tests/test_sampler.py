@@ -517,6 +517,43 @@ def loops(draw: st.DrawFn) -> tuple[SignalMap, list[Sent]]:
     return signals, first[: len(first) - overlap] + mixed + second[overlap:]
 
 
+@settings(max_examples=250)
+@given(cases() | cases(tame=True) | loops())
+def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[Sent]]) -> None:
+    """Samples, which message decided each of them, and counts; the last sample has what it knows of itself."""
+    signals, messages = case
+    topics, n = signals.topics, len(signals.states)
+    of = np.array([topics.index(m.topic) for m in messages], dtype=np.int64)
+    arrival = np.array([m.arrival for m in messages], dtype=np.int64)
+    stamp = np.array([m.stamp or -1 for m in messages], dtype=np.int64)
+    values = [
+        np.array([m.values for m in messages if m.topic == t], dtype=float).reshape(-1, len(signals.on(t)))
+        for t in topics
+    ]
+    all_of_them = Sampler(signals)
+    (t_ns, x, u), decisions = all_of_them.push_all(of, arrival, stamp, values)
+    each, sampler = run(signals, messages)
+    clock = np.cumsum(of == topics.index(signals.clock)) - 1
+    decided = zip(messages, each, clock.tolist(), strict=True)
+    expected = [(m.arrival, s.t_ns, s.status.dropped, at) for m, steps, at in decided for s in steps]
+    assert list(zip(*(row.tolist() for row in decisions), strict=True)) == expected
+    made = [s for s in only(each) if not s.status.dropped]
+    assert (t_ns.tolist(), x.tobytes()) == ([s.t_ns for s in made], np.array([s.after for s in made]).tobytes())
+    assert u[:-1].tobytes() == np.array([s.before[n:] for s in made[1:]]).tobytes()
+    assert all_of_them.counters == sampler.counters
+    for i in range(n, len(signals)) if made else ():
+        signal, known = signals[i], signals.decided_at_once and i in signals.on(signals.clock)
+        plainly = known and signal.at == "departure" and not signal.delay and signal.memory is None
+        np.testing.assert_equal(u[-1, i - n], sampler.latest()[1][i] if plainly else NAN)
+
+
+def test_a_recording_that_does_not_fit_its_topics_is_refused() -> None:
+    one, two = np.zeros(1, dtype=np.int64), np.zeros(2, dtype=np.int64)
+    for topic, values in ((two, [np.zeros((1, 1)), np.zeros((0, 1))]), (one, [np.zeros((1, 2)), np.zeros((0, 1))])):
+        with pytest.raises(ValueError, match="fit"):
+            Sampler(two_topics()).push_all(topic, one, one, values)
+
+
 @settings(max_examples=150)
 @given(loops())
 def test_each_pass_of_a_looped_bag_is_as_on_its_own(case: tuple[SignalMap, list[Sent]]) -> None:

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
     from uncertain_lti.monitor.verdict import Verdicts
     from uncertain_lti.recordings.recording import Progress, Recording
     from uncertain_lti.reports.interactive import Plotted
-    from uncertain_lti.sampling.sampler_arrays import Decisions
+    from uncertain_lti.sampling.reading import Decisions
 
 
 def add_margin_arguments(parser: argparse.ArgumentParser) -> None:

@@ -345,9 +345,8 @@ def fit_archive(
 
 
 def _sampled(recording: Recording, signals: SignalMap) -> Transient:
-    return sample(
-        read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals), signals
-    )
+    bag = open_recording(recording[0], recording[1], indexed=True, layout=signals.table)
+    return sample(read_stream(bag, signals), signals)[0]
 
 
 def survey(recording: Recording, signals: SignalMap) -> Survey:

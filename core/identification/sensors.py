@@ -22,7 +22,7 @@ from uncertain_lti.identification.excitation import quoted, successive, unexplai
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.sampling.codes import codes, too_small
-from uncertain_lti.sampling.counters import TOO_OLD
+from uncertain_lti.sampling.status import TOO_OLD
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal
 

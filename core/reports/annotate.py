@@ -46,7 +46,7 @@ from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.recordings.unreadable import SUFFIXES
-from uncertain_lti.sampling.sampler_arrays import Decisions
+from uncertain_lti.sampling.reading import Decisions
 
 METADATA = "uncertain_lti_check"
 """Name of the metadata record that says what was checked with what."""

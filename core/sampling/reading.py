@@ -11,11 +11,9 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,12 +22,10 @@ from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.sampling.counters import INVALID, LATE, TOO_OLD
 from uncertain_lti.sampling.reading_processes import processes_for, read_streams
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.sampler_arrays import Decisions, Samples, decided, known_of_the_last, sample_arrays
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.status import INVALID, LATE, TOO_OLD, Status
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
 from uncertain_lti.sampling.transient import Transient
@@ -58,29 +54,44 @@ def time_source(signals: SignalMap, topic: str, stamped: int, counted: int) -> s
     return chosen or ("header" if 2 * stamped > counted else "log")
 
 
-def sample(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Transient:
-    """One recording through the rules of the `Sampler`; signals must be resolved.
+@dataclass(frozen=True)
+class Decisions:
+    """What became of each clock message of a recording, in the order in which it was decided.
 
-    In columns (`sampler_arrays`), and message after message where that is not possible; the same to the last bit.
+    A sample is decided by its own message, or, where that lacks states or controls of its instant
+    (`SignalMap.decided_at_once`), by the next one that opens a sample; without a next one it is not decided.
+
+    `arrival` (M,): arrival of the message that decided it, ns; `t_ns` (M,): its own instant, ns; `dropped` (M,): it
+    made no sample. The others are the samples, one after the other; `by` (M,): which clock message decided it, counted
+    in order of arrival.
     """
-    samples = sample_arrays(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
-    if samples is None:
-        samples = sample_by_message(stream, signals, progress)
+
+    arrival: NDArray[np.int64]
+    t_ns: NDArray[np.int64]
+    dropped: NDArray[np.bool_]
+    by: NDArray[np.int64]
+
+
+def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
+    """One recording through the `Sampler`, and which message decided each sample; signals must be resolved."""
+    sampler = Sampler(signals)
+    (t_ns, x, held), decisions = sampler.push_all(stream.topic, stream.arrival, stream.stamp, stream.values)
     assert signals.max_gap is not None
     m = len(signals.controls)
-    return Transient(
-        samples.t_ns,
-        samples.x,
-        samples.held[:, :m],
-        s=samples.held[:, m:],
+    transient = Transient(
+        t_ns,
+        x,
+        held[:, :m],
+        s=held[:, m:],
         name=os.fspath(stream.bag.path),
         signals=signals,
         max_gap=signals.max_gap,
         min_step=signals.min_step,
-        counters=samples.counters,
+        counters=sampler.counters,
         sources=stream.bag.parts,
         notes=(*stream.bag.warnings, *lags_in_words(stream, signals)),
     )
+    return transient, Decisions(*decisions)
 
 
 def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
@@ -106,39 +117,6 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
     return said
 
 
-def sample_by_message(stream: Stream, signals: SignalMap, progress: Progress | None = None) -> Samples:
-    """The samples through the `Sampler` itself, message after message."""
-    sampler = Sampler(signals)
-    topics = signals.topics
-    rows = [iter(v.tolist()) for v in stream.values]
-    t: list[int] = []
-    x: list[NDArray[np.float64]] = []
-    held: list[NDArray[np.float64]] = []
-    unknown = np.full(len(signals.held), math.nan)
-    messages: Iterable[Any] = zip(stream.topic.tolist(), stream.arrival.tolist(), stream.stamp.tolist(), strict=True)
-    if progress is not None:
-        messages = progress(messages, len(stream.topic))
-    for position, arrival, stamp in messages:
-        for step in sampler.push(topics[position], arrival, stamp if stamp >= 0 else None, next(rows[position])):
-            if step.status.dropped:
-                continue
-            if held:
-                held[-1] = step.u  # fixed only now that the next sample has arrived
-            t.append(step.t_ns)
-            x.append(step.x_next)
-            held.append(unknown)
-    if (latest := sampler.latest()) is not None and held:
-        held[-1] = unknown.copy()
-        for position in known_of_the_last(signals):
-            held[-1][position - len(signals.states)] = latest[1][position]
-    return Samples(
-        np.array(t, dtype=np.int64),
-        np.array(x).reshape(len(t), len(signals.states)),
-        np.array(held).reshape(len(t), len(unknown)),
-        sampler.counters,
-    )
-
-
 def read_transients(
     paths: Paths,
     signals: SignalMap | str | os.PathLike[str],
@@ -158,8 +136,7 @@ def read_transients(
     signals : SignalMap or path
         A map, or the signals file.
     progress : callable, optional
-        Wraps what goes through the messages of a recording, given their number: (iterable, total) -> iterable; once
-        while they are read and once while samples are cut from them.
+        Wraps what goes through the messages of a recording, given their number: (iterable, total) -> iterable.
     processes : int or None
         How many recordings are read at the same time, each in a process of its own; None chooses
         (`reading_processes.processes_for`). A script that asks for more than 1 needs `if __name__ == "__main__":`.
@@ -201,13 +178,13 @@ def read_transients(
             times = s.stamp[chosen] if sources[topic] == "header" else s.arrival[chosen]
             instants[topic].append(times[times >= 0] if sources[topic] == "header" else times)
     resolved = resolve(signals, instants, sources)
-    transients = [sample(stream, resolved, progress) for stream in streams]
+    transients = [sample(stream, resolved)[0] for stream in streams]
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
         return transients
     resolved, words = _resolve_operating_point(resolved, transients)
     if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
-        transients = [sample(stream, resolved, progress) for stream in streams]
+        transients = [sample(stream, resolved)[0] for stream in streams]
     numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
     note = f"operating point from {words}: {numbers}"
     return [_with_signals(t, resolved, note if t is transients[0] else None) for t in transients]
@@ -230,16 +207,14 @@ def read_as_fitted(
 ) -> Transient:
     """Read one recording with the signals and sampling that a model was fitted with."""
     stream = _stream_for_model(recording, signals, progress)
-    return sample(stream, signals, progress)
+    return sample(stream, signals)[0]
 
 
 def read_as_fitted_with_decisions(
     recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> tuple[Transient, Decisions]:
     """`read_as_fitted`, and which message decided each clock message."""
-    stream = _stream_for_model(recording, signals, progress)
-    decisions = decided(signals, stream.topic, stream.arrival, stream.stamp, stream.values)
-    return sample(stream, signals, progress), decisions
+    return sample(_stream_for_model(recording, signals, progress), signals)
 
 
 def read_field(

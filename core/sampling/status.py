@@ -7,10 +7,11 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Status: what became of one clock message."""
+"""Status of one clock message, and counters of what became of messages and samples."""
 
 from __future__ import annotations
 
+from collections import Counter
 from enum import StrEnum
 
 
@@ -40,3 +41,23 @@ class Status(StrEnum):
     def opens_segment(self) -> bool:
         """The sample has no predecessor."""
         return self in (Status.FIRST, Status.RESET, Status.GAP)
+
+
+LATE, TOO_OLD, MISSING, INVALID = "late", "stale", "missing", "invalid"
+"""Kinds that are counted per topic (late) or per signal."""
+
+
+class Counters(Counter[str]):
+    """Counts by flat name, as diagnostics and `--json` show them: `samples`, `gaps`, `late /topic`, `stale signal`.
+
+    `of` gives the counts of one kind by topic or signal, so that nobody takes the names apart.
+    """
+
+    def add(self, kind: str, name: str, count: int = 1) -> None:
+        """Count something of a topic or signal."""
+        self[f"{kind} {name}"] += count
+
+    def of(self, kind: str) -> dict[str, int]:
+        """Counts of one kind."""
+        start = f"{kind} "
+        return {key[len(start) :]: count for key, count in self.items() if key.startswith(start) and count}

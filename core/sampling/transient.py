@@ -28,9 +28,8 @@ from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
-from uncertain_lti.sampling.counters import Counters
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.status import Counters, Status
 from uncertain_lti.signals.signal import AT, At
 from uncertain_lti.signals.signal_map import ARRIVAL, Signal, SignalMap
 
