@@ -31,7 +31,7 @@ from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import BLOCK
-from uncertain_lti.reports.fit_text import archive_text, next_text
+from uncertain_lti.reports.model_text import fit_text, next_text
 
 ARRAYS = ("A", "B", "dA", "dB", "c", "dc", "v")
 
@@ -103,7 +103,7 @@ def test_scheduled_from_disk_as_in_memory(bags, tmp_path):
     assert same.schedule == model.schedule and same.block_data == model.block_data
     noted = [[m for m in one.fit_summary["messages"] if "schedules nothing" in m] for one in (same, model)]
     assert noted[0] == noted[1] and len(noted[0]) == 1 and "'weather'" in noted[0][0]
-    assert f"note: {noted[0][0]}" in archive_text(same)
+    assert f"note: {noted[0][0]}" in fit_text(same)
     assert "schedules nothing" not in next_text(same, "m.json")
 
 

@@ -33,8 +33,7 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.frozen import needs, repeat_words
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
-from uncertain_lti.reports.check_data import check_data
-from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
@@ -626,7 +625,7 @@ def test_reset_clears_the_alarm_and_a_state_that_stays_frozen_raises_it_again(mo
 
 def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> None:
     from uncertain_lti.reports.findings import findings
-    from uncertain_lti.reports.html import html_report
+    from uncertain_lti.reports.pages import html_report
 
     checked = [EnvelopeMonitor(model, 50, 50).check(held(run(12), 0, 200, 350))]
     data = check_data(model, checked[0])

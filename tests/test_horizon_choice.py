@@ -22,7 +22,8 @@ import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, SignalMap
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
-from uncertain_lti.reports.fit_text import horizons_text
+from uncertain_lti.reports.model_text import horizon_blocks
+from uncertain_lti.reports.tables import text_of
 from uncertain_lti.signals.choices import HorizonRule
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import rules_for, sizes_of
@@ -89,7 +90,7 @@ def test_what_holds_on_left_out_data_stays_with_a_table_that_says_why() -> None:
     for row in taken:  # constant half-widths, unless growing ones are narrower
         other = rows[row["steps"], "constant" if row["widths"] == "growing" else "growing"]
         assert row["widths"] == "constant" or row["width"] < other["width"]
-    text = horizons_text(choice)
+    text = text_of(horizon_blocks(choice))
     assert "leaving out one recording of 4" in text and text.count("(chosen)") == len(taken)
     assert any(message.startswith("horizons of ") for message in model.fit_summary["messages"])
 

@@ -28,8 +28,7 @@ from uncertain_lti.identification.horizon_fit import better_run, fit_horizons, r
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.horizon import Run
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.reports.check_data import check_data
-from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.figures import horizon_figure, save
 from uncertain_lti.reports.model_text import model_text
 

@@ -76,7 +76,7 @@ def limited(arguments, memory=1 << 30, seconds=30):
     program = f"""
 import os, resource, sys
 from uncertain_lti.cli.main import main
-import uncertain_lti.recordings.bag, uncertain_lti.reports.fit_text, uncertain_lti.reports.annotate
+import uncertain_lti.recordings.bag, uncertain_lti.reports.model_text, uncertain_lti.reports.annotate
 size = int(open("/proc/self/statm").read().split()[0]) * os.sysconf("SC_PAGE_SIZE")
 resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, resource.RLIM_INFINITY))
 resource.setrlimit(resource.RLIMIT_CPU, ({seconds}, {seconds}))

@@ -23,7 +23,8 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import leibov2006, transient
-from uncertain_lti.reports.detectable_text import detectable_data, detectable_text, detectable_words
+from uncertain_lti.reports.tables import text_of
+from uncertain_lti.reports.validation_text import detectable_blocks, detectable_data, detectable_words
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.validation import detectable as module
 from uncertain_lti.validation.detectable import FEWEST, detectable, typical_within
@@ -275,7 +276,7 @@ def test_what_cannot_be_known_is_refused_in_words(validation):
     unstable = validation.model.replace(A=validation.model.A + 50.0 * np.eye(3))
     seen = detectable(unstable, validation.parts, kinds=("offset", "gain"))
     assert all("runs away" in fault.refused for fault in seen.faults)
-    text = "\n".join(detectable_text(detectable_data({"detectable": seen.to_dict()})))
+    text = text_of(detectable_blocks(detectable_data({"detectable": seen.to_dict()})))
     assert "runs away" in text and "unknown" in text
     assert typical_within(validation.parts) == pytest.approx(2.0) and FEWEST > 1
 

@@ -25,8 +25,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.signature import Signature, closeness
 from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part, Pattern
 from uncertain_lti.monitor.session import OK
-from uncertain_lti.reports.check_data import check_data
-from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
 from uncertain_lti.reports.validation_text import signature_text
 from uncertain_lti.signals.signal_map import Signal

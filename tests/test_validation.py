@@ -581,4 +581,4 @@ def test_each_part_is_reported(validation, runs):
         assert found["alarm_share"] == pytest.approx(verdicts.alarm.mean() * 101 / 100)
     text = validation_text(data)
     assert all(run.name in text for run in runs)
-    assert "and 5 more recordings" in validation_text({**data, "part": data["part"] * 2 + data["part"][:1]})
+    assert "and 5 more rows" in validation_text({**data, "part": data["part"] * 2 + data["part"][:1]})

@@ -31,10 +31,9 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
 from uncertain_lti.cli.command import print_json
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
-from uncertain_lti.reports.check_data import check_data
-from uncertain_lti.reports.check_text import check_text
+from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
-from uncertain_lti.reports.fit_text import alarm_text, fit_text, headline_text
+from uncertain_lti.reports.model_text import fit_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.process import Life, living, say, speed
 
@@ -74,9 +73,7 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     transients = read_transients([bags / name for name in FIT], turbofan_signals())
     model = fit(transients, additive="noise")
     model.save(model_file)
-    print(headline_text(model))
-    print(fit_text(model, transients))
-    print(alarm_text(model))
+    print(fit_text(model))
     print(f"   model: {model_file}")
 
     print(f"\n2. Playing {CHECK} at {args.rate:g} times real time to a live envelope_monitor node")

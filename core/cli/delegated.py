@@ -25,8 +25,7 @@ def _add_info(parser: argparse.ArgumentParser) -> None:
 
 def run_info(options: argparse.Namespace) -> int:
     """Print the model."""
-    from uncertain_lti.reports.model_text import model_text
-    from uncertain_lti.reports.regimes import block_facts
+    from uncertain_lti.reports.model_text import block_facts, model_text
     from uncertain_lti.reports.tables import finite_data
 
     model = load_model(options.model)

@@ -107,16 +107,7 @@ def run(options: argparse.Namespace) -> int:
     """Fit a model and write it."""
     from uncertain_lti import fit, read_transients
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.reports.fit_text import (
-        alarm_text,
-        fit_text,
-        headline_text,
-        horizons_text,
-        next_text,
-        recording_text,
-        schedule_text,
-    )
-    from uncertain_lti.reports.validation_text import left_out_text
+    from uncertain_lti.reports.model_text import fit_text, next_text, recording_text
     from uncertain_lti.validation.groups import resolve_groups
 
     output = model_target(options.output, options.force)
@@ -157,15 +148,7 @@ def run(options: argparse.Namespace) -> int:
         data = model.to_dict()
         print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
     else:
-        print_summary(options, headline_text(model))
-        for choice in model.fit_summary.get("schedule", []):
-            print_summary(options, schedule_text(choice))
-        if choice := model.fit_summary.get("horizon_choice"):
-            print_summary(options, horizons_text(choice))
-        print_summary(options, fit_text(model, transients))
-        print_summary(options, alarm_text(model))
-        if model.validation:
-            print_summary(options, left_out_text(model.validation))
+        print_summary(options, fit_text(model))
         print_summary(options, f"model written to {output}")
         print_summary(options, next_text(model, shlex.quote(str(output))))
     return DONE
@@ -176,7 +159,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
 
     from uncertain_lti.base.files import sha256
     from uncertain_lti.identification.archive import fit_archive
-    from uncertain_lti.reports.fit_text import archive_text, next_text
+    from uncertain_lti.reports.model_text import fit_text, next_text
 
     if options.discard:
         raise FitError("--discard goes through all transitions in memory; leave out --cache, --scheduler and --workers")
@@ -218,7 +201,7 @@ def _fit_archive(options: argparse.Namespace, output: Path) -> int:
     if options.json:
         print_json({"model": str(output), "fit": model.to_dict()["fit"]})
     else:
-        print_summary(options, archive_text(model))
+        print_summary(options, fit_text(model))
         print_summary(options, f"model written to {output}")
         print_summary(options, next_text(model, shlex.quote(str(output))))
     return DONE

@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from uncertain_lti.monitor.deployed import DeployedMonitor
     from uncertain_lti.monitor.verdict import Verdicts
     from uncertain_lti.recordings.recording import Progress, Recording
-    from uncertain_lti.reports.interactive import Plotted
+    from uncertain_lti.reports.pages import Plotted
     from uncertain_lti.sampling.reading import Decisions
 
 
@@ -158,8 +158,7 @@ def _add_check(parser: argparse.ArgumentParser) -> None:
 
 def run_check(options: argparse.Namespace) -> int:
     """Check each recording and return whether the alarm was raised."""
-    from uncertain_lti.reports.check_data import check_data, outcome
-    from uncertain_lti.reports.check_text import check_text
+    from uncertain_lti.reports.check import check_data, check_text, outcome
 
     judged = _judged(options)
     model, bags, deployed = judged.model, judged.bags, judged.deployed
@@ -205,7 +204,7 @@ def _add_report(parser: argparse.ArgumentParser) -> None:
 def run_report(options: argparse.Namespace) -> int:
     """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.reports.findings import findings, findings_text
-    from uncertain_lti.reports.page_file import page_target, write_page
+    from uncertain_lti.reports.pages import page_target, write_page
 
     judged = _judged(options)
     output = options.output or (None if options.json else "report.html")
@@ -217,7 +216,7 @@ def run_report(options: argparse.Namespace) -> int:
     facts = findings(judged.model, options.model, checked, judged.deployed.monitor.rule, judged.deployed.words())
     print_summary(options, findings_text(facts))
     if output is not None:
-        from uncertain_lti.reports.html import html_report
+        from uncertain_lti.reports.pages import html_report
 
         write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
         print_summary(options, f"report written to {output}")
@@ -242,7 +241,7 @@ def _add_plot(parser: argparse.ArgumentParser) -> None:
 def run_plot(options: argparse.Namespace) -> int:
     """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.page_file import HOLDS, page_target
+    from uncertain_lti.reports.pages import HOLDS, page_target
 
     named = _names_model(options.bags[0])
     model = load_model(options.bags[0]) if named else None
@@ -293,7 +292,7 @@ def _plot_judged(options: argparse.Namespace, judged: Judged, output: Path) -> i
     for _, verdicts, _ in judged:
         checked = True
         if output.suffix == ".html":
-            from uncertain_lti.reports.interactive import plotted_check
+            from uncertain_lti.reports.pages import plotted_check
 
             plotted.append(plotted_check(judged.model, verdicts, len(judged.bags)))
         else:
@@ -308,7 +307,7 @@ def _plot_judged(options: argparse.Namespace, judged: Judged, output: Path) -> i
 
 
 def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Plotted]:
-    from uncertain_lti.reports.interactive import plotted_fields, plotted_transient
+    from uncertain_lti.reports.pages import plotted_fields, plotted_transient
 
     if options.signals:
         from uncertain_lti import read_transients
@@ -332,8 +331,7 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
 
 
 def _write_page(title: str, bags: Sequence[Recording], plotted: list[Plotted], output: Path) -> None:
-    from uncertain_lti.reports.interactive import interactive_page
-    from uncertain_lti.reports.page_file import write_page
+    from uncertain_lti.reports.pages import interactive_page, write_page
 
     names = [os.path.basename(bag.path) or str(bag.path) for bag in bags]
     write_page(output, interactive_page(f"{title}: {shortlist(names, 1)}", plotted))

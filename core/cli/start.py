@@ -153,7 +153,7 @@ def _add_start(parser: argparse.ArgumentParser) -> None:
 def run_start(options: argparse.Namespace) -> int:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.reports.findings import findings_text
-    from uncertain_lti.reports.page_file import page_target
+    from uncertain_lti.reports.pages import page_target
 
     signals, model, page = (f"{options.output}{ending}" for ending in (".yaml", ".model.json", ".html"))
     if not os.path.basename(options.output):

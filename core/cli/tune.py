@@ -52,7 +52,7 @@ def run(options: argparse.Namespace) -> int:
     """Try the ways, print them, and write the model that was chosen."""
     from uncertain_lti import Transient, read_transients, tune
     from uncertain_lti.base.files import sha256
-    from uncertain_lti.reports.fit_text import alarm_text, headline_text
+    from uncertain_lti.reports.model_text import alarm_text, headline_text
     from uncertain_lti.reports.validation_text import tune_text
     from uncertain_lti.validation.groups import resolve_groups
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
-from uncertain_lti.base.english import plural, shortlist, times
+from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -177,8 +177,8 @@ class Series:
 class Panel:
     """Series over one axis.
 
-    `limits`: of the axis; `marks` (P,): violated values, NaN where none is; `levels`: lines across; `rank`: how much it
-    is worth seeing; `count`: violated samples; `note`: what stands at its right.
+    `limits`: of the axis; `marks` (P,): violated values, NaN where none is; `levels`: lines across; `count`: violated
+    samples; `note`: what stands at its right.
     """
 
     title: str
@@ -187,7 +187,6 @@ class Panel:
     limits: tuple[float, float] = (0.0, 1.0)
     marks: Array | None = None
     levels: tuple[float, ...] = ()
-    rank: float = 0.0
     count: int = 0
     note: str = ""
 
@@ -210,34 +209,12 @@ class Map:
 
 @dataclass(frozen=True)
 class Chart:
-    """Panels over the time of one recording.
+    """Panels over the time of one recording; `heading`: of the recording; `keys`: roles and words of the legend."""
 
-    `name`: what is drawn; `heading`: of the recording; `keys`: roles and words of the legend.
-    """
-
-    name: str
     heading: str
     columns: Columns
     panels: tuple[Panel | Map, ...]
     keys: tuple[tuple[str, str], ...]
-
-    @property
-    def words(self) -> str:
-        """What is seen, for those who do not see it."""
-        c, found = self.columns, [f"{self.heading}."]
-        if c.alarms:
-            found.append(f"The alarm is raised {times(len(c.alarms))}, first at {c.alarms[0][0]:.8g} s.")
-        bad = sorted((p for p in self.panels if p.count), key=lambda p: -p.count)
-        outside = [f"{p.title} {times(p.count)}{self._since(p)}" for p in bad]
-        found += [f"Outside its bounds: {shortlist(outside, 6)}."] if bad else []
-        inside = [p.title for p in self.panels if isinstance(p, Panel) and p.marks is not None and not p.count]
-        found += [f"Always inside: {shortlist(inside, 6)}."] if inside and c.judged.any() else []
-        return " ".join(found)
-
-    def _since(self, panel: Panel | Map) -> str:
-        if isinstance(panel, Map) or panel.marks is None or not (there := np.flatnonzero(~np.isnan(panel.marks))).size:
-            return ""
-        return f" from {self.columns.t[there[0]]:.6g} s"
 
 
 ALARMED = (("alarm", "alarm"), ("silent", "no verdict"))
@@ -257,11 +234,8 @@ def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most:
     panel, states = score_panel(model, verdicts, columns)
     chosen = [model.state_names[i] for i in np.argsort(-states, kind="stable")[:most]]
     below = utilisation_chart(model, verdicts, columns, chosen)
-    name = "What happened, and when: the alarm's score over its threshold, then where between its bounds each state lay"
-    if model.n > most:
-        name += f" ({most} of {model.n} states, those that did most)"
     keys = (("score", "score, utilisation"), ("bounds", "inside the bounds"), ("violated", "violated"), *ALARMED)
-    return Chart(name, below.heading, columns, (panel, *below.panels), keys)
+    return Chart(below.heading, columns, (panel, *below.panels), keys)
 
 
 def score_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Panel, Array]:
@@ -277,7 +251,7 @@ def score_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tu
     capped = np.minimum(score, FARTHEST)
     panel = Panel(
         "alarm score, 1 is the threshold", (Series("score", np.where(np.isnan(capped), np.nan, 0.0), capped),),
-        limits=(0.0, top), levels=(1.0,), rank=math.inf, note=note,
+        limits=(0.0, top), levels=(1.0,), note=note,
     )  # fmt: skip
     return panel, states
 
@@ -355,7 +329,7 @@ def envelope_chart(
         series = Series("bounds", lower[:, i], upper[:, i]), _series("recorded", low[:, i], high[:, i], columns)
         panels.append(_panel(model, columns, i, series, _limits(*sides), marks, bad))
     keys = (("bounds", "one-step bounds"), ("recorded", "recorded"), ("violated", "violated"), *ALARMED)
-    return Chart("Recorded values between their one-step bounds", heading(verdicts), columns, tuple(panels), keys)
+    return Chart(heading(verdicts), columns, tuple(panels), keys)
 
 
 def utilisation_chart(
@@ -375,10 +349,8 @@ def utilisation_chart(
         a, b, marks = (np.clip(v, -FARTHEST, FARTHEST) for v in (low[:, i], high[:, i], marks))
         series = (_series("utilisation", a, b, columns),)
         panels.append(_panel(model, columns, i, series, (-limit, limit), marks, bad, levels=(-1.0, 1.0)))
-    over = "" if row == 0 else f" over {model.steps[row - 1]} steps"
     keys = (("bounds", "inside the bounds"), ("utilisation", "utilisation"), ("violated", "violated"), *ALARMED)
-    name = f"Utilisation{over}: where between its bounds each state lay, -1 and 1 at the bounds"
-    return Chart(name, heading(verdicts), columns, tuple(panels), keys)
+    return Chart(heading(verdicts), columns, tuple(panels), keys)
 
 
 def utilisation_map(
@@ -391,7 +363,7 @@ def utilisation_map(
     values = np.where(bad, 2.0, np.minimum(size, 1.0))
     rows = tuple(model.state_names[i] for i in chosen)
     drawn = Map("|utilisation|", rows, values, count=int(verdicts.violated.sum()))
-    return Chart("Utilisation of each state over time", heading(verdicts), columns, (drawn,), MAPPED)
+    return Chart(heading(verdicts), columns, (drawn,), MAPPED)
 
 
 MAPPED = (("full", "at its bound"), ("violated", "violated"), ("alarm", "alarm"), ("silent", "no verdict"))
@@ -410,8 +382,7 @@ def horizon_chart(
             outside = (np.abs(table[:, :, i]) > 1.0).sum(axis=0).tolist()
         note = f"outside: {', '.join(map(str, outside))}"
         panels.append(Map(model.state_names[i], rows, values, note, sum(outside)))
-    name = "Utilisation over horizons: after how many steps a state lies outside its envelope"
-    return Chart(name, heading(verdicts), columns, tuple(panels), MAPPED)
+    return Chart(heading(verdicts), columns, tuple(panels), MAPPED)
 
 
 def chosen_states(model: UncertainLTI, verdicts: Verdicts, states: Sequence[str] | None) -> list[int]:
@@ -458,7 +429,7 @@ def _panel(
     count = int(bad[first : columns.stop].sum())
     unit = "" if levels else signal.unit
     note = f"violated {count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if count else ""
-    return Panel(signal.name, series, unit, limits, marks, levels, float(bad.sum()), count, note)
+    return Panel(signal.name, series, unit, limits, marks, levels, count, note)
 
 
 def _limits(lower: Array, upper: Array) -> tuple[float, float]:

@@ -13,30 +13,37 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from uncertain_lti import __version__
-from uncertain_lti.base.english import plural, times
+from uncertain_lti.base.english import plural, shortlist, times
 from uncertain_lti.base.files import sha256
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.check_data import check_data
-from uncertain_lti.reports.detectable_text import detectable_data
-from uncertain_lti.reports.regimes import block_facts, blocks_in_words
-from uncertain_lti.reports.reliance import WEIGHTS, answer, reasons
+from uncertain_lti.reports.check import UNVOUCHED, check_data
+from uncertain_lti.reports.model_text import block_facts, blocks_in_words
 from uncertain_lti.reports.tables import finite_data, list_of, number, numbers_of, shortened
-from uncertain_lti.reports.validation_text import rule_text
+from uncertain_lti.reports.validation_text import readable_validation
 
-APART = 10
-"""Verdicts without a violation that end an episode."""
+CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
+"""Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""
+RUNS_AWAY = 1.2
+"""Spectral radius of the nominal recursion from which on it says little of the machine even for a few steps."""
+CAUTION_INSIDE, TOO_FEW_INSIDE = 0.99, 0.9
+"""Share of the verdicts on left-out recordings that lie inside all bounds."""
+OUTSIDE_DOMAIN, WITHOUT_VERDICT = 0.05, 0.2
+"""Shares of the verdicts outside the fitted ranges, and of the samples without a verdict."""
+MOST_VIOLATED = 0.5
+"""Share of the verdicts violated from which on a model is refused of which nothing shows that it ever holds."""
+YES, CARE, UNKNOWN, NO = "yes", "with care", "unknown", "no"
+WEIGHTS = (NO, UNKNOWN, CARE, YES)
+"""From what weighs most: the answer is the first that some reason has."""
+_KNOWN = ("criterion", "additive", "transitions", "transients", "violations", "objective", "optimality_gap", "rank")
 
-
-MOST_EPISODES = 1000
+Reasons = Iterator[tuple[str, str, str]]
+"""Weight, subject and sentence of each reason."""
 
 
 def findings(
@@ -64,9 +71,9 @@ def findings(
     Returns
     -------
     dict
-        `rely`: an answer (yes, with care, unknown, no) and its reasons, each with how much it weighs; `happened`: a
-        sentence per recording; `model`, `validation` and `recordings` what they rest on. `recordings` holds what
-        `check --json` says, the files with their checksums, and episodes of violations.
+        `rely`: an answer (yes, with care, unknown, no) and its reasons, what weighs most first; `happened`: a sentence
+        per recording; `model`, `validation` and `recordings` what they rest on. `recordings` holds what `check --json`
+        says, and the files with their checksums.
 
     Raises
     ------
@@ -75,12 +82,26 @@ def findings(
     """
     rule = rule or model.alarm_rule
     rules = model.alarm if rule == model.alarm_rule else with_containment(model.alarm, rule)
-    recordings = [_recording(model, verdicts) for verdicts in checked]
-    validation = _validation(model)
-    for_and_against = reasons(model, validation, recordings)
-    facts: dict[str, Any] = {
+    recordings = []
+    for verdicts in checked:
+        files = [{"file": path, "sha256": sha256(path)} for path in verdicts.transient.sources]
+        recordings.append({**check_data(model, verdicts, samples=False), "files": files})
+    validation = readable_validation(model.validation)
+    kinds = (
+        _fit_reasons(model),
+        _regime_reasons(model, recordings),
+        _validation_reasons(model, validation),
+        _width_reasons(model, recordings),
+        _recording_reasons(model, recordings, validation),
+    )
+    reasons = sorted((reason for kind in kinds for reason in kind), key=lambda reason: WEIGHTS.index(reason[0]))
+    fit = model.fit_summary
+    facts = {
         "version": __version__,
-        "rely": {"answer": answer(for_and_against), "reasons": for_and_against},
+        "rely": {
+            "answer": reasons[0][0] if reasons else YES,
+            "reasons": [dict(zip(("weight", "about", "text"), reason, strict=True)) for reason in reasons],
+        },
         "happened": [_happened(r) for r in recordings],
         "alarm": any(r["alarm"] for r in recordings),
         "rule": {
@@ -90,7 +111,18 @@ def findings(
             "margin": rule.margin,
             "conditions": conditions,
         },
-        "model": _model(model, model_file),
+        "model": {
+            "file": os.fspath(model_file),
+            "sha256": sha256(model_file) if os.path.isfile(model_file) else None,
+            "fit": {key: fit[key] for key in _KNOWN if isinstance(fit.get(key), (str, int, float))},
+            "messages": _messages(model),
+            "sources": [
+                {key: str(source.get(key, "")) for key in ("file", "sha256")}
+                for source in list_of(fit.get("sources"))
+                if isinstance(source, Mapping)
+            ],
+            "regimes": block_facts(model),
+        },
         "validation": validation,
         "recordings": recordings,
     }
@@ -98,217 +130,151 @@ def findings(
     return finite
 
 
-def _model(model: UncertainLTI, model_file: str | os.PathLike[str]) -> dict[str, Any]:
-    fit = model.fit_summary
-    known = {
-        key: fit[key]
-        for key in (
-            "criterion",
-            "additive",
-            "transitions",
-            "transients",
-            "violations",
-            "objective",
-            "optimality_gap",
-            "rank",
-        )
-        if isinstance(fit.get(key), (str, int, float))
-    }
-    width = numbers_of(fit.get("mean_width_recorded"), model.n), numbers_of(fit.get("max_width_recorded"), model.n)
-    return {
-        "file": os.fspath(model_file),
-        "sha256": sha256(model_file) if os.path.isfile(model_file) else None,
-        "fit": known,
-        "messages": [str(m) for m in list_of(fit.get("messages"))],
-        "sources": [
-            {"file": str(s.get("file", "")), "sha256": str(s.get("sha256", ""))}
-            for s in list_of(fit.get("sources"))
-            if isinstance(s, Mapping)
-        ],
-        "states": [
-            {
-                "name": s.name,
-                "unit": s.unit,
-                "topic": s.topic,
-                "field": s.field,
-                "steady": s.steady,
-                "scale": s.scale,
-                "mean_width": width[0][i] if width[0] else None,
-                "max_width": width[1][i] if width[1] else None,
-            }
-            for i, s in enumerate(model.signals.states)
-        ],
-        "controls": [
-            {"name": s.name, "unit": s.unit, "topic": s.topic, "field": s.field} for s in model.signals.controls
-        ],
-        "clock": model.sampling.clock,
-        "dt_median": model.sampling.dt_median,
-        "scheduling": [
-            {"name": s.name, "unit": s.unit, "topic": s.topic, "field": s.field} for s in model.signals.scheduling
-        ],
-        "eigenvalues": [[float(v.real), float(v.imag)] for v in model.eigenvalues()] if model.schedule is None else [],
-        "schedule": "" if model.schedule is None else model.schedule.words,
-        "regimes": block_facts(model),
-        "regimes_in_words": blocks_in_words(model),
-    }
-
-
-def _validation(model: UncertainLTI) -> dict[str, Any] | None:
-    """The model's section on validation where it says what `validate` writes; another one counts as none."""
-    data = model.validation
-    try:
-        return {
-            "kind": "transients" if data["kind"] == "transients" else "blocks",
-            **{key: int(data[key]) for key in ("parts", "verdicts", "parts_inside")},
-            "hours": _real(data["hours"]),
-            "inside": None if data["inside"] is None else _real(data["inside"]),
-            "inside_interval": [_real(data["inside_interval"][0]), _real(data["inside_interval"][1])],
-            "confidence": _real(data["confidence"]),
-            "false_alarms": [
-                {
-                    "rule": rule_text(alarm),
-                    "alarms": int(alarm["alarms"]),
-                    "per_hour": _real(alarm["per_hour"]),
-                    "interval": [None if v is None else _real(v) for v in (alarm["interval"][0], alarm["interval"][1])],
-                }
-                for alarm in data["false_alarms"]
-            ],
-            "states": {name: _left_out(data["states"][name]) for name in model.state_names},
-            "words": str(data["scenario"]["words"]),
-            "what": "group" if data.get("groups") else "recording" if data["kind"] == "transients" else "block",
-            "condition": str(data.get("condition", "")),
-            "condition_short": str(data.get("condition_short", "")),
-            "hint": str(data.get("hint", "")),
-            "notes": [str(note) for note in data["notes"]],
-            "detectable": detectable_data(data),
-        }
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError):
-        return None
-
-
-def _left_out(state: Mapping[str, Any]) -> dict[str, Any]:
-    optional = ("inside", "mean_width_left_out", "mean_width_full")
-    kept: dict[str, Any] = {key: None if state[key] is None else _real(state[key]) for key in optional}
-    return {**kept, "parts_inside": int(state["parts_inside"])}
-
-
-def _real(value: Any) -> float:
-    """A finite number; raises TypeError or ValueError for anything else."""
-    if isinstance(value, str) or not math.isfinite(value):
-        raise ValueError
-    return float(value)
-
-
-def _recording(model: UncertainLTI, verdicts: Verdicts) -> dict[str, Any]:
-    transient = verdicts.transient
-    data = check_data(model, verdicts, samples=False)
-    x = np.where(np.isfinite(transient.x), transient.x, np.nan)
-    for i, name in enumerate(model.state_names):
-        there = x[~np.isnan(x[:, i]), i]
-        span = float(np.ptp(there)) if len(there) else None
-        state = data["states"][name]
-        state["range"] = span
-        state["width_to_range"] = state["mean_width"] / span if span and state["mean_width"] is not None else None
-        state["worst"] = _worst(verdicts, i, np.flatnonzero(verdicts.flags[:, i] == 1.0))
-    episodes, count = _episodes(model, verdicts)
-    return {
-        **data,
-        "files": [{"file": path, "sha256": sha256(path)} for path in transient.sources],
-        "seconds": float(np.abs(np.diff(transient.t_ns)).sum()) * 1e-9,
-        "episodes": episodes,
-        "episode_count": count,
-        "notes": list(transient.notes),
-    }
-
-
-def _episodes(model: UncertainLTI, verdicts: Verdicts) -> tuple[list[dict[str, Any]], int]:
-    """Violations that fewer than `APART` verdicts lie between; the first `MOST_EPISODES`, and how many there are."""
-    rows = np.flatnonzero(verdicts.violated)
-    if not len(rows):
-        return [], 0
-    order = np.cumsum(verdicts.judged)[rows]
-    pass_ = np.concatenate([[0], np.cumsum(np.diff(verdicts.transient.t_ns) < 0)])[rows]
-    begins = np.flatnonzero(np.concatenate([[True], (np.diff(order) > APART) | (np.diff(pass_) > 0)]))
-    ends = np.append(begins[1:], len(rows))
-    t, t_ns = verdicts.transient.t, verdicts.transient.t_ns
-    found = []
-    for a, b in list(zip(begins, ends, strict=True))[:MOST_EPISODES]:
-        inside = rows[a:b]
-        states = {}
-        for i, name in enumerate(model.state_names):
-            bad = inside[verdicts.flags[inside, i] == 1.0]
-            if len(bad):
-                states[name] = {"violations": len(bad), "first": float(t[bad[0]]), **_worst(verdicts, i, bad)}
-        first, last = int(inside[0]), int(inside[-1])
-        found.append(
-            {
-                "first": {"k": first, "t": float(t[first]), "t_ns": int(t_ns[first])},
-                "last": {"k": last, "t": float(t[last]), "t_ns": int(t_ns[last])},
-                "verdicts_violated": len(inside),
-                "alarm": bool(verdicts.alarm[first : last + 1].any()),
-                "states": states,
-            }
-        )
-    return found, len(begins)
-
-
-def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, Any]:
-    """Utilisation farthest from 0 among these samples (None where the bounds have no width), and when."""
-    if not len(rows):
-        return {"utilisation": None, "t": None}
-    utilisation = verdicts.utilisation[rows, state]
-    k = int(rows[np.argmax(np.abs(utilisation))])
-    value = float(verdicts.utilisation[k, state])
-    return {"utilisation": value if math.isfinite(value) else None, "t": float(verdicts.transient.t[k])}
+def findings_text(facts: Mapping[str, Any]) -> str:
+    """What `report` prints of `findings`."""
+    lines = [f"may I rely on it? {facts['rely']['answer']}"]
+    lines += [f"  {r['weight']}: {r['text']}" for r in facts["rely"]["reasons"]]
+    lines.append("what happened?")
+    return "\n".join(lines + [f"  {h['recording']}: {h['text']}" for h in facts["happened"]])
 
 
 def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     """One sentence, and whether there is something to look at."""
-    found = _violated(recording)
-    if not recording["frozen"]:
-        return found
-    first = "frozen: {text}, {why}".format_map(recording["frozen"][0])
-    more = len(recording["frozen"]) - 1
-    return {**found, "state": "alarm", "text": f"{first}{f', and {more} more' * bool(more)}. {found['text']}"}
-
-
-def _violated(recording: Mapping[str, Any]) -> dict[str, Any]:
-    """What is said of its verdicts."""
-    judged, bad = recording["verdicts"], recording["violated"]
+    judged, bad, state = recording["verdicts"], recording["violated"], recording["outcome"]
+    text = f"{plural(judged, 'verdict')} over {number(recording['seconds'])} s: "
     if not judged:
-        return {"recording": recording["recording"], "state": "unknown", "text": "no verdict was possible"}
-    over = f"{plural(judged, 'verdict')} over {number(recording['seconds'])} s"
-    unknown = recording["outcome"] == "unknown"
-    but = f", but {recording['reason']}" if unknown else ""
-    if not bad:
-        state = "unknown" if unknown else "quiet"
-        return {
-            "recording": recording["recording"],
-            "state": state,
-            "text": f"{over}: every one inside all bounds{but}",
-        }
-    states = {name: s["violations"] for name, s in recording["states"].items() if s["violations"]}
-    most = sorted(states, key=lambda name: -states[name])[:3]
-    text = f"{over}: {bad} violated, {_episodes_word(recording['episode_count'])}, first at "
-    listed = ", ".join(f"{shortened(name)} ({states[name]})" for name in most)
-    text += f"{recording['episodes'][0]['first']['t']:.8g} s; most often {listed}"
-    if recording["alarm"]:
-        first = recording["alarms"][0]
-        text += f". The alarm was raised {times(len(recording['alarms']))}, first at {first['t']:.8g} s"
-        return {"recording": recording["recording"], "state": "alarm", "text": text}
-    state = "unknown" if unknown else "violations"
-    return {"recording": recording["recording"], "state": state, "text": f"{text}. The alarm was not raised{but}"}
+        text = "no verdict was possible"
+    elif not bad:
+        text += "every one inside all bounds"
+    else:
+        states = {name: s["violations"] for name, s in recording["states"].items() if s["violations"]}
+        most = sorted(states, key=lambda name: -states[name])[:3]
+        count, first = recording["episode_count"], recording["episodes"][0]["first"]["t"]
+        text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first:.8g} s; "
+        text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}. The alarm was "
+        text += "not raised" if not recording["alarm"] else f"raised {times(len(recording['alarms']))}, first at "
+        text += f"{recording['alarms'][0]['t']:.8g} s" if recording["alarm"] else ""
+    if judged and state == "unknown":
+        text += f", but {recording['reason']}"
+    if frozen := [f"{repeat['text']}, {repeat['why']}" for repeat in recording["frozen"]]:
+        text = f"frozen: {shortlist(frozen, 1)}. {text}"
+    return {"recording": recording["recording"], "state": state, "text": text}
 
 
-def _episodes_word(count: int) -> str:
-    return "in one episode" if count == 1 else f"in {count} episodes"
+# --- reasons for and against relying on a model ------------------------------------------------------------------
 
 
-def findings_text(facts: Mapping[str, Any]) -> str:
-    """What `report` prints of `findings`."""
-    lines = [f"may I rely on it? {facts['rely']['answer']}"]
-    reasons = sorted(facts["rely"]["reasons"], key=lambda r: WEIGHTS.index(r["weight"]))
-    lines += [f"  {r['weight']}: {r['text']}" for r in reasons]
-    lines.append("what happened?")
-    lines += [f"  {h['recording']}: {h['text']}" for h in facts["happened"]]
-    return "\n".join(lines)
+def _messages(model: UncertainLTI) -> list[str]:
+    return [str(message) for message in list_of(model.fit_summary.get("messages"))]
+
+
+def _fit_reasons(model: UncertainLTI) -> Reasons:
+    messages = _messages(model)
+    for message in messages:  # widths and the blocks of a schedule have reasons of their own below
+        if not message.startswith(("the bounds are over", "the block at")):
+            yield CARE, "fit", message
+    if not model.fit_summary:
+        yield CARE, "fit", "the model file does not say how it was fitted"
+    radius = model.spectral_radius() if model.sampling.dt_median is not None else 0.0
+    if RUNS_AWAY < radius < math.inf and not any("spectral radius" in message for message in messages):
+        grows = f"a deviation can grow {number(radius)} times in a step (spectral radius)"
+        yield CARE, "stability", f"the nominal model runs away: {grows}"
+
+
+def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> Reasons:
+    """Regimes with little data, and verdicts in regimes that the model does not know."""
+    for text in blocks_in_words(model):
+        yield CARE, "regimes", text
+    judged, unknown = (sum(r[key] for r in recordings) for key in ("verdicts", "unknown_regime"))
+    why = "; ".join(dict.fromkeys(text for r in recordings for text in r["unknown"]))
+    if judged and unknown:
+        weight = UNKNOWN if unknown > UNVOUCHED * judged else CARE
+        share = _percent(unknown / judged)
+        yield weight, "regimes", f"{share} of the verdicts are in regimes that the model does not know: {why}"
+    elif why:
+        yield CARE, "regimes", why
+
+
+def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | None) -> Reasons:
+    alarm = model.fit_summary.get("alarm")
+    if isinstance(alarm, Mapping) and alarm.get("headline"):
+        weight = {"good": YES, "some": CARE}.get(str(alarm.get("worth")), NO)
+        yield weight, "alarm", "; ".join(map(str, [alarm["headline"], *list_of(alarm.get("promises"))]))
+    elif validation is None or validation["inside"] is None:
+        how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"
+        why = f" ({why})" if (why := model.validation.get("not_done")) else ""
+        unknown = f"it has not been validated{why}, so how it does on other recordings is unknown; {how}"
+        yield UNKNOWN, "validation", unknown
+        return
+    else:
+        inside, whole, parts = (validation[key] for key in ("inside", "parts_inside", "parts"))
+        weight = NO if inside < TOO_FEW_INSIDE else CARE if inside < CAUTION_INSIDE else YES
+        if 2 * whole < parts and weight == YES:
+            weight = CARE  # few violations, and yet nearly every run has some: an alarm on one would be a habit
+        what, but = "recordings", ""
+        if validation["kind"] != "transients":
+            what, but = "blocks", "; they are of the same run, so another day may differ"
+        yield (
+            weight,
+            "validation",
+            f"of {plural(validation['verdicts'], 'verdict')} on {what} that were left out of the fit "
+            f"{_percent(inside)} lay inside ({whole} of {parts} whole {what}){but}",
+        )
+    if validation is not None and validation.get("hint"):
+        yield CARE, "validation", str(validation["hint"])
+
+
+def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> Reasons:
+    """Bounds about as wide as what the state does contain everything, and say nothing.
+
+    Widths and ranges are those of the fit, as the fit itself prints them; of a model that does not say them, those of
+    the recordings at hand: the least share, as a recording in which a state hardly moves says nothing.
+    """
+    span = (model.domain.x_max - model.domain.x_min).tolist()
+    widths = numbers_of(model.fit_summary.get("mean_width"), model.n) or [math.nan] * model.n
+    of = zip(model.state_names, widths, span, strict=True)
+    wide = {name: width / s for name, width, s in of if 0 < s < math.inf and math.isfinite(width)}
+    where = "in the fit" if wide else "in what was checked"
+    for name in model.state_names if not wide else ():
+        shares = [r["states"][name]["width_to_range"] for r in recordings]
+        wide[name] = min((share for share in shares if share is not None), default=0.0)
+    worst = max(wide, key=lambda name: wide[name])
+    useless = [f"{shortened(name)} ({wide[name]:.0%})" for name in model.state_names if wide.get(name, 0.0) > TOO_WIDE]
+    if useless:
+        armed = isinstance(model.fit_summary.get("alarm"), Mapping)  # a window sees less than what a width says
+        weight = NO if 2 * len(useless) >= model.n and not armed else CARE
+        wider = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range {where} say next to nothing"
+        yield weight, "tightness", f"{wider}: {shortlist(useless, 6)}"
+    elif wide[worst] > 0.0:
+        weight = CARE if wide[worst] > CAUTION_WIDTH else YES
+        most = f"one-step bounds are at most {wide[worst]:.3g} times as wide as the state's own range {where}"
+        yield weight, "tightness", f"{most} ({shortened(worst)})"
+
+
+def _recording_reasons(
+    model: UncertainLTI, recordings: Sequence[Mapping[str, Any]], validation: Mapping[str, Any] | None
+) -> Reasons:
+    fitted = {s.get("sha256") for s in list_of(model.fit_summary.get("sources")) if isinstance(s, Mapping)} - {None, ""}
+    if same := [os.path.basename(r["recording"]) for r in recordings if any(f["sha256"] in fitted for f in r["files"])]:
+        proves = "which it contains by construction: that proves nothing"
+        yield CARE, "recordings", f"checked on what it was fitted to ({shortlist(same, 4)}), {proves}"
+    judged = sum(r["verdicts"] for r in recordings)
+    if not judged:
+        yield NO, "recordings", "no verdict was possible on what was checked, so nothing is known of it"
+        return
+    violated, outside = (sum(r[key] for r in recordings) / judged for key in ("violated", "outside_domain"))
+    silent = 1.0 - judged / sum(r["samples"] for r in recordings)
+    if violated > MOST_VIOLATED and (validation is None or validation["inside"] is None):
+        nothing = "nothing shows that the model holds on any healthy recording that it was not fitted to"
+        text = f"{_percent(violated)} of the verdicts are violated, and {nothing}: such a verdict cannot tell a fault"
+        yield NO, "recordings", text
+    if outside > OUTSIDE_DOMAIN:
+        yield CARE, "recordings", f"{_percent(outside)} of the verdicts are outside the ranges seen in the fit"
+    if silent > WITHOUT_VERDICT:
+        yield CARE, "recordings", f"{_percent(silent)} of the samples have no verdict (gaps, missing values)"
+
+
+def _percent(share: float) -> str:
+    """Never 100 % of what is not all."""
+    text = f"{100 * share:.2f}"
+    return "over 99.99 %" if text == "100.00" and share < 1.0 else f"{text} %"

@@ -7,89 +7,209 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What `info` prints of a model."""
+"""What `fit` and `info` print of a model, and what a report has of it."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.english import plural, shortlist
+from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.reports.detectable_text import condition_text, detectable_data, detectable_words
-from uncertain_lti.reports.regimes import MOST_REGIMES, block_facts, blocks_in_words
-from uncertain_lti.reports.tables import number, table
+from uncertain_lti.reports.tables import Block, Table, list_of, named, number, numbers_of, share, text_of
+from uncertain_lti.reports.validation_text import condition_text, detectable_data, detectable_words, left_out_text
+from uncertain_lti.sampling.reading import unused
+from uncertain_lti.sampling.transient import Transient
+
+MOST_SHOWN = 20
+"""Signals whose elements, and discarded transitions that are printed."""
 
 
-def model_text(model: UncertainLTI) -> str:
-    """Summary of a model file."""
+def recording_text(transient: Transient) -> str:
+    """One recording: what was read, and what of it is not used."""
+    usable, left = int(transient.usable.sum()), ", ".join(unused(transient))
+    span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
+    text = f"{plural(len(transient), 'sample')} over {span:.4g} s, {plural(usable, 'usable transition')}"
+    return f"{transient.name}: {text}{f' ({left})' * bool(left)}"
+
+
+def fit_text(model: UncertainLTI) -> str:
+    """What was fitted: what it is worth, how it was chosen, its widths, its alarm, and what the user should know."""
+    facts = model.fit_summary
+    blocks: list[Block] = [headline_text(model)]
+    for choice in facts.get("schedule", []):
+        blocks += schedule_blocks(choice)
+    if choice := facts.get("horizon_choice"):
+        blocks += horizon_blocks(choice)
+    criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
+    gap = facts.get("optimality_gap")
+    blocks += [
+        f"criterion {criterion}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
+        f"{facts['violations']} outside, optimality gap {'not known' if gap is None else f'{gap:.1e}'}",
+        *_widths(model),
+        *_dynamics(model),
+    ]
+    if "discarded" in facts:
+        before = ", ".join(map(number, facts["with_discarded"]["mean_width_recorded"]))
+        gone = [f"{d['file']} t = {d['t']:.4f} s" for d in facts["discarded"]]
+        blocks.append(
+            f"discarded {plural(len(gone), 'transition')} (mean width with them: {before}): "
+            f"{shortlist(gone, MOST_SHOWN)}"
+        )
+    blocks += [f"note: {message}" for message in facts.get("messages", [])]
+    blocks.append(alarm_text(model))
+    if model.validation:
+        blocks.append(left_out_text(model.validation))
+    return text_of(blocks)
+
+
+def model_blocks(model: UncertainLTI) -> list[Block]:
+    """What is in a model: its signals, elements, widths, alarm, and the faults that it sees."""
     s, facts = model.sampling, model.fit_summary
-    lines = [repr(model)]
+    blocks: list[Block] = [repr(model)]
     if s.clock:
-        lines.append(
+        blocks.append(
             f"clock {s.clock} ({s.time.get(s.clock, '?')} time), step {number(s.dt_median)} s "
             f"({number(s.dt_min)} to {number(s.dt_max)}), max_gap {number(s.max_gap)} s"
         )
-    signals = [
-        [
-            f"{kind} {signal.name}",
-            signal.topic or "-",
-            signal.field,
-            number(float(signal.steady)),
-            number(float(signal.scale)),
-            signal.unit or "-",
-        ]
+    rows = [
+        [f"{kind} {x.name}", x.topic or "-", x.field, number(float(x.steady)), number(float(x.scale)), x.unit or "-"]
         for kind, group in (
             ("state", model.signals.states),
             ("control", model.signals.controls),
             ("scheduling", model.signals.scheduling),
         )
-        for signal in group
+        for x in group
     ]
-    lines.append(table(("signal", "topic", "field", "steady", "scale", "unit"), signals))
-    lines += _scheduled_text(model) if model.schedule is not None else [_elements(model), *dynamics_text(model)]
-    if facts.get("mean_width_recorded"):
-        widths = [
-            [name, number(a), number(b)]
-            for name, a, b in zip(
-                model.state_names, facts["mean_width_recorded"], facts["max_width_recorded"], strict=True
-            )
-        ]
-        lines.append(table(("one-step envelope", "mean width", "largest"), widths))
-    lines += horizon_widths_text(model)
+    blocks.append(Table(("signal", "topic", "field", "steady", "scale", "unit"), rows, left=(1, 2), most=300))
+    if model.schedule is None and model.n + model.m <= MOST_SHOWN:
+        blocks.append(_elements(model))
+    blocks += [*_dynamics(model), *_widths(model)]
     for rule in model.alarm:
+        words = rule.words
         if isinstance(rule, AlarmRule):
             over = "" if rule.horizon == 1 else f" over {rule.horizon} steps"
-            lines.append(
-                f"alarm: {rule.violations} of the last {plural(rule.window, 'verdict')} violated{over}; margin "
-                f"{number(rule.margin)}"
-            )
-        else:
-            lines.append(f"alarm: {rule.words}")
+            last = plural(rule.window, "verdict")
+            words = f"{rule.violations} of the last {last} violated{over}; margin {number(rule.margin)}"
+        blocks.append(f"alarm: {words}")
     if model.signatures:
-        lines.append(f"signatures of faults: {', '.join(signature.label for signature in model.signatures)}")
+        blocks.append(f"signatures of faults: {', '.join(signature.label for signature in model.signatures)}")
     if (faults := detectable_data(model.validation)) is not None:
-        lines += [condition_text(faults), *(f"  {text}" for text in detectable_words(faults))]
-    return "\n".join(lines + [f"note: {message}" for message in facts.get("messages", [])])
+        blocks += [condition_text(faults), *(f"  {text}" for text in detectable_words(faults))]
+    return blocks + [f"note: {message}" for message in list_of(facts.get("messages"))]
 
 
-def horizon_widths_text(model: UncertainLTI) -> list[str]:
-    """Widths of the envelopes over several steps."""
-    if not (over := model.fit_summary.get("horizons")):
-        return []
-    rows = [[str(h["steps"]), number(h["seconds"]), h["widths"], *map(number, h["mean_width_recorded"])] for h in over]
-    return [table(("mean width after steps", "s", "half-widths", *model.state_names), rows)]
+def model_text(model: UncertainLTI) -> str:
+    """Summary of a model file."""
+    return text_of(model_blocks(model))
 
 
-MOST_PRINTED = 12
-"""Blocks whose elements are printed."""
+def headline_text(model: UncertainLTI) -> str:
+    """Whether the model is worth having, in one line."""
+    alarm = model.fit_summary.get("alarm", {})
+    why = alarm.get("not_learnt") or "the alarm was given"
+    return str(alarm.get("headline") or f"alarm not learnt on left-out data, so nothing says what it is worth: {why}")
 
 
-def _elements(model: UncertainLTI, title: str = "A, B [1/s]") -> str:
-    """Elements of one block with their half-widths."""
+def alarm_text(model: UncertainLTI) -> str:
+    """What raises the alarm, and what it promises."""
+    alarm = model.fit_summary.get("alarm", {})
+    said = [*alarm.get("promises", []), *([alarm["note"]] if "note" in alarm else [])]
+    return "\n".join(["alarm: " + "; or ".join(rule.words for rule in model.alarm), *(f"  {text}" for text in said)])
+
+
+def next_text(model: UncertainLTI, file: str) -> str:
+    """What to look at after a fit: the first thing that a person can mend, and the commands that tell more."""
+    facts = model.fit_summary
+    minded = [text for text in facts.get("messages", []) if "schedules nothing" not in text]
+    blind = facts.get("alarm", {}).get("worth") in ("none", "some")
+    remedy = remedies(facts.get("messages", []), facts["additive"], model.state_names[0]) if blind else ""
+    worry = remedy or (minded[0] if minded else "")
+    if not worry and facts["transients"] == 1:
+        worry = "one recording says nothing of another day; check the model on one that was not fitted"
+    rows = [
+        (f"uncertain-lti check {file} BAG", "is there an alarm on a recording that was not fitted?"),
+        (f"uncertain-lti report {file} BAG", "may I rely on it, and what happened? a page with figures"),
+        (f"envelope_monitor --ros-args -p model:={file}", "the same live"),
+    ]
+    width = max(len(command) for command, _ in rows)
+    first = [f"look first at: {worry}"] if worry else []
+    return "\n".join([*first, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])
+
+
+def schedule_blocks(choice: Mapping[str, Any]) -> list[Block]:
+    """How the number of knots of one signal was chosen."""
+    tried = [c for c in choice["candidates"] if "refused" not in c]
+    rows = [
+        [
+            _chosen(c["knots"], c["knots"] == choice["chosen"]),
+            share(c["outside"], 2),
+            share(c["excess"]),
+            f"x {c['width']:.3g} ± {c['width_error']:.2g}" if c["knots"] > 1 else "x 1",
+            ", ".join(f"{k:.4g}" for k in c["at"]) or "-",
+        ]
+        for c in tried
+    ]
+    refused = [f"  {plural(c['knots'], 'knot')}: {c['refused']}" for c in choice["candidates"] if "refused" in c]
+    title = f"knots on {choice['signal']}, {_left_out(choice)}:"
+    return [title, *([Table(("knots", "outside", "excess", "mean width", "at"), rows)] if rows else []), *refused]
+
+
+def horizon_blocks(choice: Mapping[str, Any]) -> list[Block]:
+    """How the horizons and their half-widths were chosen."""
+    rows = [
+        [
+            _chosen(c["steps"], c["taken"]),
+            c["widths"],
+            share(c["outside"], 2),
+            f"x {c['width']:.3g}",
+            f"x {c['per_step']:.3g}",
+            c["why"],
+        ]
+        for c in choice["candidates"]
+    ]
+    if not rows:
+        return [f"horizons: {choice['reason']}"]
+    header = ("steps", "half-widths", "outside", "width", "per step", "")
+    return [f"horizons, {_left_out(choice)} (one step: x 1):", Table(header, rows)]
+
+
+def _left_out(choice: Mapping[str, Any]) -> str:
+    return f"by leaving out one {choice['left_out']} of {choice['units']} at a time"
+
+
+def _chosen(count: int, chosen: bool) -> str:
+    return f"{count}{' (chosen)' * chosen}"
+
+
+def _widths(model: UncertainLTI) -> list[Block]:
+    """Widths of one step beside what the states did in the fit, and over several steps."""
+    facts, blocks = model.fit_summary, list[Block]()
+    mean, largest = (numbers_of(facts.get(f"{which}_width_recorded"), model.n) for which in ("mean", "max"))
+    if mean and largest:
+        spans = ((model.domain.x_max - model.domain.x_min) * model.operating_point.X).tolist()
+        rows = []
+        for signal, width, most, span in zip(model.signals.states, mean, largest, spans, strict=True):
+            known = math.isfinite(span) and span > 0
+            of = [number(span), share(width / span, 2)] if known else ["-", "-"]
+            rows.append([named(signal.name, signal.unit), number(width), number(most), *of])
+        header = ("one-step envelope", "mean width", "largest", "range", "width/range")
+        blocks.append(Table(header, rows, most=200))
+    if over := facts.get("horizons"):
+        rows = [
+            [str(h["steps"]), number(h["seconds"]), h["widths"], *map(number, h["mean_width_recorded"])] for h in over
+        ]
+        blocks.append(Table(("mean width after steps", "s", "half-widths", *model.state_names), rows))
+    return blocks
+
+
+def _elements(model: UncertainLTI) -> Table:
+    """Elements with their half-widths."""
     names = [*model.state_names, *model.control_names]
     nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
     shown = [
@@ -103,67 +223,75 @@ def _elements(model: UncertainLTI, title: str = "A, B [1/s]") -> str:
         + [f"{pair[i, 0]:.4g} ± {pair[i, 1]:.3g}" for _, pair in shown]
         for i, name in enumerate(model.state_names)
     ]
-    return table((title, *names, *(name for name, _ in shown)), rows)
+    return Table(("A, B [1/s]", *names, *(name for name, _ in shown)), rows)
 
 
-def _scheduled_text(model: UncertainLTI) -> list[str]:
-    """Regimes, then the elements of each block that has some of its own."""
-    lines = regimes_text(model)
-    own = [r for r, data in enumerate(model.block_data) if data.tied_to is None]
-    lines += [_elements(model.blocks[r], f"{r}: {model.block_name(r)}: A, B [1/s]") for r in own[:MOST_PRINTED]]
-    if (more := len(own) - MOST_PRINTED) > 0:
-        lines.append(f"  and the elements of {plural(more, 'more regime')}; --json has all")
-    return lines
-
-
-def regimes_text(model: UncertainLTI) -> list[str]:
-    """The regimes of a scheduled model: data, mean widths when fitted, eigenvalues and time constants."""
+def _dynamics(model: UncertainLTI) -> list[Block]:
+    """How fast a model is: eigenvalues, or what each regime rests on with its time constants."""
     if model.schedule is None:
-        return []
-    blocks = block_facts(model)
-    widths = any(block["mean_width"] for block in blocks)
-    header = ["regime", "transitions", "elements of"]
+        values = [v.real if v.imag == 0 else v for v in model.eigenvalues()]
+        return [f"eigenvalues of A [1/s]: {', '.join(f'{v:.4g}' for v in values)}"]
+    facts = block_facts(model)
+    widths = any(block["mean_width"] for block in facts)
+    header = ["regime", "transitions", "elements of", "time constants [s]"]
     header += [f"{name}: mean width" for name in model.state_names] * widths
     rows = []
-    names = [f"{r}: {block['regime']}" for r, block in enumerate(blocks)]
-    for name, block in zip(names[:MOST_REGIMES], blocks, strict=False):
+    for block in facts:
         transitions = "unknown" if block["transitions"] is None else str(block["transitions"])
-        row = [name, transitions if block["known"] else "0, not visited"]
-        row.append("its own" if block["tied_to"] is None else f"regime {block['tied_to']}")
-        row += [number(w) for w in block["mean_width"] or [None] * model.n] * widths
-        rows.append(row)
-    lines = [
-        f"scheduled on {model.schedule.words}, {plural(model.schedule.blocks, 'regime')}",
-        table(header, rows),
-        table(
-            ("regime", "eigenvalues of A [1/s]", "time constants [s]"),
-            [
-                [name, _eigenvalues(b["eigenvalues"]), ", ".join(_constant(v) for v in b["time_constants"])]
-                for name, b in zip(names[:MOST_REGIMES], blocks, strict=False)
-            ],
-        ),
-    ]
-    if (more := len(blocks) - MOST_REGIMES) > 0:
-        lines.append(f"  and {plural(more, 'more regime')}; --json has all")
-    return lines + [f"note: {text}" for text in blocks_in_words(model)]
+        row = [block["regime"], transitions if block["known"] else "0, not visited"]
+        row.append("its own" if block["tied_to"] is None else facts[block["tied_to"]]["regime"])
+        row.append(", ".join("grows" if v is None else number(v) for v in block["time_constants"]))
+        rows.append(row + [number(w) for w in block["mean_width"] or [None] * model.n] * widths)
+    title = f"scheduled on {model.schedule.words}, {plural(model.schedule.blocks, 'regime')}"
+    return [title, Table(header, rows), *(f"note: {text}" for text in blocks_in_words(model))]
 
 
-def _constant(value: float | None) -> str:
-    return "grows" if value is None else number(value)
+def block_facts(model: UncertainLTI) -> list[dict[str, Any]]:
+    """What each block of a scheduled model rests on, and how fast it is."""
+    if model.schedule is None:
+        return []
+    fitted = list_of(model.fit_summary.get("blocks"))
+    knots = model.schedule.recorded_values(model.signals.signals)
+    facts = []
+    for r, (data, values) in enumerate(zip(model.block_data, model.eigenvalues(), strict=True)):
+        said = fitted[r] if r < len(fitted) and isinstance(fitted[r], Mapping) else {}
+        widths = numbers_of(said.get("mean_width"), model.n)
+        axes = zip(model.schedule.axes, knots, model.schedule.indices[r], strict=True)
+        facts.append(
+            {
+                "regime": model.block_name(r),
+                "at": {axis.signal: float(values_of[k]) for axis, values_of, k in axes},
+                "transitions": data.transitions,
+                "tied_to": data.tied_to,
+                "known": data.known,
+                "mean_width": None if widths is None else (np.array(widths) * model.operating_point.X).tolist(),
+                "eigenvalues": [[float(v.real), float(v.imag)] for v in values],
+                "time_constants": [-1.0 / float(v.real) if v.real < 0 else None for v in values],
+            }
+        )
+    return facts
 
 
-def eigenvalues_text(model: UncertainLTI) -> str:
-    """Eigenvalues of A of a model without a schedule in one line."""
-    return _eigenvalues([[float(v.real), float(v.imag)] for v in model.eigenvalues()])
-
-
-def _eigenvalues(pairs: Sequence[Sequence[float]]) -> str:
-    return ", ".join(
-        f"{real:.4g}{imag:+.4g}j" if abs(imag) > 1e-12 * math.hypot(real, imag) else f"{real:.4g}"
-        for real, imag in pairs
-    )
-
-
-def dynamics_text(model: UncertainLTI) -> list[str]:
-    """How fast a fitted model is: eigenvalues in one line, or the regimes of a scheduled model."""
-    return regimes_text(model) or [f"eigenvalues of A [1/s]: {eigenvalues_text(model)}"]
+def blocks_in_words(model: UncertainLTI) -> list[str]:
+    """What a reader should know of the blocks of a scheduled model."""
+    if model.schedule is None:
+        return []
+    found, of = [], model.schedule.blocks
+    unknown, tied = [], []
+    for r, data in enumerate(model.block_data):
+        if not data.known:
+            unknown.append(model.block_name(r))
+        elif data.tied_to is not None:
+            tied.append(f"{model.block_name(r)} (as {model.block_name(data.tied_to)})")
+    if unknown:
+        found.append(
+            f"no recording visited {plural(len(unknown), 'regime')} of {of}, and no bound there can be trusted: "
+            f"{shortlist(unknown, 6)}; record the machine there, or leave the knots out"
+        )
+    if tied:
+        whose = "its" if len(tied) == 1 else "their"
+        few = f"{plural(len(tied), 'regime')} of {of} had too little data for elements of {whose} own"
+        found.append(f"{few}: {shortlist(tied, 6)}")
+    if any(data.transitions is None for data in model.block_data):
+        found.append("the model file does not say how much data each regime had")
+    return found

@@ -7,27 +7,52 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Tables, numbers and names as a person reads them, and data as JSON holds it."""
+"""Blocks: lines and tables that texts and pages are made of; numbers and names in them."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
+
+from uncertain_lti.base.english import plural
+
+
+@dataclass(frozen=True)
+class Table:
+    """Cells as text; columns but the first and those in `left` stand to the right; `most` rows are shown."""
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    left: Sequence[int] = ()
+    most: int = 40
+
+    def __str__(self) -> str:
+        lines = [self.header, *self.rows[: self.most]]
+        sides = [str.ljust if i == 0 or i in self.left else str.rjust for i in range(len(self.header))]
+        columns = [
+            [side(cell, max(map(len, cells))) for cell in cells]
+            for side, cells in zip(sides, zip(*lines, strict=True), strict=True)
+        ]
+        text = ["  " + "  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
+        more = len(self.rows) - self.most
+        return "\n".join(text + [f"  and {plural(more, 'more row')}; --json has all"] * (more > 0))
+
+
+Block = str | Table
+"""A line, or a table."""
+
+
+def text_of(blocks: Iterable[Block]) -> str:
+    """Blocks as text for a terminal."""
+    return "\n".join(map(str, blocks))
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Columns aligned with spaces; the first to the left, the others to the right."""
-    lines = [list(header), *(list(row) for row in rows)]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(header))]
-    return "\n".join(
-        "  "
-        + "  ".join(
-            cell.ljust(width) if i == 0 else cell.rjust(width)
-            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-        ).rstrip()
-        for line in lines
-    )
+    """A table as text, every row of it."""
+    rows = list(rows)
+    return str(Table(header, rows, most=len(rows)))
 
 
 def number(value: float | None) -> str:
@@ -35,8 +60,20 @@ def number(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
-def beyond(utilisation: float) -> str:
-    """A violated utilisation with as many digits as show that it is beyond -1 or 1."""
+def share(value: float | None, digits: int = 3) -> str:
+    """A share in percent, or a dash for nothing."""
+    return "-" if value is None else f"{value:.{digits}%}"
+
+
+def named(name: str, unit: str) -> str:
+    """A name and its unit."""
+    return f"{name} [{unit}]" if unit else name
+
+
+def beyond(utilisation: float | None) -> str:
+    """A violated utilisation with as many digits as show that it is beyond -1 or 1; None: the bounds have no width."""
+    if utilisation is None:
+        return "no width"
     for digits in range(3, 10):
         text = f"{utilisation:.{digits}g}"
         if abs(float(text)) > 1.0:

@@ -204,7 +204,7 @@
     holder.replaceChildren();
     $("note").textContent = now.note;
     panels().forEach((panel) => {
-      const box = element("section"), head = element("h2", panel.title + (panel.unit ? ` [${panel.unit}]` : ""));
+      const box = element("section"), head = element("h3", panel.title + (panel.unit ? ` [${panel.unit}]` : ""));
       head.append(element("small", panel.note));
       box.append(head);
       holder.append(box);

@@ -1,0 +1,501 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Facts of a check as plain data, and as blocks of text."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.english import plural, shortlist, times
+from uncertain_lti.model.jumps import jump_words, jumps
+from uncertain_lti.model.operating_point import recorded
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.frozen import repeat_words
+from uncertain_lti.monitor.likeness import LEAST, over_recording
+from uncertain_lti.monitor.verdict import Verdicts
+from uncertain_lti.reports.charts import runs
+from uncertain_lti.reports.tables import Block, Table, beyond, named, number, share, shortened, text_of
+from uncertain_lti.sampling.reading import unused
+from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.transient import Transient
+
+UNVOUCHED, STRANGE = 0.2, 0.5
+"""Share of the verdicts outside the fitted domain from which on their quiet says nothing; there, or in alarm from early
+on, from which the machine may be another."""
+JUDGED = 0.5
+"""Share of the steps that must have a verdict for their quiet to say something."""
+APART = 10
+"""Verdicts without a violation that end an episode."""
+MOST_EPISODES, MOST_EXPLAINED = 1000, 100
+"""Episodes, and patterns of alarms, in the data."""
+MOST_SHOWN = 5
+"""Frozen repeats, patterns and rules that the text names."""
+OUTCOMES = ("alarm", "unknown", "violations", "quiet")
+"""What a check can come to, from what weighs most."""
+
+
+def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) -> dict[str, Any]:
+    """Result of a check as plain data.
+
+    Counts and widths per state, the spans of alarm with what raised them, episodes of violations, exact repeats
+    (`frozen` raised the alarm, `repeats` are longer than any of the fit), what alarms look like (`explained`); of a
+    scheduled model what became of each regime and why one is unknown, of a model with horizons the windows of each.
+    With samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no verdict).
+    """
+    transient, judged = verdicts.transient, int(verdicts.judged.sum())
+    data: dict[str, Any] = {
+        "recording": transient.name,
+        "samples": len(transient),
+        "seconds": float(np.abs(np.diff(transient.t_ns)).sum()) * 1e-9,
+        "verdicts": judged,
+        "no_verdict": _not_judged(verdicts),
+        "violated": int(verdicts.violated.sum()),
+        "inside": _inside(int(verdicts.violated.sum()), judged),
+        "outside_domain": int(verdicts.outside_domain.sum()),
+        "outside_domain_share": int(verdicts.outside_domain.sum()) / judged if judged else None,
+        "unknown_regime": int(verdicts.unknown_regime.sum()),
+        "unknown": unknown_in_words(model, verdicts),
+        "regimes": check_regimes(model, verdicts),
+        "states": _states(model, verdicts),
+        "horizons": _horizons(model, verdicts),
+        "alarm": bool(verdicts.alarm.any()),
+        "alarms": [
+            {**_span(transient, start, stop), "raised": [_why(reason) for reason in verdicts.raised(start)]}
+            for start, stop in runs(verdicts.alarm)
+        ],
+        "episodes": [_episode(model, verdicts, rows) for rows in islice(_episodes(verdicts), MOST_EPISODES)],
+        "episode_count": sum(1 for _ in _episodes(verdicts)),
+        "frozen": _repeats(model, verdicts, verdicts.frozen),
+        "repeats": _repeats(model, verdicts, verdicts.repeating),
+        "explained": list(islice(_explained(model, verdicts), MOST_EXPLAINED)),
+        "notes": list(transient.notes),
+    }
+    data["reason"] = _why_unknown(model, verdicts, data)
+    found = (data["alarm"], bool(data["reason"]), data["violated"], True)
+    data["outcome"] = next(outcome for outcome, there in zip(OUTCOMES, found, strict=True) if there)
+    if samples:
+        data["verdict_per_sample"] = _per_sample(model, verdicts)
+    return data
+
+
+def outcome(recordings: Sequence[dict[str, Any]]) -> str:
+    """The outcome of several recordings: the first of OUTCOMES that one of them has."""
+    return min((r["outcome"] for r in recordings), key=OUTCOMES.index, default=OUTCOMES[-1])
+
+
+def _not_judged(verdicts: Verdicts) -> list[str]:
+    withheld = verdicts.withheld.any(axis=1)
+    counts = {
+        Status.STEP.value: verdicts.unfitted_step,
+        Status.MODE.value: verdicts.unlisted_mode,
+        Status.FROZEN.value: withheld & ~verdicts.judged,
+        Status.UNASKED.value: np.array([]) if verdicts.asked is None else ~verdicts.asked,
+        "frozen in part": withheld & verdicts.judged,
+    }
+    return [*unused(verdicts.transient), *(f"{int(n.sum())} {word}" for word, n in counts.items() if n.any())]
+
+
+def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]]:
+    x = verdicts.transient.x
+    change, largest = jumps(model, np.concatenate([np.full((1, model.n), np.nan), x[:-1]]), x)
+    states = {}
+    for i, name in enumerate(model.state_names):
+        bad, own = np.flatnonzero(verdicts.flags[:, i] == 1.0), int((~np.isnan(verdicts.flags[:, i])).sum())
+        width = (verdicts.upper - verdicts.lower)[verdicts.judged, i]
+        mean = float(np.nanmean(width)) if own else None
+        values = x[np.isfinite(x[:, i]), i]
+        span = float(np.ptp(values)) if len(values) else None
+        states[name] = {
+            "violations": len(bad),
+            "verdicts": own,
+            "inside": _inside(len(bad), own),
+            "first_violation": _instant(verdicts.transient, int(bad[0])) if len(bad) else None,
+            "mean_width": mean,
+            "range": span,
+            "width_to_range": mean / span if span and mean is not None else None,
+            "worst": _worst(verdicts, i, bad),
+            "unit": model.signals.states[i].unit,
+            "jump": _jump(verdicts, name, bad, change[:, i], float(largest[i])),
+        }
+    return states
+
+
+def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, Any]:
+    """Utilisation farthest from 0 among these samples (None where the bounds have no width), and when."""
+    if not len(rows):
+        return {"utilisation": None, "t": None}
+    k = int(rows[np.argmax(np.abs(verdicts.utilisation[rows, state]))])
+    value = float(verdicts.utilisation[k, state])
+    return {"utilisation": value if math.isfinite(value) else None, "t": float(verdicts.transient.t[k])}
+
+
+def _jump(
+    verdicts: Verdicts, name: str, bad: NDArray[np.intp], change: Array, largest: float
+) -> dict[str, Any] | None:
+    """The largest jump with which a state left its bounds, if it is larger than any of the fit."""
+    size = np.nan_to_num(np.abs(change[bad]))
+    if not size.any():
+        return None
+    k = int(bad[np.argmax(size)])
+    text = jump_words(name, float(change[k]), largest)
+    return {**_instant(verdicts.transient, k), "change": float(change[k]), "largest_in_fit": largest, "text": text}
+
+
+def _horizons(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
+    """What became of the windows of each horizon."""
+    found = []
+    for j, steps in enumerate(model.steps, 1):
+        table = verdicts.horizon_utilisation[:, j]
+        count = int((~np.isnan(table).all(axis=1)).sum())
+        with np.errstate(invalid="ignore"):
+            left = np.abs(table) > 1.0
+        outside = int(left.any(axis=1).sum())
+        rows = [np.flatnonzero(of) for of in left.T]
+        states = {
+            name: {"outside": len(of), "first": _instant(verdicts.transient, int(of[0])) if len(of) else None}
+            for name, of in zip(model.state_names, rows, strict=True)
+        }
+        inside = _inside(outside, count)
+        found.append({"steps": steps, "windows": count, "outside": outside, "inside": inside, "states": states})
+    return found
+
+
+def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[str, Any]]:
+    """The repeats that some samples (N+1, n) belong to, in order of time; without those that go on to be frozen."""
+    if model.repeats is None or not which.any():
+        return []
+    transient, found = verdicts.transient, []
+    for i, name in enumerate(model.state_names):
+        fresh = np.concatenate([[True], (np.diff(transient.x[:, i]) != 0) | (np.diff(transient.segment) > 0)])
+        begins = np.maximum.accumulate(np.where(fresh, np.arange(len(fresh)), 0))
+        for start, stop in runs(which[:, i]):
+            if not verdicts.frozen[start, i] and stop < len(which) and verdicts.frozen[stop, i]:
+                continue
+            begin = int(begins[start])
+            seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, start))
+            longest = float(model.repeats.longest_repeat_s[i])
+            found.append(
+                {
+                    "state": name,
+                    **_instant(transient, begin),
+                    "seconds": seconds,
+                    "told_after": told,
+                    "longest_in_fit": longest,
+                    "why": verdicts.why_frozen.get((start, i), ""),
+                    "text": f"{name} {repeat_words(seconds, longest)} from {transient.t[begin]:.4f} s",
+                }
+            )
+    return sorted(found, key=lambda repeat: (repeat["k"], repeat["state"]))
+
+
+def _explained(model: UncertainLTI, verdicts: Verdicts) -> Iterator[dict[str, Any]]:
+    """What the alarms look like, those close to one another together."""
+    if not verdicts.alarm.any():
+        return
+    v = verdicts
+    patterns = over_recording(model, v.judged, v.alarm, v.horizon_utilisation, v.lower, v.upper, v.outside_domain)
+    for start, stop, explainer in patterns:
+        like = explainer.likeness()
+        if like is not None and like.verdicts >= LEAST:
+            yield {
+                **_span(v.transient, start, stop + 1),
+                "label": like.label or None,
+                "matches": dict(like.matches),
+                "parts": [part._asdict() for part in like.parts],
+                "first": list(like.first),
+                "verdicts": like.verdicts,
+                "text": like.words,
+            }
+
+
+def _episodes(verdicts: Verdicts) -> Iterator[NDArray[np.intp]]:
+    """The violated samples of each episode: fewer than `APART` verdicts lie between them, and no step back in time."""
+    rows = np.flatnonzero(verdicts.violated)
+    if len(rows):
+        order = np.cumsum(verdicts.judged)[rows]
+        back = np.concatenate([[0], np.cumsum(np.diff(verdicts.transient.t_ns) < 0)])[rows]
+        yield from np.split(rows, np.flatnonzero((np.diff(order) > APART) | (np.diff(back) > 0)) + 1)
+
+
+def _episode(model: UncertainLTI, verdicts: Verdicts, rows: NDArray[np.intp]) -> dict[str, Any]:
+    first, last, t = int(rows[0]), int(rows[-1]), verdicts.transient.t
+    states = {}
+    for i, name in enumerate(model.state_names):
+        bad = rows[verdicts.flags[rows, i] == 1.0]
+        if len(bad):
+            states[name] = {"violations": len(bad), "first": float(t[bad[0]]), **_worst(verdicts, i, bad)}
+    return {
+        "first": _instant(verdicts.transient, first),
+        "last": _instant(verdicts.transient, last),
+        "verdicts_violated": len(rows),
+        "alarm": bool(verdicts.alarm[first : last + 1].any()),
+        "states": states,
+    }
+
+
+def _per_sample(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
+    numbers = {"flags": verdicts.flags, "lower": verdicts.lower, "upper": verdicts.upper, "state": verdicts.transient.x}
+    numbers["utilisation"] = verdicts.utilisation
+    if model.horizons:
+        numbers["horizon_utilisation"] = verdicts.horizon_utilisation
+    flags = {"outside_domain": verdicts.outside_domain, "alarm": verdicts.alarm}
+    block = sample_blocks(model, verdicts)
+    if model.schedule is not None:
+        flags["unknown_regime"] = verdicts.unknown_regime
+    lists = {key: _nulls(values) for key, values in numbers.items()} | {key: v.tolist() for key, v in flags.items()}
+    if model.schedule is not None:
+        lists["regime"] = [r if r >= 0 else None for r in block.tolist()]
+    return [
+        {"t_ns": t_ns, "status": status.value, **{key: values[k] for key, values in lists.items()}}
+        for k, (t_ns, status) in enumerate(zip(verdicts.transient.t_ns.tolist(), verdicts.statuses(), strict=True))
+    ]
+
+
+def _nulls(values: Array) -> list[Any]:
+    """Numbers as lists, None in place of those that are not finite."""
+    found = values.astype(object)
+    found[~np.isfinite(values)] = None
+    return list(found.tolist())
+
+
+def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) -> str:
+    """Why a check says nothing of the machine; empty if it does."""
+    judged = data["verdicts"]
+    steps = max((data["samples"] if verdicts.asked is None else int(verdicts.asked.sum())) - 1, 1)
+    if not judged:
+        return "; ".join(["no verdict was possible, so nothing is known", *data["unknown"]])
+    if judged < JUDGED * steps:
+        why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
+        return f"only {judged} of {steps} steps could be judged{why}"
+    if (outside := data["outside_domain_share"]) > UNVOUCHED:
+        ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
+        why = f" ({'; '.join(data['unknown'])})" if data["unknown"] else ""
+        return (
+            f"{outside:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; {ask}"
+            f"fit recordings that reach as far{why}"
+        )
+    alarm = model.fit_summary.get("alarm")
+    if isinstance(alarm, dict) and alarm.get("worth") == "none":
+        return f"the model is {alarm['headline']}"
+    if (model.domain.x_max > model.domain.x_min).any() and not np.ptp(verdicts.transient.x[verdicts.judged], 0).any():
+        return "nothing that is judged moves in it"
+    alarmed = verdicts.alarm[verdicts.judged]
+    if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
+        return (
+            f"the alarm is up for {alarmed.mean():.0%} of it, from early on: the fault was there before, or this is "
+            f"another machine, in other units, or run as in no recording of the fit"
+        )
+    return ""
+
+
+def _why(raised: Any) -> dict[str, Any]:
+    facts = {key: getattr(raised, key) for key in ("state", "horizon", "value", "words")}
+    return {"rule": raised.label, **facts}
+
+
+def _inside(bad: int, count: int) -> float | None:
+    return 1.0 - bad / count if count else None
+
+
+def _instant(transient: Transient, k: int) -> dict[str, Any]:
+    """Sample k: its time since the first sample, s, and its stamp, ns."""
+    return {"k": k, "t": float(transient.t[k]), "t_ns": int(transient.t_ns[k])}
+
+
+def _span(transient: Transient, start: int, stop: int) -> dict[str, Any]:
+    """The first of some samples, and the time to the last of them, s."""
+    return {**_instant(transient, start), "seconds": float(transient.t_ns[stop - 1] - transient.t_ns[start]) * 1e-9}
+
+
+# --- regimes -----------------------------------------------------------------------------------------------------
+
+
+def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
+    """What became of the verdicts in each regime; a verdict belongs to the block of the largest weight."""
+    if model.schedule is None:
+        return []
+    block, found = sample_blocks(model, verdicts), []
+    for r in range(model.schedule.blocks):
+        rows = np.flatnonzero(block == r)
+        bad, violated = (verdicts.flags[rows] == 1.0).sum(axis=0), int(verdicts.violated[rows].sum())
+        own = (~np.isnan(verdicts.flags[rows])).sum(axis=0)  # without those withheld as a state is frozen
+        total = np.nansum((verdicts.upper - verdicts.lower)[rows], axis=0)
+        found.append(
+            {
+                "regime": model.block_name(r),
+                "verdicts": len(rows),
+                "violated": violated,
+                "inside": _inside(violated, len(rows)),
+                "unknown_regime": int(verdicts.unknown_regime[rows].sum()),
+                "states": {
+                    name: {
+                        "verdicts": int(own[i]),
+                        "violations": int(bad[i]),
+                        "inside": _inside(int(bad[i]), int(own[i])),
+                        "mean_width": float(total[i] / own[i]) if own[i] else None,
+                    }
+                    for i, name in enumerate(model.state_names)
+                },
+            }
+        )
+    return found
+
+
+def sample_blocks(model: UncertainLTI, verdicts: Verdicts) -> NDArray[np.intp]:
+    """The block of the largest weight for the verdict on each sample (N+1,); -1 where there is no verdict."""
+    return np.where(verdicts.judged, model.main_block(_before(model, verdicts)), -1)
+
+
+def _before(model: UncertainLTI, verdicts: Verdicts) -> Array:
+    """Normalised [x; u; s] at the sample before each, (n + m + q, N+1); NaN where a verdict has none."""
+    steps = verdicts.transient.transitions()
+    z = np.full((model.n + model.m + model.q, len(verdicts.transient)), math.nan)
+    z[:, steps.k + 1] = model.normalised_columns(steps)
+    return z
+
+
+def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
+    """Why regimes are unknown, and modes not in the model, each reason once with its count."""
+    if model.schedule is None or not (verdicts.unknown_regime.any() or verdicts.unlisted_mode.any()):
+        return []
+    s, point, found = _before(model, verdicts)[list(model.scheduling_positions)], model.operating_point, []
+    for axis, i, values in zip(model.schedule.axes, model.scheduling_positions, s, strict=True):
+        unit = f" {model.signals.signals[i].unit}".rstrip()
+
+        def numbers(normalised: Any, i: int = i) -> list[str]:
+            of = recorded(np.asarray(normalised), float(point.steady[i]), float(point.scale[i]))
+            return [f"{v:.6g}" for v in of.tolist()]
+
+        if axis.knots:
+            far = values[verdicts.judged & ((values < axis.knots[0]) | (values > axis.knots[-1]))]
+            if len(far):
+                reached = " to ".join(dict.fromkeys(numbers([far.min(), far.max()])))
+                ends = " to ".join(numbers([axis.knots[0], axis.knots[-1]]))
+                found.append(
+                    f"{axis.signal} is beyond its knots, {ends}{unit}, in {plural(len(far), 'verdict')} ({reached})"
+                )
+            continue
+        there = values[verdicts.unlisted_mode]
+        odd = there[~np.isin(there, axis.modes)]
+        if len(odd):
+            listed, strange = shortlist(numbers(axis.modes), 6), shortlist(numbers(np.unique(odd)), 6)
+            found.append(
+                f"the model lists {axis.signal} = {listed}{unit}, and {plural(len(odd), 'sample')} with {strange} "
+                f"{'has' if len(odd) == 1 else 'have'} no verdict"
+            )
+    places, weights = model.schedule.corners(s[:, verdicts.unknown_regime])
+    met = []
+    for r, data in enumerate(model.block_data):
+        count = int(((places == r) & (weights > 0)).any(axis=0).sum())
+        if count and not data.known:
+            met.append(f"{model.block_name(r)} ({plural(count, 'verdict')})")
+    return found + [f"no recording visited {shortlist(met, 6)}"] * bool(met)
+
+
+# --- text --------------------------------------------------------------------------------------------------------
+
+
+def check_text(data: dict[str, Any]) -> str:
+    """Summary of `check_data` for a person."""
+    return text_of(check_blocks(data))
+
+
+def check_blocks(data: Mapping[str, Any]) -> list[Block]:
+    """Summary of `check_data`, what weighs most first and what came of it last."""
+    blocks: list[Block] = []
+    if data["outcome"] == "unknown":
+        blocks.append(f"UNKNOWN: {data['reason']}")
+    elif data["alarm"] and data["reason"]:
+        blocks.append(f"ALARM, and beware: {data['reason']}")
+    inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} inside all bounds"
+    left = f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""
+    samples = f"{plural(data['samples'], 'sample')}, {plural(data['verdicts'], 'verdict')}"
+    blocks.append(f"{data['recording']}: {samples}, {inside}{left}")
+    rows = [_state_row(*item) for item in data["states"].items()]
+    header: Sequence[str] = ("state", "violations", "inside", "mean width", "width/range", "first", "worst")
+    blocks.append(Table(header, rows, most=200))
+    if data["horizons"]:
+        rows = [_horizon_row(h) for h in data["horizons"]]
+        blocks.append(Table(("steps", "windows", "inside", "first outside", "state"), rows))
+    visited = [r for r in data["regimes"] if r["verdicts"]]
+    if visited and len(data["regimes"]) > 1:
+        header = ("regime", "verdicts", "inside", "unknown", *(f"{name}: mean width" for name in data["states"]))
+        blocks.append(Table(header, [_regime_row(r) for r in visited]))
+    if data["verdicts"]:
+        blocks.append(f"outside the fitted domain: {data['outside_domain_share']:.2%} of the verdicts")
+        if data["unknown_regime"]:
+            unknown = data["unknown_regime"] / data["verdicts"]
+            blocks.append(f"unknown regime: {unknown:.2%} of the verdicts, which nothing vouches for")
+    blocks += [f"  {text}" for text in data["unknown"]]
+    blocks += [f"{j['text']} at {j['t']:.4f} s" for s in data["states"].values() if (j := s["jump"]) is not None]
+    frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
+    longest = {r["state"]: r for r in sorted(data["repeats"], key=lambda repeat: repeat["seconds"])}
+    blocks += _first(frozen, "frozen repeat")
+    blocks += [f"warning: {r['text']}, as of a machine at rest: the model does not move it" for r in longest.values()]
+    told = [f"the alarm from {like['t']:.4f} s {like['text']}" for like in data["explained"] if like["text"]]
+    blocks += _first(told, "alarm")
+    if data["alarm"]:
+        first = data["alarms"][0]
+        often = times(len(data["alarms"]))
+        blocks.append(f"ALARM: raised {often}, first at {first['t']:.4f} s for {number(first['seconds'])} s")
+        by = [r["words"] for r in first["raised"] if r["rule"] != "containment"]
+        blocks += [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
+    elif data["verdicts"]:
+        blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
+    return blocks
+
+
+def episodes_table(data: Mapping[str, Any]) -> Table:
+    """When which states left their bounds; the states early, where a phone shows them without scrolling."""
+    rows = []
+    for e in data["episodes"]:
+        where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
+        listed = [f"{shortened(name)} ({s['violations']}, worst {beyond(s['utilisation'])})" for name, s in where]
+        first, last = f"{e['first']['t']:.4f}", f"{e['last']['t']:.4f}"
+        rows.append([first, shortlist(listed, 4), str(e["verdicts_violated"]), "yes" * e["alarm"], last])
+    header = ("first [s]", "states (violations, worst utilisation)", "violated", "alarm", "last [s]")
+    return Table(header, rows, left=(1,), most=20)
+
+
+def _first(lines: list[str], word: str) -> list[str]:
+    more = len(lines) - MOST_SHOWN
+    return lines[:MOST_SHOWN] + [f"  and {plural(more, f'more {word}')}; --json has all"] * (more > 0)
+
+
+def _state_row(name: str, state: Mapping[str, Any]) -> list[str]:
+    first = state["first_violation"]
+    return [
+        named(name, state["unit"]),
+        str(state["violations"]),
+        share(state["inside"]),
+        number(state["mean_width"]),
+        share(state["width_to_range"], 2),
+        "-" if first is None else f"{first['t']:.4f} s",
+        beyond(state["worst"]["utilisation"]) if state["violations"] else "-",
+    ]
+
+
+def _horizon_row(horizon: Mapping[str, Any]) -> list[str]:
+    left = [(state["first"]["t"], name) for name, state in horizon["states"].items() if state["first"] is not None]
+    when, name = min(left, default=(None, "-"))
+    first = "-" if when is None else f"{when:.4f} s"
+    return [str(horizon["steps"]), str(horizon["windows"]), share(horizon["inside"]), first, name]
+
+
+def _regime_row(regime: Mapping[str, Any]) -> list[str]:
+    counts = [regime["regime"], str(regime["verdicts"]), share(regime["inside"]), str(regime["unknown_regime"])]
+    return [*counts, *(number(state["mean_width"]) for state in regime["states"].values())]
