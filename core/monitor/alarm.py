@@ -33,6 +33,7 @@ from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, Statis
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.field_path import FieldPath
 
+_WORTH_THREADS = 20_000  # verdicts
 EVERY_STATE = "joint"
 """What stands for the state in the name of a statistic of all of them."""
 
@@ -306,8 +307,9 @@ class Alarm:
         judged = np.ones(count, dtype=bool) if judged is None else judged
         each = np.empty((count, len(self.parts)), dtype=bool) if each is None else each
         values = np.empty((count, len(self.names))) if values is None else values
-        parts = zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True)
-        on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), list(parts))
+        parts = list(zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True))
+        for alike in [parts] if count >= _WORTH_THREADS else [[part] for part in parts]:
+            on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), alike)
         self.reset()
         return np.asarray(np.logical_or.reduce(list(each.T))), each, values
 
