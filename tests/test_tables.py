@@ -285,7 +285,7 @@ def test_runs_in_one_file_are_recordings(many, tmp_path, capsys):
     assert [len(r) for r in runs] == [200] * 3 and not any(r.counters["equal stamp"] for r in runs)
     model = tmp_path / "m.model.json"
     assert main(["fit", str(many), "--signals", str(tmp_path / "s.yaml"), "--output", str(model)]) == 0
-    assert "left out one recording of 3 at a time" in capsys.readouterr().out
+    assert "left out one recording at a time (3 recordings)" in capsys.readouterr().out
     loaded = UncertainLTI.load(model)
     assert loaded.signals.table == TableLayout("clock", "ms", "trial")
     assert len(loaded.fit_summary["sources"]) == 1 and loaded.fit_summary["transients"] == 3

@@ -441,7 +441,7 @@ def fitted(folder):
 def test_fit_prints_and_stores_what_leaving_out_gives(folder, capsys):
     assert fitted(folder) == 0
     printed = capsys.readouterr().out
-    assert "left out one recording of 6 at a time" in printed and "false alarms: at most" in printed
+    assert "left out one recording at a time (6 recordings)" in printed and "false alarms: at most" in printed
     stored = UncertainLTI.load(folder / "m.json").validation
     assert stored["kind"] == "transients" and stored["parts"] == 6 and len(stored["false_alarms"]) == 2
 
@@ -474,7 +474,7 @@ def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     for key, counted in (("folder", 3), ("metadata=machine", 3), ("name=_m(\\d)", 2)):
         assert main([*command, "--group", key]) == 0
         printed = capsys.readouterr().out
-        assert f"left out one group of {counted} at a time (6 recordings in {counted} groups, by {key})" in printed
+        assert f"left out one group at a time (6 recordings in {counted} groups, by {key})" in printed
         assert "lie in 3 folders" not in printed
     assert main(["validate", model]) == 0
     assert f"{counted} groups, by {key}" in capsys.readouterr().out
