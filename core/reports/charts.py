@@ -200,7 +200,7 @@ class Panel:
 class Map:
     """Rows of a size over time, `values` (rows, P): 1 is the bound, beyond it is violated, NaN unknown."""
 
-    title: str
+    heading: str
     rows: tuple[str, ...]
     values: Array
     note: str = ""

@@ -143,9 +143,7 @@ def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, 
     return {"utilisation": value if math.isfinite(value) else None, "t": float(verdicts.transient.t[k])}
 
 
-def _jump(
-    verdicts: Verdicts, name: str, bad: NDArray[np.intp], change: Array, largest: float
-) -> dict[str, Any] | None:
+def _jump(verdicts: Verdicts, name: str, bad: NDArray[np.intp], change: Array, largest: float) -> dict[str, Any] | None:
     """The largest jump with which a state left its bounds, if it is larger than any of the fit."""
     size = np.nan_to_num(np.abs(change[bad]))
     if not size.any():

@@ -290,7 +290,7 @@ def _new_figure(width: float, height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height))
+    figure = Figure(figsize=(width, height), layout="constrained")
     FigureCanvasAgg(figure)
 
     def png(self: Any) -> bytes:  # a notebook that has no matplotlib backend asks the object itself
@@ -303,53 +303,29 @@ def _new_figure(width: float, height: float) -> Any:
 
 
 def _drawn(chart: Chart, event: tuple[float, str] | None = None) -> Any:
-    """The figure of a chart: its panels below each other, in two columns where there are many."""
-    abreast = 1 if len(chart.panels) <= FEW else 2
-    rows = math.ceil(len(chart.panels) / abreast)
-    heights = [
-        max(0.17 * len(p.rows), 0.3) if isinstance(p, Map) else 1.5 / abreast if abreast > 1 else 1.25
-        for p in chart.panels
-    ]
-    left = 0.75 if abreast == 2 else 0.75 + max([0.055 * len(_short(r)) - 0.35 for r in _rows(chart)], default=0.0)
-    gap, top, bottom, title = 0.75, 0.6, 0.5, 0.3
-    width = (_WIDTH - left - 0.15 - (abreast - 1) * gap) / abreast
-    total = top + bottom + max(sum(heights[k * rows : (k + 1) * rows]) + rows * title for k in range(abreast))
-    figure, axes = _new_figure(_WIDTH, total), list[Any]()
-    for i, (panel, height) in enumerate(zip(chart.panels, heights, strict=True)):
-        column, row = divmod(i, rows)
-        y = total - top - sum(heights[column * rows : i + 1]) - (row + 1) * title + 0.1
-        box = ((left + column * (width + gap)) / _WIDTH, y / total, width / _WIDTH, height / total)
-        axis = figure.add_axes(box, sharex=axes[0] if axes else None)
-        axes.append(axis)
+    """The figure of a chart: its panels below each other."""
+    heights = [max(0.17 * len(p.rows), 0.4) if isinstance(p, Map) else 1.2 for p in chart.panels]
+    figure = _new_figure(_WIDTH, sum(heights) + 0.32 * len(heights) + 1.0)
+    axes = figure.subplots(len(heights), 1, sharex=True, squeeze=False, height_ratios=heights)[:, 0]
+    for axis, panel in zip(axes, chart.panels, strict=True):
         if isinstance(panel, Map):
             _map(axis, panel, chart.columns)
         else:
             _panel(axis, panel, chart.columns)
-        size = 8 if abreast == 1 else 7
-        axis.set_title(_short(panel.heading if isinstance(panel, Panel) else panel.title, 70 // abreast), loc="left",
-                       fontsize=size, pad=3)  # fmt: skip
-        colour = VIOLATED if panel.count else RECORDED
-        axis.set_title(_short(panel.note, 70 // abreast), loc="right", fontsize=size, pad=3, color=colour)
-        last = row == rows - 1 or i == len(chart.panels) - 1
-        axis.tick_params(labelsize=7, labelbottom=last)
-        if last:
-            axis.set_xlabel(chart.columns.label, fontsize=8)
+        axis.set_title(_short(panel.heading, 60), loc="left", fontsize=8, pad=3)
+        axis.set_title(_short(panel.note, 60), loc="right", fontsize=8, pad=3, color=VIOLATED if panel.count else "k")
+        axis.tick_params(labelsize=7)
         if event is not None:
             axis.axvline(event[0], color=RECORDED, linestyle="--", linewidth=1.0)
+    axes[-1].set_xlabel(chart.columns.label, fontsize=8)
     if event is not None:
         side = "right" if event[0] > sum(chart.columns.limits) / 2 else "left"
         place = axes[0].get_xaxis_transform()
         axes[0].text(event[0], 0.95, f" {_plain(event[1])} ", transform=place, va="top", ha=side, fontsize=8)
-    figure.text(0.1 / _WIDTH, 1 - 0.22 / total, _short(chart.heading, 110), fontsize=9)
-    figure.legend(
-        handles=[_key(*key) for key in chart.keys], loc="upper left", ncols=len(chart.keys), fontsize=7, frameon=False,
-        bbox_to_anchor=(0.0, 1 - 0.28 / total), borderaxespad=0.1,
-    )  # fmt: skip
+    figure.suptitle(_short(chart.heading, 110), fontsize=9, x=0.01, ha="left")
+    keys = [_key(*key) for key in chart.keys]
+    figure.legend(handles=keys, loc="outside lower left", ncols=len(keys), fontsize=7, frameon=False)
     return figure
-
-
-def _rows(chart: Chart) -> list[str]:
-    return [row for p in chart.panels if isinstance(p, Map) for row in p.rows]
 
 
 def _key(role: str, words: str) -> Any:
@@ -359,50 +335,39 @@ def _key(role: str, words: str) -> Any:
     colour, alpha = _LOOKS[role]
     if role == "violated":
         return Line2D([], [], color=colour, label=words, marker="o", markersize=4, linewidth=0)
-    return Patch(facecolor=colour, alpha=alpha, label=words, edgecolor="#999999", linewidth=0.3)
+    return Patch(facecolor=colour, alpha=alpha, label=words, edgecolor=NO_VERDICT, linewidth=0.3)
 
 
-def _shade(axis: Any, columns: Columns, height: float = 1.0) -> None:
+def _panel(axis: Any, panel: Panel, columns: Columns) -> None:
     low, high = columns.limits
     least = (high - low) / (2 * charts.PIXELS)  # wide enough to be seen
     for spans, role in ((columns.alarms, "alarm"), (columns.silent, "silent")):
         wide = [(begin, max(end - begin, least)) for begin, end in spans]
         colour, alpha = _LOOKS[role]
-        axis.broken_barh(wide, (0, height), transform=axis.get_xaxis_transform(), color=colour, alpha=alpha, lw=0)
+        axis.broken_barh(wide, (0, 1), transform=axis.get_xaxis_transform(), color=colour, alpha=alpha, lw=0)
     axis.set_xlim(low - 0.01 * (high - low), high + 0.01 * (high - low))
-
-
-def _panel(axis: Any, panel: Panel, columns: Columns) -> None:
-    from matplotlib.ticker import FuncFormatter
-
-    _shade(axis, columns)
-    bottom, top = panel.limits
     at = np.flatnonzero(columns.apart)
     t = np.insert(columns.t, at, np.nan)
     if len(panel.levels) == 2:
         axis.axhspan(*panel.levels, color=ENVELOPE, alpha=0.25, linewidth=0)
-    for level in panel.levels if len(panel.levels) == 1 else ():
-        axis.axhline(level, color=VIOLATED, linewidth=0.8, linestyle="--")
+        axis.set_yticks([panel.levels[0], 0, panel.levels[1]])
+    elif panel.levels:
+        axis.axhline(panel.levels[0], color=VIOLATED, linewidth=0.8, linestyle="--")
     for series in panel.series:
         colour, alpha = _LOOKS[series.role]
-        low = np.insert(series.low, at, np.nan)
+        lower = np.insert(series.low, at, np.nan)
         if series.high is not None:
-            high = np.insert(series.high, at, np.nan)
-            axis.fill_between(t, low, high, color=colour, alpha=alpha, linewidth=0.6)
+            axis.fill_between(t, lower, np.insert(series.high, at, np.nan), color=colour, alpha=alpha, linewidth=0.6)
         else:
             few = "." if len(columns.t) <= 200 and series.role == "recorded" else None
-            axis.plot(t, low, color=colour, linewidth=0.8, marker=few, markersize=3)
-    axis.set_ylim(bottom, top)
+            axis.plot(t, lower, color=colour, linewidth=0.8, marker=few, markersize=3)
+    axis.set_ylim(*panel.limits)
     if panel.marks is not None:
         there = np.flatnonzero(~np.isnan(panel.marks))
-        values = np.clip(panel.marks[there], bottom, top)
-        size = 3.5 if len(there) <= 150 else 2.0
-        axis.plot(columns.t[there], values, "o", color=VIOLATED, markersize=size, mew=0, clip_on=False, zorder=3)
-        axis.plot(columns.t[there], np.full(len(there), 0.03), "|", color=VIOLATED, markersize=5,
-                  transform=axis.get_xaxis_transform(), zorder=3)  # fmt: skip
-    if len(panel.levels) == 2:
-        axis.set_yticks([panel.levels[0], 0, panel.levels[1]])
-    axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.6g}"))
+        values, size = np.clip(panel.marks[there], *panel.limits), 3.5 if len(there) <= 150 else 2.0
+        (dots,) = axis.plot(columns.t[there], values, "o", color=VIOLATED, ms=size, mew=0, clip_on=False, zorder=3)
+        dots.set_in_layout(False)
+    axis.yaxis.set_major_formatter("{x:.6g}")
     axis.grid(alpha=0.25, linewidth=0.5)
     axis.spines[["top", "right"]].set_visible(False)
 
@@ -414,11 +379,11 @@ def _map(axis: Any, drawn: Map, columns: Columns) -> None:
     colours = colormaps["Blues"].with_extremes(over=VIOLATED, bad=(*to_rgb(NO_VERDICT), 0.35))
     edge = np.append(columns.edges[:, 0], columns.limits[1]) if len(columns.t) else np.array([0.0, 1.0])
     values = drawn.values if len(columns.t) else np.full((len(drawn.rows), 1), np.nan)
-    axis.pcolormesh(edge, np.arange(len(drawn.rows) + 1), np.ma.masked_invalid(values), cmap=colours, vmin=0.0,
-                    vmax=1.0, rasterized=True)  # fmt: skip
+    rows = np.arange(len(drawn.rows) + 1)
+    axis.pcolormesh(edge, rows, np.ma.masked_invalid(values), cmap=colours, vmin=0.0, vmax=1.0, rasterized=True)
     for begin, end in columns.alarms:
-        axis.axvspan(begin, end, ymin=0.0, ymax=0.06, color=ALARM, linewidth=0)
-    axis.set_yticks(np.arange(len(drawn.rows)) + 0.5, [_short(row) for row in drawn.rows])
+        axis.axvspan(begin, end, ymin=0.0, ymax=min(0.06, 0.5 / len(drawn.rows)), color=ALARM, linewidth=0)
+    axis.set_yticks(rows[:-1] + 0.5, [_short(row) for row in drawn.rows])
     axis.set_ylim(len(drawn.rows), 0)
 
 
@@ -442,33 +407,25 @@ def _heat_maps(grids: Sequence[_Grid], note: str) -> Any:
     """Heat maps of the same size, one below the other."""
     rows, columns = grids[0].rows, grids[0].columns
     numbers = grids[0].values.size <= _NUMBERS
-    cell = 0.6 if numbers else min(0.4, 9.0 / len(columns))
-    width, height = max(cell * len(columns), 0.6), max((0.32 if numbers else 0.18) * len(rows), 0.4)
     size = 7 if max(len(rows), len(columns)) <= 30 else 5.5
     label, below = (0.0086 * size * max(map(len, names), default=0) + 0.2 for names in (rows, columns))
-    total_w, one = max(label + width + 0.9, 4.6), height + 0.55
-    total_h = len(grids) * one + below + 0.2
-    figure = _new_figure(total_w, total_h)
-    for k, grid in enumerate(grids):
-        bottom = (len(grids) - 1 - k) * one + below + 0.3
-        axis = figure.add_axes((label / total_w, bottom / total_h, width / total_w, height / total_h))
+    width = (0.6 if numbers else min(0.4, 9.0 / len(columns))) * len(columns)
+    height = max((0.32 if numbers else 0.18) * len(rows), 0.4)
+    figure = _new_figure(max(label + width + 0.9, 4.6), len(grids) * (height + 0.55) + below + 0.3)
+    axes = figure.subplots(len(grids), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, grid in zip(axes, grids, strict=True):
         shown = np.where(grid.values == 0.0, np.nan, grid.values) if grid.kind == "width" else grid.values
         image = axis.imshow(shown, **_scale(grid.values, grid.kind), aspect="auto", interpolation="nearest")
-        bar = figure.add_axes(((label + width + 0.15) / total_w, bottom / total_h, 0.15 / total_w, height / total_h))
-        figure.colorbar(image, cax=bar).minorticks_off()
+        bar = figure.colorbar(image, ax=axis, fraction=0.04, pad=0.01)
+        bar.minorticks_off()
+        bar.ax.tick_params(labelsize=7)
         if grid.kind == "signed":
-            greatest = float(image.norm.vmax)
-            ticks = [-greatest, -greatest * 10**-1.5, 0.0, greatest * 10**-1.5, greatest]
-            bar.set_yticks(ticks, [_brief(tick) for tick in ticks])
-        bar.tick_params(labelsize=7)
+            ticks = [float(image.norm.vmax) * k for k in (-1, -(10**-1.5), 0, 10**-1.5, 1)]
+            bar.set_ticks(ticks, labels=[_brief(tick) for tick in ticks])
         axis.set_title(grid.title, loc="left", fontsize=9)
-        some = range(0, len(columns), math.ceil(len(columns) * size / (72 * width)))
-        names = [columns[j] if k == len(grids) - 1 else "" for j in some]
-        axis.set_xticks(some, names, rotation=90, fontsize=size)
         axis.set_yticks(range(len(rows)), rows, fontsize=size)
         for place in grid.parted:
-            if place < len(columns):
-                axis.axvline(place - 0.5, color=RECORDED, linewidth=0.8)
+            axis.axvline(place - 0.5, color=RECORDED, linewidth=0.8)
         for i, j in np.argwhere(np.isfinite(grid.values)) if numbers else ():
             red, green, blue, _ = image.cmap(image.norm(grid.values[i, j]))
             ink = "w" if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else "k"
@@ -477,7 +434,10 @@ def _heat_maps(grids: Sequence[_Grid], note: str) -> Any:
         if grid.marked is not None:
             i, j = grid.marked.nonzero()
             axis.plot(j + 0.36, i - 0.3, ".", color=VIOLATED, markersize=5 if numbers else 3)
-    figure.text(0.1 / total_w, 0.08 / total_h, _plain(note), fontsize=7)
+        axis.set_xlim(-0.5, len(columns) - 0.5)
+    some = range(0, len(columns), math.ceil(len(columns) * size / (72 * max(width, 0.6))))
+    axes[-1].set_xticks(some, [columns[j] for j in some], rotation=90, fontsize=size)
+    figure.supxlabel(_plain(note), fontsize=7, x=0.01, ha="left")
     return figure
 
 
