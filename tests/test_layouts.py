@@ -148,7 +148,7 @@ def test_odd_names_stay_well_formed():
 
 def test_bad_use_is_one_sentence(annotated, tmp_path, capsys):
     _, model, _ = annotated
-    for arguments, why in (([], "--foxglove"), (["--foxglove", str(tmp_path / "no" / "x.json")], "cannot be written")):
+    for arguments, why in (([], "--foxglove"), (["--foxglove", str(tmp_path / "no" / "x.json")], "make it first")):
         assert main(["layout", str(model), *arguments]) == 2
         said = capsys.readouterr()
         assert why in said.err and said.err.count("\n") == 1 and not said.out

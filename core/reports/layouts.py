@@ -7,10 +7,10 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Layouts of viewers for the topics of a monitor, live or in an annotated recording.
+"""Layouts of Foxglove, Lichtblick and PlotJuggler, to watch live what the monitor publishes or an annotated recording.
 
 Foxglove and Lichtblick (JSON) take a number of a JointState by its index, PlotJuggler (XML) names its curves after the
-joints; so a layout is made for a model.
+joints; so a layout is made for a model. Both are made from one table of plots.
 """
 
 from __future__ import annotations
@@ -18,32 +18,56 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from importlib.resources import files
-from typing import Any
+from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
 from jinja2 import Environment
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.files import may_replace, whole_file
+from uncertain_lti.base.files import target
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, OUTPUTS, Output
+from uncertain_lti.reports.pages import write_page
+from uncertain_lti.reports.tables import named
 from uncertain_lti.signals.signal_map import Signal
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
 """Distinguished by colour-blind people, on light and on dark ground (Okabe and Ito 2008)."""
+_CYCLE = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 _PAGE = 6  # states that one page shows
-_BOUNDS = tuple(output for output in OUTPUTS if output.view in ("bound", "sample"))
-_STATES = tuple(output for output in OUTPUTS if output.view == "states")
-_STEPS = tuple(output for output in OUTPUTS if output.view == "steps")
-_ALARMS = tuple(output for output in OUTPUTS if output.view == "alarm")
+(_ALARM,) = (output for output in OUTPUTS if output.view == "alarm")
 
 
-def _colour(output: Output) -> str:
-    return BOUND if output.view == "bound" else RECORDED
+class _Plot(NamedTuple):
+    """One plot: each curve is an output, the index of a state, a label and a colour; `limits` lie across."""
+
+    key: str
+    title: str
+    curves: list[tuple[Output, int, str, str]]
+    limits: tuple[tuple[str, float], ...] = ()
+    steps: bool = False
+
+
+def _pages(states: Sequence[Signal]) -> list[tuple[str, list[_Plot], list[_Plot]]]:
+    """Of each page its states, a plot of each one's bounds and sample, and plots of their verdicts together."""
+    pages = []
+    for page, begin in enumerate(range(0, len(states), _PAGE)):
+        shown = list(enumerate(states))[begin : begin + _PAGE]
+        bounds = []
+        for i, state in shown:
+            of = [o for o in OUTPUTS if o.view in ("bound", "sample")]
+            curves = [(o, i, o.name, BOUND if o.view == "bound" else RECORDED) for o in of]
+            bounds.append(_Plot(f"bounds{i}", named(state.name, state.unit), curves))
+        verdicts = []
+        for o in sorted((o for o in OUTPUTS if o.view in ("states", "steps")), key=lambda o: o.view):
+            curves = [(o, i, state.name, _CYCLE[i % _PAGE]) for i, state in shown]
+            verdicts.append(_Plot(f"{o.name}{page}", o.title, curves, o.limits, o.view == "steps"))
+        pages.append((f"{begin + 1} to {begin + len(shown)}", bounds, verdicts))
+    return pages
 
 
 def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any]:
-    """Layout of Foxglove and Lichtblick: bounds and samples of each state, utilisation, flags, alarm, diagnostics."""
+    """Layout of Foxglove and Lichtblick: bounds and samples of each state, utilisation, flags and alarm."""
     panels: dict[str, Any] = {}
 
     def panel(kind: str, name: str, title: str, config: dict[str, Any]) -> str:
@@ -51,54 +75,32 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
         panels[key] = {"foxglovePanelTitle": title, "lichtblickPanelTitle": title, **config}
         return key
 
-    def plot(name: str, title: str, paths: list[dict[str, Any]]) -> str:
+    def drawn(plot: _Plot) -> str:
+        named = [(f"{base}/{o.name}.position[{i}]", label, colour) for o, i, label, colour in plot.curves]
+        if plot.steps:
+            paths = [_change(value, label) for value, label, _ in named]
+            return panel("StateTransitions", plot.key, plot.title, {"isSynced": True, "paths": paths})
+        named += [(f"{value:g}", label, VIOLATED) for label, value in plot.limits]
+        lines = [{**_change(*line), "enabled": True, "lineSize": 1.5, "color": colour} for *line, colour in named]
         shown = {"showLegend": True, "legendDisplay": "floating", "showPlotValuesInLegend": True}
         axes = {"showXAxisLabels": True, "showYAxisLabels": True, "isSynced": True, "xAxisVal": "timestamp"}
-        return panel("Plot", name, title, {"paths": paths, **shown, **axes, "sidebarDimension": 240})
+        return panel("Plot", plot.key, plot.title, {"paths": lines, **shown, **axes, "sidebarDimension": 240})
 
-    pages = []
-    for page, begin in enumerate(range(0, len(states), _PAGE)):
-        rows = []
-        shown = list(enumerate(states))[begin : begin + _PAGE]
-        for i, state in shown:
-            title = f"{state.name} [{state.unit}]" if state.unit else state.name
-            paths = [_line(f"{base}/{o.name}.position[{i}]", o.name, _colour(o), 1.5) for o in _BOUNDS]
-            rows.append(plot(f"bounds{i}", title, paths))
-        together = []
-        for output in _STATES:
-            paths = [_line(f"{base}/{output.name}.position[{i}]", state.name) for i, state in shown]
-            limits = [_line(f"{value:g}", label, VIOLATED, 1.0) for label, value in output.limits]
-            together.append(plot(f"{output.name}{page}", output.title, paths + limits))
-        for output in _STEPS:
-            paths = [_change(f"{base}/{output.name}.position[{i}]", state.name) for i, state in shown]
-            steps = {"isSynced": True, "paths": paths}
-            together.append(panel("StateTransitions", f"{output.name}{page}", output.title, steps))
-        pages.append(_split("row", _stack(rows), _stack(together), 60))
-    if len(pages) == 1:
-        body: Any = pages[0]
-    else:
-        titles = [f"{i * _PAGE + 1} to {min((i + 1) * _PAGE, len(states))}" for i in range(len(pages))]
-        tabs = [{"title": title, "layout": page} for title, page in zip(titles, pages, strict=True)]
+    pages = [
+        (title, _split("row", _stack([drawn(p) for p in bounds]), _stack([drawn(p) for p in verdicts]), 60))
+        for title, bounds, verdicts in _pages(states)
+    ]
+    body: Any = pages[0][1]
+    if len(pages) > 1:
+        tabs = [{"title": title, "layout": page} for title, page in pages]
         body = panel("Tab", "states", "states", {"activeTabIdx": 0, "tabs": tabs})
-    (violation,) = _ALARMS
-    value = f"{base}/{violation.name}.data"
-    alarm = panel(
-        "Indicator",
-        "alarm",
-        "alarm",
-        {
-            "path": value,
-            "style": "background",
-            "fallbackColor": UNKNOWN,
-            "fallbackLabel": "no verdict yet",
-            "rules": [
-                {"operator": "=", "rawValue": "true", "color": VIOLATED, "label": "ALARM"},
-                {"operator": "=", "rawValue": "false", "color": CONTAINED, "label": "no alarm"},
-            ],
-        },
-    )
-    steps = {"isSynced": True, "paths": [_change(value, "alarm")]}
-    raised = panel("StateTransitions", "alarm", "alarm", steps)
+    value = f"{base}/{_ALARM.name}.data"
+    looks = [("true", VIOLATED, "ALARM"), ("false", CONTAINED, "no alarm")]
+    rules = [{"operator": "=", "rawValue": raw, "color": colour, "label": label} for raw, colour, label in looks]
+    unknown = {"fallbackColor": UNKNOWN, "fallbackLabel": "no verdict yet"}
+    alarm = panel("Indicator", "alarm", "alarm", {"path": value, "style": "background", **unknown, "rules": rules})
+    paths = {"isSynced": True, "paths": [_change(value, "alarm")]}
+    raised = panel("StateTransitions", "alarm", "alarm", paths)
     return {
         "configById": panels,
         "globalVariables": {},
@@ -108,25 +110,23 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
     }
 
 
+def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
+    """`foxglove_layout` as text."""
+    return json.dumps(foxglove_layout(states, base), indent=1, ensure_ascii=False) + "\n"
+
+
 def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
     """Layout of PlotJuggler: bounds and samples of each state, utilisation, flags and alarm, in tabs."""
     tabs: list[tuple[str, list[tuple[str, list[tuple[str, str]]]]]] = []
-    for begin in range(0, len(states), _PAGE):
-        page = states[begin : begin + _PAGE]
-        plots = []
-        for state in page:
-            title = f"{state.name} [{state.unit}]" if state.unit else state.name
-            plots.append((title, [(f"{base}/{o.name}/{state.name}/position", _colour(o)) for o in _BOUNDS]))
-        some = len(states) > _PAGE
-        numbers = f" {begin + 1} to {begin + len(page)}" if some else ""
-        tabs.append((f"bounds{numbers}", plots))
-        colours = _cycle(len(page))
-        verdicts = [
-            (o.title, [(f"{base}/{o.name}/{s.name}/position", c) for s, c in zip(page, colours, strict=True)])
-            for o in (*_STATES, *_STEPS)
-        ]
-        verdicts += [("alarm", [(f"{base}/{o.name}/data", VIOLATED)]) for o in _ALARMS]
-        tabs.append((f"verdicts{numbers}", verdicts))
+    for title, *both in _pages(states):
+        numbers = f" {title}" if len(states) > _PAGE else ""
+        for name, plots in zip(("bounds", "verdicts"), both, strict=True):
+            drawn = [
+                (p.title, [(f"{base}/{o.name}/{states[i].name}/position", colour) for o, i, _, colour in p.curves])
+                for p in plots
+            ]
+            tabs.append((f"{name}{numbers}", drawn))
+        tabs[-1][1].append(("alarm", [(f"{base}/{_ALARM.name}/data", VIOLATED)]))
     made = Environment(trim_blocks=True, keep_trailing_newline=True)
     made.filters["attribute"] = _attribute
     text = files("uncertain_lti.reports").joinpath("assets", "plotjuggler.xml").read_text(encoding="utf-8")
@@ -137,33 +137,16 @@ def write_layouts(
     model: UncertainLTI, foxglove: str | None, plotjuggler: str | None, base: str | None = None
 ) -> list[str]:
     """Write one or both of the layouts, each whole or not at all."""
-    wanted = [(foxglove, foxglove_text), (plotjuggler, plotjuggler_layout)]
     if foxglove is None and plotjuggler is None:
         raise ModelError("no layout is asked for; give --foxglove FILE.json, --plotjuggler FILE.xml or both")
     base = NODE if base is None else f"/{base.strip('/')}"
-    written = []
-    for path, words in ((foxglove, b'"configById"'), (plotjuggler, b"<root")):
-        if path is not None and not may_replace(path, holds=words):
-            raise ModelError(f"{path}: is there already and is no such layout; choose another name, or move it away")
-    for path, make in wanted:
-        if path is not None:
-            try:
-                with whole_file(path) as stream:
-                    stream.write(make(model.signals.states, base).encode("utf-8", "replace"))
-            except OSError as error:
-                raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
-            written.append(path)
-    return written
-
-
-def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
-    """`foxglove_layout` as text."""
-    return json.dumps(foxglove_layout(states, base), indent=1, ensure_ascii=False) + "\n"
-
-
-def _line(value: str, label: str, colour: str = "", size: float = 1.0) -> dict[str, Any]:
-    line = {"value": value, "label": label, "enabled": True, "timestampMethod": "receiveTime", "lineSize": size}
-    return line | ({"color": colour} if colour else {})
+    made = [(foxglove, b'"configById"', foxglove_text), (plotjuggler, b"<root", plotjuggler_layout)]
+    asked = [(path, holds, make) for path, holds, make in made if path is not None]
+    for path, holds, _ in asked:
+        target(path, holds=holds, kind="such layout", example="layout.json")
+    for path, _, make in asked:
+        write_page(path, make(model.signals.states, base))
+    return [path for path, *_ in asked]
 
 
 def _change(value: str, label: str) -> dict[str, Any]:
@@ -179,11 +162,6 @@ def _stack(panels: Sequence[Any]) -> Any:
     if len(panels) == 1:
         return panels[0]
     return _split("column", panels[0], _stack(panels[1:]), round(100 / len(panels), 3))
-
-
-def _cycle(count: int) -> list[str]:
-    colours = ["#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00"]
-    return [colours[i % len(colours)] for i in range(count)]
 
 
 def _attribute(text: str) -> str:
