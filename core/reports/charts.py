@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
@@ -77,9 +76,8 @@ class Columns:
     ) -> Columns:  # fmt: skip
         """At most about `most` columns (two per pixel where all samples fit), finer around instants that are `near`."""
         t, loops = forward(t)
-        first, stop = 0, len(t)
-        if span is not None:
-            first, stop = int(np.searchsorted(t, span[0])), int(np.searchsorted(t, span[1], side="right"))
+        low, high = span or (-math.inf, math.inf)
+        first, stop = int(np.searchsorted(t, low)), int(np.searchsorted(t, high, side="right"))
         count = stop - first
         here = slice(first, stop)
         broken = np.zeros(count, dtype=bool)
@@ -97,15 +95,12 @@ class Columns:
                     chosen[max(onset - reach, 0) : onset + reach + 2] = True
         starts = np.flatnonzero(chosen) + first
         ends = np.append(starts[1:], stop)[: len(starts)]
-        nothing = np.zeros(len(t), dtype=bool)
-        alarmed, known = (
-            np.logical_or.reduceat((nothing if a is None else a)[:stop], starts) if count else nothing[:0]
-            for a in (alarm, judged)
-        )
         apart = broken[starts - first]
         begins = np.where(apart, t[starts], t[np.maximum(starts - 1, first)]) if count else t[:0]
         edges, middle = np.column_stack([begins, t[ends - 1]]), (t[starts] + t[ends - 1]) / 2
-        return cls(starts, stop, middle, edges, apart, len(starts) < count, alarmed, known, loops)
+        nowhere = np.zeros(len(t), dtype=bool)
+        raised, known = (_some(nowhere if a is None else a, starts, stop) for a in (alarm, judged))
+        return cls(starts, stop, middle, edges, apart, len(starts) < count, raised, known, loops)
 
     @property
     def label(self) -> str:
@@ -152,7 +147,7 @@ class Columns:
 
     def some(self, which: Mask) -> Mask:
         """Whether any sample of each column (P,) is marked."""
-        return np.logical_or.reduceat(which[: self.stop], self.starts) if len(self.starts) else which[:0]
+        return _some(which, self.starts, self.stop)
 
     def worst(self, bad: Mask, utilisation: Array, values: Array) -> Array:
         """Of each column (P,) the value at its violated sample that lies farthest out; NaN where none is."""
@@ -162,6 +157,10 @@ class Columns:
         order = rows[np.argsort(np.abs(utilisation[rows]), kind="stable")]
         found[np.searchsorted(self.starts, order, side="right") - 1] = values[order]
         return found
+
+
+def _some(which: Mask, starts: NDArray[np.intp], stop: int) -> Mask:
+    return np.logical_or.reduceat(which[:stop], starts) if len(starts) else which[:0]
 
 
 @dataclass(frozen=True)
@@ -218,6 +217,7 @@ class Chart:
 
 
 ALARMED = (("alarm", "alarm"), ("silent", "no verdict"))
+MAPPED = (("full", "at its bound"), ("violated", "violated"), *ALARMED)
 
 
 def columns_of(
@@ -232,8 +232,7 @@ def columns_of(
 def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most: int = 6) -> Chart:
     """What happened and when: the alarm's score over its threshold, then the states that did it."""
     panel, states = score_panel(model, verdicts, columns)
-    chosen = [model.state_names[i] for i in np.argsort(-states, kind="stable")[:most]]
-    below = utilisation_chart(model, verdicts, columns, chosen)
+    below = utilisation_chart(model, verdicts, columns, np.argsort(-states, kind="stable")[:most].tolist())
     keys = (("score", "score, utilisation"), ("bounds", "inside the bounds"), ("violated", "violated"), *ALARMED)
     return Chart(below.heading, columns, (panel, *below.panels), keys)
 
@@ -262,36 +261,30 @@ def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[A
     The score of a statistic is what it is over its threshold; that of containment the violated verdicts over those
     that raise the alarm or, where one is enough, the utilisation over the margin.
     """
-    reached = [_size(*columns.extremes(verdicts.utilisation))]
     where = columns.alarm if columns.alarm.any() else columns.judged
-    states = _most(reached[0][where])
-    found = []
+    states = _most(_size(*columns.extremes(verdicts.utilisation))[where])
+    found, given = [], np.flatnonzero(verdicts.judged)
     for r, rule in enumerate(verdicts.alarms.rules):
         if not isinstance(rule, AlarmRule):
             continue
-        table = verdicts.horizon_utilisation[:, 1 + model.steps.index(rule.horizon)] if rule.horizon > 1 else None
-        raised = columns.some(verdicts.rule_alarms[:, r])
+        row = (1, *model.steps).index(rule.horizon)
+        table = verdicts.longer_utilisation[:, row - 1] if row else verdicts.utilisation
         if rule.violations == 1:
-            size = reached[0] if table is None else _size(*columns.extremes(table))
-            value = _fmax(size) / rule.margin
+            value = _fmax(_size(*columns.extremes(table))) / rule.margin
         else:
             with np.errstate(invalid="ignore"):
-                beyond = verdicts.flags == 1.0 if table is None else np.abs(table) > rule.margin
-                bad = np.logical_or.reduce(beyond, axis=1)
-            given = np.flatnonzero(verdicts.judged)
-            total = np.concatenate([[0], np.cumsum(bad[given])])
-            ends = np.arange(1, len(total))
-            full = np.full((len(bad), 1), np.nan)
-            full[given, 0] = (total[ends] - total[np.maximum(ends - rule.window, 0)]) / rule.violations
-            value = columns.extremes(full)[1][:, 0]
-        below = np.minimum(value, 1.0 - 1.0 / max(rule.violations, 2) if rule.violations > 1 else 1.0)
-        found.append(np.where(raised, np.fmax(value, 1.0), below))  # a masked state, or --grace, raises nothing
-    if len(names := verdicts.statistic_names):
+                bad = (np.abs(table[given]) > rule.margin).any(axis=1)
+            total, ends = np.concatenate([[0], np.cumsum(bad)]), np.arange(1, len(given) + 1)
+            count = np.full((len(table), 1), np.nan)
+            count[given, 0] = total[ends] - total[np.maximum(ends - rule.window, 0)]
+            value = columns.reduced(count, np.fmax)[:, 0] / rule.violations
+        raised = columns.some(verdicts.rule_alarms[:, r])  # a masked state, or --grace, raises nothing
+        found.append(np.where(raised, np.fmax(value, 1.0), np.minimum(value, 0.999)))
+    if verdicts.statistic_names:
         over = _size(*columns.extremes(verdicts.statistics))
         found.append(_fmax(over))
-        most = _most(over[where])
         of = {name: i for i, name in enumerate(model.state_names)}
-        for name, size in zip(names, most, strict=True):
+        for name, size in zip(verdicts.statistic_names, _most(over[where]), strict=True):
             if (i := of.get(name.partition("/")[2])) is not None:
                 states[i] = max(states[i], size)
     score = _fmax(np.stack(found, axis=1))
@@ -313,11 +306,8 @@ def _most(values: Array) -> Array:
     return greatest
 
 
-def envelope_chart(
-    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None
-) -> Chart:
-    """Each state between its one-step bounds, in recorded units."""
-    chosen = chosen_states(model, verdicts, states)
+def envelope_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, chosen: Sequence[int]) -> Chart:
+    """Some states, each between its one-step bounds, in recorded units."""
     x = verdicts.transient.x
     low, high = columns.extremes(x)
     lower, upper = columns.reduced(verdicts.lower, np.fmin), columns.reduced(verdicts.upper, np.fmax)
@@ -333,16 +323,15 @@ def envelope_chart(
 
 
 def utilisation_chart(
-    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None, row: int = 0
+    model: UncertainLTI, verdicts: Verdicts, columns: Columns, chosen: Sequence[int], row: int = 0
 ) -> Chart:
     """Where between its bounds each state lay, -1 and 1 at the bounds; `row` 0 is one step, others the horizons."""
-    chosen = chosen_states(model, verdicts, states)
-    values = verdicts.utilisation if row == 0 else verdicts.longer_utilisation[:, row - 1]
+    values = verdicts.longer_utilisation[:, row - 1] if row else verdicts.utilisation
     low, high = columns.extremes(values)
     panels = []
     for i in chosen:
         with np.errstate(invalid="ignore"):
-            bad = verdicts.flags[:, i] == 1.0 if row == 0 else np.abs(values[:, i]) > 1.0
+            bad = np.abs(values[:, i]) > 1.0 if row else verdicts.flags[:, i] == 1.0
         size = _size(low[:, i], high[:, i])
         limit = float(np.clip(1.1 * size[np.isfinite(size)].max(initial=0.0), 1.25, 4.0))
         marks = columns.worst(bad, values[:, i], values[:, i])
@@ -353,49 +342,26 @@ def utilisation_chart(
     return Chart(heading(verdicts), columns, tuple(panels), keys)
 
 
-def utilisation_map(
-    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None
-) -> Chart:
+def utilisation_map(model: UncertainLTI, verdicts: Verdicts, columns: Columns, chosen: Sequence[int]) -> Chart:
     """Greatest |utilisation| of many states over time, a row each."""
-    chosen = chosen_states(model, verdicts, states)
-    size = _size(*columns.extremes(verdicts.utilisation))[:, chosen].T
-    bad = (columns.reduced(verdicts.flags, np.fmax)[:, chosen] == 1.0).T
-    values = np.where(bad, 2.0, np.minimum(size, 1.0))
-    rows = tuple(model.state_names[i] for i in chosen)
-    drawn = Map("|utilisation|", rows, values, count=int(verdicts.violated.sum()))
+    values = _size(*columns.extremes(verdicts.utilisation))[:, list(chosen)].T
+    names = tuple(model.state_names[i] for i in chosen)
+    drawn = Map("|utilisation|", names, values, count=int(verdicts.violated.sum()))
     return Chart(heading(verdicts), columns, (drawn,), MAPPED)
 
 
-MAPPED = (("full", "at its bound"), ("violated", "violated"), ("alarm", "alarm"), ("silent", "no verdict"))
-
-
-def horizon_chart(
-    model: UncertainLTI, verdicts: Verdicts, columns: Columns, states: Sequence[str] | None = None
-) -> Chart:
+def horizon_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, chosen: Sequence[int]) -> Chart:
     """Greatest |utilisation| over time, of each state a map with a row per number of steps."""
     table, step = verdicts.horizon_utilisation, model.sampling.dt_median
     rows = tuple(f"{h} ({h * step:.3g} s)" if step is not None else str(h) for h in (1, *model.steps))
     panels = []
-    for i in chosen_states(model, verdicts, states):
+    for i in chosen:
         values = _size(*columns.extremes(table[:, :, i])).T
         with np.errstate(invalid="ignore"):
             outside = (np.abs(table[:, :, i]) > 1.0).sum(axis=0).tolist()
         note = f"outside: {', '.join(map(str, outside))}"
         panels.append(Map(model.state_names[i], rows, values, note, sum(outside)))
     return Chart(heading(verdicts), columns, tuple(panels), MAPPED)
-
-
-def chosen_states(model: UncertainLTI, verdicts: Verdicts, states: Sequence[str] | None) -> list[int]:
-    """Positions of the states to draw."""
-    refuse_other(model, UncertainLTI, "model", "give the model that the recording was checked with", ModelError)
-    refuse_other(
-        verdicts, Verdicts, "verdicts", "give what EnvelopeMonitor(model).check(transient) returned", ModelError
-    )
-    names = list(model.state_names if states is None else states)
-    for name in names:
-        if name not in model.state_names:
-            raise ModelError(f"there is no state '{name}' to draw; states are {', '.join(model.state_names)}")
-    return [model.state_names.index(name) for name in names]
 
 
 def heading(verdicts: Verdicts) -> str:

@@ -72,8 +72,8 @@ def alarm_figure(
     matplotlib.figure.Figure
         Not written yet; see `save`.
     """
-    charts.chosen_states(model, verdicts, None)
-    return _drawn(charts.alarm_chart(model, verdicts, charts.columns_of(verdicts, span=span), most), event)
+    columns, _ = _chosen(model, verdicts, None, span)
+    return _drawn(charts.alarm_chart(model, verdicts, columns, most), event)
 
 
 def envelope_figure(
@@ -108,9 +108,7 @@ def envelope_figure(
     ModelError
         A name is not a state of the model.
     """
-    charts.chosen_states(model, verdicts, states)
-    chart = charts.envelope_chart(model, verdicts, charts.columns_of(verdicts, span=span), states)
-    return _drawn(chart, event)
+    return _drawn(charts.envelope_chart(model, verdicts, *_chosen(model, verdicts, states, span)), event)
 
 
 def utilisation_figure(
@@ -145,9 +143,9 @@ def utilisation_figure(
     ModelError
         A name is not a state of the model.
     """
-    many = len(charts.chosen_states(model, verdicts, states)) > FEW
-    make = charts.utilisation_map if many else charts.utilisation_chart
-    return _drawn(make(model, verdicts, charts.columns_of(verdicts, span=span), states))
+    columns, chosen = _chosen(model, verdicts, states, span)
+    make = charts.utilisation_map if len(chosen) > FEW else charts.utilisation_chart
+    return _drawn(make(model, verdicts, columns, chosen))
 
 
 def horizon_figure(
@@ -181,8 +179,7 @@ def horizon_figure(
     ModelError
         A name is not a state of the model.
     """
-    charts.chosen_states(model, verdicts, states)
-    return _drawn(charts.horizon_chart(model, verdicts, charts.columns_of(verdicts, span=span), states))
+    return _drawn(charts.horizon_chart(model, verdicts, *_chosen(model, verdicts, states, span)))
 
 
 def matrices_figure(model: UncertainLTI) -> Any:
@@ -283,6 +280,20 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
 
 
 # --- charts over time ------------------------------------------------------------------------------------------------
+
+
+def _chosen(
+    model: UncertainLTI, verdicts: Verdicts, states: Sequence[str] | None, span: tuple[float, float] | None
+) -> tuple[Columns, list[int]]:
+    """Columns of a recording, and positions of the states to draw."""
+    refuse_other(model, UncertainLTI, "model", "give the model that the recording was checked with", ModelError)
+    made = "give what EnvelopeMonitor(model).check(transient) returned"
+    refuse_other(verdicts, Verdicts, "verdicts", made, ModelError)
+    names = list(model.state_names if states is None else states)
+    for name in names:
+        if name not in model.state_names:
+            raise ModelError(f"there is no state '{name}' to draw; states are {', '.join(model.state_names)}")
+    return charts.columns_of(verdicts, span=span), [model.state_names.index(name) for name in names]
 
 
 def _new_figure(width: float, height: float) -> Any:

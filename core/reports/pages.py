@@ -245,13 +245,12 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
     """A recording that was checked: the alarm's score, utilisation, states between their bounds, controls."""
     numbers = (6 + 2 * len(model.steps)) * model.n + 2 * model.m + 3
     columns = charts.columns_of(verdicts, _stretches(recordings, numbers), fine=True)
-    top, _ = charts.score_panel(model, verdicts, columns)
-    made = {
-        "utilisation" + ", 1 step" * bool(model.steps): charts.utilisation_chart(model, verdicts, columns),
-        "values": charts.envelope_chart(model, verdicts, columns),
-    }
+    of, states = (model, verdicts, columns), range(model.n)
+    top, _ = charts.score_panel(*of)
+    made = {"utilisation" + ", 1 step" * bool(model.steps): charts.utilisation_chart(*of, states)}
+    made["values"] = charts.envelope_chart(*of, states)
     for row, steps in enumerate(model.steps, 1):
-        made[f"utilisation, {plural(steps, 'step')}"] = charts.utilisation_chart(model, verdicts, columns, row=row)
+        made[f"utilisation, {plural(steps, 'step')}"] = charts.utilisation_chart(*of, states, row)
     views = {
         name: sorted(((columns, p) for p in chart.panels if isinstance(p, Panel)), key=lambda placed: -placed[1].count)
         for name, chart in made.items()
