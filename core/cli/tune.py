@@ -116,7 +116,7 @@ def _time(text: str) -> float:
 
 COMMAND = Command(
     "tune",
-    "try delays, schedules, lags and horizons, and take what sees clearly smaller jumps than fit",
+    "try delays, schedules and lags, and take what sees clearly smaller jumps than fit",
     add_arguments,
     run,
     quiet=SILENT,

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""tune(): what `fit` does not do by itself, delays, schedules, lags and horizons, tried by what their panels see."""
+"""tune(): what `fit` does not do by itself, delays, schedules and lags, tried by what their panels see."""
 
 from __future__ import annotations
 
@@ -55,8 +55,6 @@ FOLDS = 5
 """Times that something is left out to choose memories, at most."""
 FEWEST_STEPS, MOST_STEPS = 3, 0.05
 """A control whose steps are events changes in at least so many transitions, and in at most this share of them."""
-LONGEST = 64
-"""Steps of the longest horizon tried."""
 
 
 @dataclass(frozen=True)
@@ -144,16 +142,6 @@ def memories(transients: Sequence[Transient], best: Setting) -> Iterator[Setting
     delayed = replace(best, memories=()).prepared(transients)
     for some in memory_candidates(delayed, best.options.get("additive", "noise")):
         yield best.beside(f"with {', '.join(one.name for one in some)}", memories=some)
-
-
-def horizons(transients: Sequence[Transient], best: Setting, within: float) -> Iterator[Setting]:
-    """Envelopes over several steps beside that of one."""
-    step = float(np.median(np.concatenate([t.dt for t in transients])))
-    longest = min(LONGEST, round(within / step))
-    for steps in sorted({max(2, longest // 4), longest}):
-        if longest >= 2:
-            options = {**best.options, "horizons": [steps], "widths": "constant"}
-            yield best.beside(f"and over {steps} steps", options=options)
 
 
 def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
@@ -305,10 +293,6 @@ def _largest(phi: Array, move: Array) -> Array:
     return np.asarray(left[-max(1, len(left) // 100) :].mean(axis=0))
 
 
-WITHIN = 1.0
-"""Time of the longest horizon tried, s."""
-
-
 class _SpentError(Exception):
     """The budget is spent."""
 
@@ -353,8 +337,8 @@ def tune(
 ) -> Tuned:
     """Try what `fit` does not do by itself, and take what sees clearly smaller jumps on left-out data.
 
-    Controls taken earlier, schedules, lags and rates of states, and horizons are tried in turn, each beside the best so
-    far, with the panel learnt anew. A way is taken if the jumps that its panel sees are smaller by CLEARLY than those
+    Controls taken earlier, schedules, and lags and rates of states are tried in turn, each beside the best so far, with
+    the panel learnt anew. A way is taken if the jumps that its panel sees are smaller by CLEARLY than those
     of the best so far, and if it misses none of the recordings with a fault that `fit` alone sees.
 
     Parameters
@@ -410,14 +394,12 @@ def tune(
         hurried(setting.words)
         try:
             runs = setting.prepared(transients)
-            asked = dict(setting.options)
-            widths = asked.pop("widths", "constant")
             found = fit_monitored(
                 runs,
                 groups=groups,
                 false_alarms=false_alarms,
                 progress=hurried,
-                **{"schedule": {}, **asked, "widths": {h: widths for h in asked.get("horizons", ())}},
+                **{"schedule": {}, **setting.options},
             )
             if found.panel is None:
                 raise FitError(found.why)
@@ -444,8 +426,6 @@ def tune(
                 if not attempt(setting):
                     break
         for setting in memories(transients, best):
-            attempt(setting)
-        for setting in horizons(transients, best, WITHIN):
             attempt(setting)
     except (_SpentError, KeyboardInterrupt):
         reason += "; the time ran out before every way was tried"
