@@ -476,8 +476,8 @@ class EnvelopeMonitor:
         alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(
             transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer.transpose(1, 0, 2),
-            why_frozen=why,
+            unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer.transpose(1, 0, 2), residual,
+            longer_residual.transpose(1, 0, 2), why,
         )  # fmt: skip
 
     def _look_all(

@@ -352,6 +352,10 @@ class Verdicts:
         The rules, with their `labels` and the `names` of the statistics.
     longer_utilisation : array (N+1, horizons, n)
         Utilisation by each of the model's horizons; NaN where its window is broken.
+    residual : array (N+1, n)
+        x_next - centre, normalised; NaN without a verdict.
+    longer_residual : array (N+1, horizons, n)
+        The same by each of the model's horizons.
     why_frozen : dict, optional
         Of each sample and number of a state that is frozen there, in words why it is.
     asked : array (N+1,) of bool, optional
@@ -376,6 +380,8 @@ class Verdicts:
     rule_alarms: NDArray[np.bool_]
     alarms: Alarm
     longer_utilisation: Array
+    residual: Array
+    longer_residual: Array
     why_frozen: dict[tuple[int, int], str] = field(default_factory=dict)
     asked: NDArray[np.bool_] | None = None
 

@@ -173,7 +173,8 @@ def judge(
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
-    longer, longer_width, longer_residual = _longer(model, full, steps, verdicts.horizon_utilisation[judged][:, 1:])
+    found = verdicts.longer_utilisation[judged], verdicts.longer_residual[judged]
+    longer, longer_residual, longer_width = _longer(model, full, steps, *found)
     width = (verdicts.upper - verdicts.lower)[judged]
     point = full.operating_point
     low, high = full.bounds(
@@ -203,7 +204,7 @@ def judge(
         transient,
         longer,
         longer_width,
-        residual=_residual(model, steps),
+        residual=verdicts.residual[judged],
         longer_residual=longer_residual,
         judged_by=full.with_residuals_of(model, instead=True),
         extrapolated=np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
@@ -213,28 +214,18 @@ def judge(
     )
 
 
-def _longer(model: UncertainLTI, full: UncertainLTI, steps: Transitions, table: Array) -> tuple[Array, Array, Array]:
-    """Utilisation, mean widths and residuals over the horizons of the full model."""
-    places = {horizon.steps: j for j, horizon in enumerate(full.horizons)}
-    utilisation, residual = np.full((2, len(steps.dt), len(places), model.n), np.nan)
-    width, point = np.full((len(places), model.n), np.nan), model.operating_point
-    x_next = point.normalise_x(steps.x_next).T
-    envelopes = model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)
-    for j, (windows, centre, half) in enumerate(envelopes):
-        place = places[windows.steps]
-        utilisation[:, place] = table[:, j]
+def _longer(
+    model: UncertainLTI, full: UncertainLTI, steps: Transitions, utilisation: Array, residual: Array
+) -> tuple[Array, Array, Array]:
+    """Utilisation, residuals and mean widths over the horizons of the full model, NaN where this one lacks one."""
+    places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
+    width = np.full((len(model.horizons) + 1, model.n), np.nan)
+    for j, (_, _, half) in enumerate(model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)):
         if half.size:
-            residual[windows.last, place] = (x_next[:, windows.last] - centre).T
-            width[place] = 2.0 * half.mean(axis=1) * point.X
-    return utilisation, width, residual
-
-
-def _residual(model: UncertainLTI, steps: Transitions) -> Array:
-    """What the centre of one step leaves unexplained, normalised."""
-    z = model.normalised_columns(steps)
-    centre, half = np.empty((model.n, len(steps.dt))), np.empty((model.n, len(steps.dt)))
-    model.columns_centre_and_half(z, steps.dt, centre, half)
-    return np.asarray(model.operating_point.normalise_x(steps.x_next) - centre.T)
+            width[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
+    with_none = ((0, 0), (0, 1), (0, 0))
+    every = (np.pad(values, with_none, constant_values=np.nan)[:, places] for values in (utilisation, residual))
+    return *every, width[places]  # type: ignore[return-value]
 
 
 def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
