@@ -12,7 +12,7 @@
 import numpy as np
 import pytest
 
-from uncertain_lti import OperatingPoint, SignalMap, Transient
+from uncertain_lti import SignalMap, Transient
 from uncertain_lti.identification import discard, fit
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.signals.signal_map import Signal
@@ -57,24 +57,19 @@ def messages(*transients, additive="noise", **options):
 
 WORDS = {
     "collinear": "nearly move together",
-    "one-sided": "steady value",
     "weak": "moves too little",
     "feedback": "follow from the states",
     "slow": "sampling is slow",
-    "quantised": "is recorded in steps of",
     "frozen": "frozen sensor",
     "held": "repeats its last value",
-    "ended": "commands that have ended",
     "delay": "better when it is taken",
-    "gain": "--additive noise",
     "few": "as wide as the rest needs",
     "noise": "like noise from sample to sample",
-    "no machine": "read no time constants",
     "missing": "one sample earlier explains",
     "code": "stands for no value",
+    "jitter": "the stamps jitter",
     "flip": "change sign together",
     "wrap": "wraps around",
-    "jitter": "the stamps jitter",
 }
 
 
@@ -105,39 +100,12 @@ def test_a_state_that_follows_its_control_is_named_with_the_cure():
     assert "'speed' and 'valve'" in message and "steps of 'valve' that are sharper than 'speed' can follow" in message
 
 
-def test_one_sided_control_is_named_with_its_side():
-    up = steps(np.random.default_rng(3), 1501)
-    up[:, 1] = np.abs(up[:, 1])
-    (message,) = [m for m in messages(run(u=up)) if "never goes" in m]
-    assert "'pump' never goes below" in message
-    up[:, 1] *= -1
-    (message,) = [m for m in messages(run(u=up)) if "never goes" in m]
-    assert "'pump' never goes above" in message
-
-
-def test_one_sided_is_seen_from_the_steady_value():
-    up = np.abs(steps(np.random.default_rng(3), 1501))
-    centred = OperatingPoint([0, 0], [0.5, 0.5], [1, 1], [1, 1])
-    assert any("never goes" in m for m in messages(run(u=up)))
-    assert not any("never goes" in m for m in messages(run(u=up), operating_point=centred, additive="both"))
-
-
 def test_control_lost_in_the_noise_is_named():
     u = steps(np.random.default_rng(4), 1501)
     u[:, 1] *= 1e-5
     (message,) = [m for m in messages(run(u=u, noise=1e-2)) if WORDS["weak"] in m]
     assert "'pump'" in message and "standard errors" in message
     assert not any(WORDS["weak"] in m for m in messages(run(u=u, noise=0.0, count=1500, seed=4)) if "'valve'" in m)
-
-
-@pytest.mark.parametrize(("moves", "named"), [(1, True), (9, True), (200, False)])
-def test_control_that_hardly_ever_moves_is_named(moves, named):
-    u = steps(np.random.default_rng(4), 1501)
-    u[:, 1] = 0.0
-    u[100 : 100 + moves : 1, 1] = 0.4
-    found = messages(run(u=u))
-    assert any(f"'pump' leaves its usual value in {moves} of 1500 transitions only" in m for m in found) == named
-    assert not (named and any("'pump' never goes" in m for m in found))
 
 
 def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
@@ -158,15 +126,6 @@ def test_step_too_long_for_the_fastest_mode(dt, slow):
     assert ("slow" in said(messages(run(dt=dt, noise=1e-5)))) == slow
 
 
-def test_rounding_sensor_is_named_with_its_step():
-    def rounded(size):
-        return lambda x, u: (np.column_stack([np.round(x[:, 0] / size) * size, x[:, 1]]), u)
-
-    (message,) = [m for m in messages(run(change=rounded(0.05))) if WORDS["quantised"] in m]
-    assert "'speed' is recorded in steps of 0.05" in message
-    assert "quantised" not in said(messages(run(change=rounded(1e-5))))  # far finer than the movement
-
-
 def test_frozen_sensor_is_named_with_its_stretch():
     def freeze(x, u):
         x = x.copy()
@@ -175,7 +134,7 @@ def test_frozen_sensor_is_named_with_its_stretch():
 
     (message,) = [m for m in messages(run(change=freeze)) if WORDS["frozen"] in m]
     assert "'flow'" in message and "119 samples" in message
-    assert "run from 20 s" in message or "recording 1 from sample 400" in message
+    assert "run at 20 s" in message
 
 
 def test_a_machine_at_rest_is_not_frozen():
@@ -201,33 +160,6 @@ def test_state_of_a_slower_topic_is_named_with_its_period(period):
     assert "'flow'" in message and f"every {period} samples" in message
 
 
-def test_commands_that_ended_long_ago_are_named():
-    u = np.random.default_rng(8).uniform(-1, 1, (1501, 2))
-    u[900:, 0] = u[900, 0]
-    assert "ended" not in said(messages(run(u=u)))  # the other control of the topic goes on
-    u[900:] = u[900]
-    (message,) = [m for m in messages(run(u=u)) if WORDS["ended"] in m]
-    assert "'valve' and 'pump' change all the time" in message and "the last 600 samples" in message
-    assert "ended" not in said(messages(run(u=np.random.default_rng(8).uniform(-1, 1, (1501, 2)))))
-
-
-def test_stale_controls_are_named():
-    signals = SignalMap(
-        (Signal("speed", "/s", "a"), Signal("flow", "/s", "b")),
-        (Signal("valve", "/c", "a", max_hold=0.1), Signal("pump", "/c", "b")),
-        clock="/s",
-        max_gap=1.0,
-    )
-    from uncertain_lti.identification.assembly import assemble
-    from uncertain_lti.identification.sensors import stale
-
-    old = run(signals=signals, counters={"stale valve": 400})
-    problem = assemble([old], OperatingPoint.identity(2, 2), None, "noise")
-    (message,) = stale(signals.signals, 2, problem, [old])
-    assert "'valve' was older than max_hold (0.1 s) in 400 of 1501 samples" in message
-    assert stale(signals.signals, 2, problem, [run(signals=signals, counters={"stale valve": 3})]) == []
-
-
 @pytest.mark.parametrize("lag", [1, 3, 7])
 @pytest.mark.parametrize("noise", [1e-4, 1e-2])
 def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
@@ -242,27 +174,6 @@ def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
     ).all()
 
 
-def test_noise_near_rest_is_named():
-    u = steps(np.random.default_rng(11), 1501)
-    u[200:800] = 0.0
-    transient = run(11, u=u, noise=5e-3)
-    transient = Transient(transient.t_ns[1:], transient.x[1:], transient.u[1:])
-    (message,) = [m for m in messages(transient, additive="none") if WORDS["gain"] in m]
-    times = float(message.partition(" times that of")[0].rpartition(" ")[2])
-    pure, better = fit(transient, additive="none"), fit(transient, additive="noise")
-    assert times > 1.0 and (better.fit_summary["mean_width"] < pure.fit_summary["mean_width"]).all()
-
-
-def test_pure_intervals_that_do_well_are_left_alone():
-    rng = np.random.default_rng(12)
-    u = steps(rng, 1501)
-    x = np.zeros((1501, 2))
-    x[0] = 1.0
-    for k in range(1500):
-        x[k + 1] = x[k] + 0.05 * (A * (1 + 0.2 * rng.uniform(-1, 1, (2, 2))) @ x[k] + B @ u[k])
-    assert "gain" not in said(messages(Transient(np.arange(1501) * 0.05, x, u), additive="none"))
-
-
 def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
     from uncertain_lti import read_transients
 
@@ -270,7 +181,7 @@ def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
         return fit(read_transients([recordings / b for b in bags], signals_folder / signals)).fit_summary["messages"]
 
     hunter = of(["hunter_se/straight_odd_t_0_5_run_01.mcap"], "hunter_se.yaml")
-    assert {"collinear", "one-sided"} <= said(hunter)  # a straight run: the speed follows a throttle that only opens
+    assert {"collinear"} <= said(hunter)  # a straight run: the speed follows a throttle that only opens
     neato = said(of(["neato/person_follower.mcap"], "neato.yaml"))
     assert "slow" in neato and "delay" not in neato  # its signals file sets the delay
     assert "weak" in said(of(["crazyflie/yx3bag_0.mcap"], "crazyflie_vicon.yaml"))
@@ -279,7 +190,7 @@ def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
     assert "missing" not in neato | said(hunter)
     go2 = said(of(["go2/test_3.mcap"], "go2_joint.yaml"))
     assert "jitter" in go2  # 0.12 to 4.8 ms around 2 ms
-    assert not go2 & {"missing", "code", "delay", "slow", "weak", "held", "quantised", "frozen", "one-sided"}
+    assert not go2 & {"missing", "code", "delay", "slow", "weak", "held", "frozen"}
 
 
 def test_the_suggested_delay_narrows_the_neato(recordings, signals_folder):
@@ -295,19 +206,6 @@ def test_the_suggested_delay_narrows_the_neato(recordings, signals_folder):
     )
     assert sum("`delay: 1`" in m for m in plain.fit_summary["messages"]) == 2
     assert (shifted.fit_summary["mean_width"] < 0.65 * plain.fit_summary["mean_width"]).all()
-
-
-def test_hunter_steering_is_named_as_not_identifiable(recordings, signals_folder, tmp_path):
-    from uncertain_lti import read_transients
-
-    text = (signals_folder / "hunter_se.yaml").read_text()
-    text = text.replace(
-        "\ncontrols:", "\n  - {name: yaw_rate, topic: /hunter/twist, field: twist.angular.z}\ncontrols:"
-    )
-    (tmp_path / "s.yaml").write_text(text + "  - {name: steering, topic: /hunter/cmd, field: vector.y}\n")
-    bag = recordings / "hunter_se/straight_odd_t_0_5_run_01.mcap"
-    found = fit(read_transients(bag, tmp_path / "s.yaml")).fit_summary["messages"]
-    assert any("'steering' leaves its usual value in 1 of 2512 transitions only" in m for m in found)
 
 
 # --- few samples, and noise ---
@@ -350,20 +248,6 @@ def test_discards_that_are_too_few_are_added_to():
     assert "--discard 4 " in message
 
 
-def test_rare_steps_of_a_control_are_to_be_recorded_more_often_and_not_left_out():
-    u = np.zeros((1501, 2))
-    u[:, 0] = steps(np.random.default_rng(7), 1501)[:, 0]
-    u[700:, 1] = 1.0
-
-    def kick(x, u):  # what the linear plant does not know of: a kick as the pump starts
-        x = x.copy()
-        x[701:704, 1] += 0.4
-        return x, u
-
-    (message,) = [m for m in messages(run(u=u, change=kick)) if WORDS["few"] in m]
-    assert "where 'pump' steps: record more such steps" in message and "--discard" not in message
-
-
 def test_for_a_criterion_that_would_discard_others_the_stretch_is_named():
     (message,) = [m for m in messages(run(change=spiked((400,))), criterion="lp") if WORDS["few"] in m]
     assert "leave that stretch out" in message and "--discard" not in message
@@ -380,44 +264,6 @@ def test_a_state_that_is_noise_is_named():
     assert "slow" not in said(found)
     (message,) = [m for m in found if WORDS["noise"] in m]
     assert message.startswith("'flow' moves like noise")
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_noise_is_no_fast_machine(seed):
-    """No advice on the rate of sampling where there is no memory that a faster rate would show."""
-
-    def still(x, u):
-        return 1.0 + 0.05 * np.random.default_rng(seed).standard_normal(x.shape), u
-
-    found = messages(run(seed, count=400, change=still))
-    assert {"noise", "no machine"} <= said(found) and "slow" not in said(found)
-
-
-def test_noise_on_a_slow_state_is_no_fast_machine():
-    rng = np.random.default_rng(11)
-    slow = (np.diag([-0.05, -0.1]), np.diag([0.05, 0.1]))
-    u = np.repeat(rng.uniform(-1, 1, (60, 2)), 100, axis=0)[:4001]
-    found = messages(run(count=4000, u=u, plant=slow, noise=0.2))
-    assert "slow" not in said(found), found
-
-
-def test_columns_that_are_not_told_apart_are_no_fast_machine():
-    def copied(x, u):
-        x = x.copy()
-        x[:, 1] = 3.0 * x[:, 0] + 1e-3 * np.random.default_rng(3).standard_normal(len(x))
-        return x, u
-
-    found = messages(run(change=copied, noise=1e-3))
-    assert "collinear" in said(found) and "slow" not in said(found)
-
-
-def test_what_is_set_is_not_recommended():
-    coarse = run(noise=0.0, change=lambda x, u: (np.round(x / 0.05) * 0.05, u))
-    for additive in ("noise", "both"):
-        found = messages(coarse, additive=additive)
-        assert "quantised" in said(found) and not any("noise term" in m or "--additive" in m for m in found)
-        assert "--additive" not in remedies(found, additive, "speed")
-    assert any("use the noise term" in m for m in messages(coarse, additive="disturbance"))
 
 
 def test_remedies_go_by_what_was_found():
@@ -463,20 +309,12 @@ def test_a_missing_state_is_named_with_its_number_and_the_cure_narrows(turn):
     half = resonance(turn, 0.02, 0.01, measured=[0])
     found = messages(half)
     (message,) = [m for m in found if WORDS["missing"] in m]
-    assert "'x1'" in message and "autocorrelation" in message and not {"weak", "noise", "no machine"} & said(found)
+    assert "'x1'" in message and "autocorrelation" in message and not {"weak", "noise"} & said(found)
     share = float(message.split("explains ")[1].split("%")[0]) / 100
     wider = Transient(half.t_ns[1:], half.x[1:], np.hstack([half.u[1:], half.x[:-1]]), name="run")
     before, after = (fit(t, additive="noise").fit_summary["mean_width"][0] for t in (half, wider))
     assert after / before < 1 - 0.5 * share
     assert "missing" not in said(messages(resonance(turn, 0.02, 0.01)))  # with both states recorded
-
-
-@pytest.mark.parametrize("measured", [(0, 1), (0,)])
-@pytest.mark.parametrize("turn", [0.8, 1.2, 1.6])
-@pytest.mark.parametrize("damping", [0.02, 0.2])
-@pytest.mark.parametrize("noise", [0.0, 0.05, 0.3])
-def test_a_true_resonance_is_never_said_to_come_from_noise(turn, damping, noise, measured):
-    assert "no machine" not in said(messages(resonance(turn, damping, noise, measured)))
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
@@ -519,7 +357,7 @@ def test_a_lagged_state_as_control_is_understood(recordings, signals_folder):
     better = fit(read_transients(bag, replace(signals, controls=(*signals.controls, added))))
     assert better.fit_summary["mean_width"][0] < 0.6 * plain.fit_summary["mean_width"][0]
     found = better.fit_summary["messages"]
-    assert not said(found) & {"collinear", "feedback", "slow", "no machine", "delay"} and "unstable" not in str(found)
+    assert not said(found) & {"collinear", "feedback", "slow", "delay"} and "unstable" not in str(found)
 
 
 # --- numbers that are no movement ---

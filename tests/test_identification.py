@@ -353,17 +353,6 @@ def test_unstable_nominal_model_is_said():
     assert any("unstable" in message for message in model.fit_summary["messages"])
 
 
-def test_noise_near_rest_is_named_with_the_remedy():
-    transient = drawn(small_plant(3), 400, 3, noise=2e-3, rest=150)
-    model = fit(transient)
-    assert any(
-        "absurdly wide" in message and "--additive noise" in message for message in model.fit_summary["messages"]
-    )
-    better = fit(transient, additive="noise")
-    assert not any("absurdly" in message for message in better.fit_summary["messages"])
-    assert (better.fit_summary["mean_width"] < model.fit_summary["mean_width"]).all()
-
-
 def test_constant_step_gives_the_width_to_noise_and_says_so():
     transient = drawn(small_plant(3), 200, 3, noise=1e-3)
     model = fit(transient, additive="both")

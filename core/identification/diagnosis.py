@@ -7,40 +7,74 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What the data and the fit mean for the user, in words."""
+"""What the data and the fit mean for the user, in words: a finding, its numbers and the remedy."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+import re
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import excitation, predictability, regimes, sensors
+from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
-from uncertain_lti.identification.excitation import quoted as _list
+from uncertain_lti.identification.evidence import (
+    DETERMINED,
+    NOISE,
+    autocorrelation,
+    lagged_states,
+    late_controls,
+    lost,
+    predicted,
+    successive,
+    unexplained,
+)
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.predictability import Prediction
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.codes import codes, too_small
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.signal_map import Signal
 
 LOOKED_AT, STRETCHES = 20_000, 20
 """Transitions, and stretches, that are examined at most for what shows in any of them."""
 FAST = 0.7
 """|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
-NEARLY = 0.5
-"""Share of a mode's speed that must remain without measurement noise, or noise is what makes it fast."""
 WIDE = 0.5
 """Mean width, as a share of the state's own range, above which few faults can show."""
-SLOW, DISCARD = "sampling is slow", "--discard"
-"""Words by which a message is known again."""
-AFTER_STEP = 5
-"""Samples after a step of a control that still belong to it."""
+COLLINEAR = 1e-3
+"""Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""
+MOST_GROUPS, MOST_NAMES, MOST_TIED = 3, 6, 5
+"""Combinations of signals, names in a sentence, and blocks with elements of another that are named."""
+FED_BACK = 0.9
+"""Share of a control's changes explained by the states, from which on that is reported."""
+FROZEN = 25
+"""Samples for which a value does not change while the others move, from which on it may be frozen."""
+UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
+"""|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `_jittering`."""
+
+_CODE, _NOISE, _BEFORE, _FEW = (
+    "a number that stands for no value",
+    "like noise from sample to sample",
+    "one sample earlier explains",
+    "as wide as the rest needs",
+)
+_QUATERNION = re.compile(r"((?:.*\.)?(?:orientation|rotation|quaternion|quat|q)(?:\.|_?))[xyzw]")
+_REMEDIES = (  # words of a message on the state, or on any signal; what narrows the bounds
+    (_FEW, True, "look at the few samples that carry the width, named above"),
+    (_BEFORE, True, "add its value one sample earlier, as said above"),
+    ("`delay:", False, "set the delay that the notes propose"),
+    ("sampling is slow", False, "sample faster"),
+    ("moves too little", False, "record the controls moving more"),
+    ("is not identifiable", False, "record the controls moving more"),
+)
 
 
 def too_few(transitions: int, unknowns: int) -> str:
@@ -92,15 +126,13 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
             f"to 0; record it moving, or leave it out"
         )
     free = np.flatnonzero(~dead)
-    unit = 1.0 / sums.phi_scale[free]
-    correlation = sums.centre[np.ix_(free, free)] * np.outer(unit, unit) / sums.count
-    values, vectors = np.linalg.eigh(correlation)
+    values, vectors = _directions(sums, free)
     limit = 1e-12 * len(free)
     for value, vector in zip(values, vectors.T, strict=True):
         if value <= limit:
             part = [names[free[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
             messages.append(
-                f"rank deficient: {_list(part)} move together in every transition, so their columns cannot be told "
+                f"rank deficient: {_quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
     moved = sums.high - sums.low
@@ -112,54 +144,53 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
     return int(np.count_nonzero(values > limit)), messages
 
 
+def _directions(sums: Moments, columns: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Eigenvalues and eigenvectors of the correlation of some regressors."""
+    unit = 1.0 / sums.phi_scale[columns]
+    return np.linalg.eigh(sums.centre[np.ix_(columns, columns)] * np.outer(unit, unit) / sums.count)
+
+
 def describe(
     model: UncertainLTI,
     problem: Problem,
     sums: Moments,
     mean_width: Array,
-    max_width: Array,
     transients: Sequence[Transient] = (),
     few: Carriers | None = None,
     discarded: int | None = None,
 ) -> tuple[int, list[str]]:
     """Rank, and messages to the user on a fitted model and the recordings it was fitted to.
 
-    `mean_width` (n,): normalised, per step; `max_width` (n,): normalised, per step.
+    `mean_width` (n,): normalised, per step.
     """
-    states = model.state_names
-    names = [*states, *model.control_names]
-    scheduled, problem = problem, replace(problem, columns=replace(problem.columns, regimes=None))
-    all_sums, sums = sums, sums.one_block()
-    found, messages = _rank(problem, sums, names)
-    apart = not messages
-    messages += _tied(model, scheduled, all_sums) + _beyond_knots(model, scheduled)
-    part = _stretches(problem)
     signals = (*model.signals.states, *model.signals.controls)
-    lagged = predictability.lagged_states(signals, model.n)
-    alike = excitation.collinear(problem, sums, names, 1e-12 * problem.p, lagged)
-
-    def place(some: Sequence[int]) -> str:
-        return _where(problem, some, transients)
-
-    broken = [*sensors.coded(problem, sums, signals), *sensors.flipped(problem, signals, place)]
-    messages = [*broken, *messages]
-    messages += [*([] if broken else _carried(few, discarded, problem, names, place)), *alike]
-    known = predictability.prediction(part)
-    told, follow = _recordings(model, problem, part, sums, names, transients, bool(broken))
-    messages += told
-    messages += _noise_like(known, part, states, follow)
-    past = bool(lagged)  # A alone is then not the dynamics
-    slow = [] if past else _slow(model, known, apart and not alike, bool(follow))
-    messages += slow
-    messages += _unstable(model, past)
-    messages += _unsure(model, names)
+    names = [s.name for s in signals]
+    scheduled, problem = problem, replace(problem, columns=replace(problem.columns, regimes=None))
+    regimes_said = _tied(model, scheduled, sums) + _beyond_knots(model, scheduled)
+    sums = sums.one_block()
+    rank, messages = _rank(problem, sums, names)
+    apart = not messages
+    coded = [*_coded(problem, sums, signals), *_wrapped(problem, signals, transients)]
+    messages = [*coded, *messages, *regimes_said]
+    if not coded:  # the envelope is fitted to the jumps, and what follows would be about them
+        part, past = _stretches(problem), lagged_states(signals, model.n)
+        messages += _carried(few, discarded, problem, names, transients)
+        alike = _collinear(problem, sums, names, past)
+        noisy, late, held = _noise_like(part, names), _delayed(part, signals, past), _held(part, signals)
+        messages += [*alike, *late, *held, *_jittering(model, part, names), *_frozen(part, names, transients)]
+        lacking = {} if late else _missing(part, signals)
+        lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
+        messages += lacking.values()
+        messages += _weak(problem, sums, names, past, lacking)
+        messages += _fed_back(part, names, past)
+        messages += [m for i, m in noisy.items() if i not in lacking]
+        if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
+            messages += _slow(model) + _unstable(model)
+    messages += _wide(sums, mean_width, names)
     columns = problem.columns
-    if not columns.noise and not columns.disturbance:
-        messages += _near_rest(scheduled, _stretches(scheduled), all_sums, mean_width, states)
-    messages += _wide(sums, mean_width, states, known, few, bool(slow) and SLOW in slow[0], follow)
     if columns.drift and columns.noise and not columns.disturbance:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
-    return found, messages
+    return rank, messages
 
 
 def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
@@ -198,93 +229,232 @@ def _beyond_knots(model: UncertainLTI, problem: Problem) -> list[str]:
     return messages
 
 
-MOST_TIED = 5
-"""Blocks that share the elements of another which are named one by one."""
+def _collinear(problem: Problem, sums: Moments, names: Sequence[str], past: Collection[int]) -> list[str]:
+    """Signals that nearly move together, and the recording that would separate them."""
+    free = np.flatnonzero(sums.phi_scale[: problem.p] > 0)
+    free = free[~np.isin(free, list(past))]
+    messages = []
+    for value, vector in zip(*[a.T for a in _directions(sums, free)], strict=True):
+        part = [int(free[j]) for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
+        if not 1e-12 * problem.p < value < COLLINEAR or len(part) < 2:
+            continue
+        states, controls = [names[j] for j in part if j < problem.n], [names[j] for j in part if j >= problem.n]
+        if not states:
+            cure = f"record {_quoted(controls[:1])} moving while {_quoted(controls[1:])} rests"
+        elif controls:
+            cure = f"record steps of {_quoted(controls)} that are sharper than {_quoted(states)} can follow"
+        else:
+            cure = f"excite them by other controls or from other initial states, or leave one of {_quoted(states)} out"
+        messages.append(
+            f"{_quoted([names[j] for j in part])} nearly move together (all but {value**0.5:.2%} of their size), so "
+            f"their columns are poorly told apart and their elements may trade places: {cure}"
+        )
+    if (groups := len(messages)) > MOST_GROUPS:
+        messages[MOST_GROUPS:] = [
+            f"{groups} combinations of signals nearly move together, of which the {MOST_GROUPS} nearest are named "
+            f"above: few of {len(free)} signals can be told apart; use fewer, or more controls of their own"
+        ]
+    return messages
 
 
-def _at(model: UncertainLTI, block: int) -> str:
-    """at the knot of a block; empty of a model with one."""
-    return f" at {model.block_name(block)}" if model.schedule is not None else ""
-
-
-def _few(words: Sequence[str]) -> str:
-    """The first of them, and how many more there are."""
-    return "; ".join(words[:3]) + (f"; and {len(words) - 3} more" if len(words) > 3 else "")
-
-
-def _unstable(model: UncertainLTI, past: bool) -> list[str]:
-    """Whether the nominal model, of every block, stays bounded in a free run; past: it remembers earlier samples."""
-    growing, running = [], []
-    for r, block in enumerate(model.blocks):
-        unstable = [] if past else [v for v in block.eigenvalues() if v.real > 0]
-        if unstable:
-            values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
-            growing.append(f"eigenvalues {values} 1/s{_at(model, r)}")
-        elif block.spectral_radius() > 1.0 + 1e-9:
-            running.append(f"spectral radius {block.spectral_radius():.4g}{_at(model, r)}")
-    stay = "one-step bounds restart from the measured state and stay valid, a free run does not"
-    if growing:
-        return [f"the nominal model is unstable ({_few(growing)}): {stay}"]
-    if running:
-        return [f"the nominal recursion runs away at the recorded step ({_few(running)}): {stay}"]
-    return []
-
-
-def _unsure(model: UncertainLTI, names: Sequence[str]) -> list[str]:
-    """Half-widths above their nominal elements."""
-    nominal, half = (
-        np.stack([np.hstack([getattr(b, name) for name in both]) for b in model.blocks])
-        for both in (("A", "B"), ("dA", "dB"))
-    )
-    wide = np.argwhere(half > np.abs(nominal))
-    if not len(wide):
-        return []
-    r, i, j = max(wide.tolist(), key=lambda at: float(half[tuple(at)] - abs(nominal[tuple(at)])))
+def _weak(
+    problem: Problem, sums: Moments, names: Sequence[str], past: Collection[int], lacking: Collection[int]
+) -> list[str]:
+    """Controls whose effect is lost in the noise."""
     return [
-        f"{len(wide)} of {nominal.size} half-widths exceed their nominal elements (most: {names[i]} from "
-        f"{names[j]}{_at(model, r)}, {nominal[r, i, j]:.3g} ± {half[r, i, j]:.3g} 1/s): the sign of these effects is "
-        f"not known"
+        f"control '{names[j]}' moves too little to be distinguished from the noise: its strongest effect, on "
+        f"'{names[state]}', is {certainty:.2g} standard errors; record it with larger or more steps "
+        f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
+        for j, (state, certainty) in lost(problem, sums, past).items()
+        if state not in lacking
     ]
 
 
-def _recordings(
-    model: UncertainLTI,
-    problem: Problem,
-    part: Problem,
-    sums: Moments,
-    names: Sequence[str],
-    transients: Sequence[Transient],
-    broken: bool,
-) -> tuple[list[str], set[int]]:
-    """Messages on the recordings (excitation, sensors, topics), and the states that lack another state.
+def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int]) -> list[str]:
+    """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to separate.
 
-    broken: some numbers are no movement; what the jumps do to the residuals comes from them.
+    u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} if a feedback sets u_k; an input that a person steps
+    at will is not.
     """
-    signals = (*model.signals.states, *model.signals.controls)
-    past = predictability.lagged_states(signals, model.n)
-    rare = excitation.rare(part, names)
-    known = {*rare, *past}
-    held, late = sensors.held(part, signals), sensors.delayed(part, signals, past)
-    found = None if late or broken else predictability.autocorrelation(part)
-    # what a slow topic or a late control explains needs no further state
-    follow = {i for i in range(model.n) if found and found.follows(i) and not any(f"'{names[i]}'" in m for m in held)}
-    speed = max((abs(v) for block in model.blocks for v in block.eigenvalues()), default=0.0) * (
-        model.sampling.dt_median or np.inf
-    )
-    uneven = [] if broken else sensors.jittering(part, signals, float(speed), model.sampling.clock)
-    messages = [*rare.values(), *uneven]
-    if found:
-        messages += predictability.missing(found, signals, follow)
-    lost = {j: (i, certainty) for j, (i, certainty) in excitation.lost(problem, sums, known).items() if i not in follow}
-    messages += [] if broken else predictability.weak(lost, names)
-    messages += excitation.one_sided(part, names, known)
-    messages += excitation.fed_back(part, names, past)
-    messages += late
-    messages += sensors.quantised(part, signals)
-    messages += held
-    messages += sensors.frozen(part, signals, transients)
-    messages += sensors.stale(signals, model.n, part, transients)
-    return messages, follow
+    follows = successive(problem)
+    if len(follows) <= 4 * problem.p:
+        return []
+    before, now = problem.z[follows], problem.z[follows + 1]
+    n = problem.n
+    basis = np.column_stack([now[:, :n], before, np.ones(len(before))])
+    gram = basis.T @ basis
+    messages = []
+    for j in [j for j in range(n, problem.p) if j not in past]:
+        change = now[:, j] - before[:, j]
+        change = change - change.mean()
+        size = float(change @ change)
+        if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
+            continue
+        explained = 1.0 - float(unexplained(gram, (basis.T @ change)[:, None], np.array([size]))[0]) / size
+        if explained > FED_BACK:
+            messages.append(
+                f"the changes of control '{names[j]}' follow from the states to {explained:.0%}: a feedback sets it, "
+                f"so the nominal matrices may mix it with the plant (the bounds hold for the same feedback only); "
+                f"record it with steps of its own"
+            )
+    return messages
+
+
+def _coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[str]:
+    """Signals in which a number means "no value"."""
+    messages = []
+    for j, signal in enumerate(signals):
+        if too_small(float(sums.low[j]), float(sums.high[j])):
+            continue
+        z, steady, scale = problem.z[:, j], float(signal.steady), float(signal.scale)
+        found = codes(z)
+        others = z[~np.isin(z, list(found))] * scale + steady
+        messages += [
+            f"'{signal.name}' is exactly {code * scale + steady:.9g} in {count} of {problem.N} transitions and "
+            f"{others.min():.4g} to {others.max():.4g} in the others: {_CODE}, or a sensor at its limit, "
+            f"and the envelope is fitted to the jumps there and back; if it stands for none, write "
+            f"`ignore: [{code * scale + steady:.12g}]` in the entry of '{signal.name}'"
+            for code, count in found.items()
+        ]
+    return messages
+
+
+def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[Transient]) -> list[str]:
+    """Components of a quaternion that change sign together, and angles that wrap around."""
+    states, messages, groups = signals[: problem.n], list[str](), dict[str, list[int]]()
+    scale, steady = (np.array([float(getattr(s, name)) for s in states]) for name in ("scale", "steady"))
+    before, after = problem.z[:, : problem.n] * scale + steady, problem.x_next * scale + steady
+    for i, signal in enumerate(states):
+        if match := _QUATERNION.fullmatch(signal.field) or (not signal.topic and _QUATERNION.fullmatch(signal.name)):
+            groups.setdefault(signal.topic + match[1], []).append(i)
+        step = np.abs(after[:, i] - before[:, i])
+        for turn in (2 * np.pi, 360.0):
+            jumps = np.abs(step - turn) < 0.1 * turn
+            inside = np.abs(before[:, i]).max() < 0.51 * turn or (before[:, i].min() >= 0 and before[:, i].max() < turn)
+            if inside and 0 < jumps.sum() < 0.05 * problem.N and step[~jumps].max() < 0.3 * turn:
+                messages.append(
+                    f"'{signal.name}' wraps around in {plural(int(jumps.sum()), 'step')} "
+                    f"({_where(problem, np.flatnonzero(jumps).tolist(), transients)}), by {turn:.4g}: that jump is no "
+                    f"movement, and the envelope is fitted to it; use 'unwrap({signal.field or signal.name})'"
+                )
+    for those in groups.values():
+        one, other = before[:, those], after[:, those]
+        total, apart = np.square(one + other).sum(axis=1), np.square(one - other).sum(axis=1)
+        flips = np.flatnonzero((np.square(one).sum(axis=1) > 0.1) & (total < 0.02 * apart))
+        if len(flips) and max(np.abs(one).max(), np.abs(other).max()) < 1.01:  # of a unit quaternion
+            messages.append(
+                f"{_quoted([states[i].name for i in those])} change sign together in {plural(len(flips), 'step')} "
+                f"({_where(problem, flips.tolist(), transients)}): q and -q are one attitude, so that jump is no "
+                f"movement, and the envelope is fitted to it; use roll, pitch or yaw instead, unwrap(yaw(...))"
+            )
+    return messages
+
+
+def _jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> list[str]:
+    """Stamps that are unevenly spaced where the samples are not.
+
+    Over the uneven steps, what a constant step explains is compared with what the stated one does. Of samples that are
+    really uneven the stated one explains more.
+    """
+    dt, x = problem.dt, problem.z[:, : problem.n]
+    usual = float(np.median(dt))
+    uneven = np.abs(np.log(dt / usual)) > UNEVEN
+    speed = max((abs(v) for block in model.blocks for v in block.eigenvalues()), default=0.0) * usual
+    moving = np.flatnonzero(np.ptp(x, axis=0) > 0)
+    if uneven.sum() < max(20, 0.01 * problem.N) or not speed < SLOW_STEP or not len(moving):
+        return []
+    left = []
+    for length in (dt, np.full(len(dt), usual)):
+        basis = np.column_stack([problem.z, np.ones(problem.N)]) * length[:, None]
+        rest = problem.x_next - x
+        rest = rest - basis @ (np.linalg.pinv(basis.T @ basis, hermitian=True) @ (basis.T @ rest))
+        left.append(np.sqrt(np.mean(rest[uneven] ** 2, axis=0)))
+    ratio = (left[0] / np.maximum(left[1], 1e-300))[moving]
+    if ratio.max() < JITTER or ratio.min() < 1 / 1.05:
+        return []
+    clock = model.sampling.clock
+    return [
+        f"the stamps jitter: steps range from {dt.min() * 1e3:.3g} to {dt.max() * 1e3:.3g} ms around "
+        f"{usual * 1e3:.3g} ms, and a constant step leaves {1 - 1 / ratio.max():.0%} less of "
+        f"'{names[moving[np.argmax(ratio)]]}' unexplained over the {int(uneven.sum())} uneven ones: "
+        f"write `step: constant` in the signals file, or have them stamped at the sensor"
+        + (f", or try the other time of {clock} (header or log) under `topics`" if clock else "")
+    ]
+
+
+def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """States that repeat their last value between samples of a slower topic."""
+    messages = []
+    if len(successive(problem)) < 0.5 * problem.N:
+        return []
+    for i, signal in enumerate(signals[: problem.n]):
+        instants = np.flatnonzero(problem.x_next[:, i] != problem.z[:, i])
+        if not 10 <= len(instants) <= 0.7 * problem.N:
+            continue
+        period = float(np.median(np.diff(instants)))
+        # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
+        if period >= 2 and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
+            messages.append(
+                f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
+                f"new about every {period:.0f} samples: its topic or its sensor is slower than the clock, and its row "
+                f"is fitted to jumps; make its topic the clock, or leave it out"
+            )
+    return messages
+
+
+def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transient]) -> list[str]:
+    """States that keep exactly one value for long while the other signals move."""
+    messages = []
+    spread = np.ptp(problem.z_columns, axis=1)
+    for i in range(problem.n):
+        still = problem.x_next[:, i] == problem.z[:, i]
+        if still.mean() > 0.5:  # held, quantised, or at rest most of the time
+            continue
+        still[1:] &= problem.source[1:] == problem.source[:-1]
+        runs = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
+        for start, stop in runs[runs[:, 1] - runs[:, 0] >= FROZEN]:
+            moving = (np.ptp(problem.z[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
+            moving[i] = False
+            if moving.any():
+                messages.append(
+                    f"'{names[i]}' stands at exactly one value for {stop - start} samples "
+                    f"({_where(problem, [start], transients)}) while '{names[int(np.argmax(moving))]}' moves: a frozen "
+                    f"sensor? Leave that stretch out, or the envelope will take it for healthy"
+                )
+                break
+    return messages
+
+
+def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int]) -> list[str]:
+    """Controls that explain the states better when taken some samples earlier."""
+    return [
+        f"the states follow control '{signals[problem.n + j].name}' better when it is taken {plural(best, 'sample')} "
+        f"earlier (the unexplained part of a step falls by {share:.0%}): try "
+        f"`delay: {signals[problem.n + j].delay + best}` for it in the signals file"
+        for j, (best, share) in late_controls(problem, past).items()
+    ]
+
+
+def _missing(problem: Problem, signals: Sequence[Signal]) -> dict[int, str]:
+    """States whose next sample depends on more than the signals at one instant."""
+    known = autocorrelation(problem)
+    messages = {}
+    for i, signal in enumerate(signals[: problem.n]):
+        if known is None or not known.follows(i):
+            continue
+        one, two = known.correlation[i].tolist()
+        entry = (
+            f"{{name: {signal.name}_before, topic: {signal.topic}, field: '{Memory('lag').of(signal.field)}'}}"
+            if signal.topic
+            else "the same column, one row later"
+        )
+        messages[i] = (
+            f"what one step leaves unexplained of '{signal.name}' is correlated from sample to sample "
+            f"(autocorrelation {one:.2f} at one sample, {two:.2f} at two): a state that moves it is not among the "
+            f"signals. Its value {_BEFORE} {1 - 1 / known.gain[i]:.0%} of it (root mean square); add that as a "
+            f"control ({entry}), or its rate, measured or as `rate(...)` of the field"
+        )
+    return messages
 
 
 def _stretches(problem: Problem) -> Problem:
@@ -302,33 +472,24 @@ def _carried(
     discarded: int | None,
     problem: Problem,
     names: Sequence[str],
-    place: Callable[[Sequence[int]], str],
+    transients: Sequence[Transient],
 ) -> list[str]:
     """States whose width a few samples carry."""
     if few is None:
         return []
     indices = sorted(few.transitions)
-    where = place(indices)
     wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
-    widths = [f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4]]
-    widths += [f"{len(wide) - 4} other states"] if len(wide) > 4 else []
-    listed = widths[0] if len(widths) == 1 else ", ".join(widths[:-1]) + " and of " + widths[-1]
-    if steps := _at_steps(problem, indices):
-        cure = (
-            f"they are the few where {_list([names[j] for j in steps])} {'steps' if len(steps) == 1 else 'step'}: "
-            f"record more such steps, or find the delay between them and the answer"
-        )
-    else:
-        cure = "look at what happened there; if it is no part of healthy use, "
-        cure += (
-            "leave that stretch out of the recording"
-            if discarded is None
-            else f"{DISCARD} {discarded + len(indices)} leaves them out and lists them"
-        )
-    one = len(indices) == 1
+    listed = ", ".join(f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4])
+    listed += f" and of {len(wide) - 4} other states" if len(wide) > 4 else ""
+    cure = (
+        "leave that stretch out of the recording"
+        if discarded is None
+        else f"--discard {discarded + len(indices)} leaves them out and lists them"
+    )
     return [
-        f"{plural(len(indices), 'transition')} of {problem.N} ({where}) {'makes' if one else 'make'} the envelope of "
-        f"{listed} as wide as the rest needs: {cure}"
+        f"{plural(len(indices), 'transition')} of {problem.N} ({_where(problem, indices, transients)}) "
+        f"{'makes' if len(indices) == 1 else 'make'} the envelope of {listed} {_FEW}: look at what happened there; if "
+        f"it is a rare step of a control, record more of them; if it is no part of healthy use, {cure}"
     ]
 
 
@@ -346,153 +507,81 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
     return where + (f"; and {len(indices) - 4} more" if len(indices) > 4 else "")
 
 
-def _at_steps(problem: Problem, indices: Sequence[int]) -> list[int]:
-    """Columns of controls that rarely change, and do so at most of these transitions."""
-    found = []
-    for j in range(problem.n, problem.p):
-        changes = np.flatnonzero(np.diff(problem.z[:, j]) != 0) + 1
-        near = np.zeros(problem.N, dtype=bool)
-        for shift in range(-2, AFTER_STEP + 1):
-            near[np.clip(changes + shift, 0, problem.N - 1)] = True
-        if len(changes) and near.mean() < 0.1 and near[list(indices)].mean() >= 0.5:
-            found.append(j)
-    return found
-
-
-def _noise_like(known: Prediction, problem: Problem, states: Sequence[str], follow: Collection[int]) -> list[str]:
+def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
     """States whose next sample cannot be predicted from those before."""
-    moving = np.ptp(problem.z[:, : problem.n], axis=0) > 0
-    like = [i for i in range(problem.n) if moving[i] and known.like_noise(i) and i not in follow]
-    if not like:
-        return []
-    worst = min(like, key=lambda i: float(known.predicted[i]))
-    one = len(like) == 1
-    return [
-        f"{_list([states[i] for i in like])} {'moves' if one else 'move'} like noise from sample to sample: signals "
-        f"and controls at one instant predict {max(0.0, known.predicted[worst]):.0%} of the variance of "
-        f"'{states[worst]}' at the next; leave {'it' if one else 'them'} out, or record the machine at work"
-    ]
+    n = problem.n
+    share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
+    moving = np.ptp(problem.z[:, :n], axis=0) > 0
+    return {
+        i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "
+        f"variance at the next; leave it out, or record the machine at work"
+        for i in np.flatnonzero(moving & (share < NOISE)).tolist()
+    }
 
 
-def _slow(model: UncertainLTI, known: Prediction, apart: bool, hidden: bool) -> list[str]:
-    """Modes that a step of forward Euler is too long for, if the recordings confirm them.
-
-    apart: the columns can be separated, so that the eigenvalues mean something; hidden: a state is missing, so that
-    what looks like noise may be a mode that one sample does not show.
-    """
-    dt = model.sampling.dt_median
-    if dt is None:
-        return []
+def _slow(model: UncertainLTI) -> list[str]:
+    """The fastest mode, if a step of forward Euler is too long for it."""
+    dt = model.sampling.dt_median or 0.0
     fastest = max((v for block in model.blocks for v in block.eigenvalues()), key=abs)
     turn = abs(fastest) * dt
     if turn <= FAST:
         return []
     mode = f"{fastest.real:.3g}{fastest.imag:+.3g}j" if fastest.imag else f"{fastest.real:.3g}"
-    if apart and known.fastest <= FAST and (hidden or known.fastest > NEARLY * turn):
-        return []  # nearly as fast without the noise, or not seen at all: neither is its doing
-    if not apart or known.fastest <= FAST:
-        cause = "noise" if apart else "columns that the recordings do not tell apart"
-        return [
-            f"the fastest mode of the nominal model ({mode} 1/s) comes from {cause}, not from the machine: the bounds "
-            f"hold, but read no time constants from A"
-        ]
     return [
-        f"{SLOW} for the fastest mode ({mode} 1/s, {turn:.2g} in a step of "
-        f"{dt:.3g} s): A is then the matrix of this step length rather than of the machine, and holds for no other; "
-        f"sample {np.ceil(turn / 0.2):.0f} times as fast, or leave the fast state out"
+        f"sampling is slow for the fastest mode ({mode} 1/s, {turn:.2g} in a step of {dt:.3g} s), unless noise of the "
+        f"readings makes it look fast: the bounds hold, but A is the matrix of this step length, so read no time "
+        f"constants from it; if the machine is that fast, sample {np.ceil(turn / 0.2):.0f} times as fast"
     ]
 
 
-def _wide(
-    sums: Moments,
-    mean_width: Array,
-    states: Sequence[str],
-    known: Prediction,
-    few: Carriers | None,
-    slow: bool,
-    follow: Collection[int],
-) -> list[str]:
-    """States whose envelope is as wide as what they do, and why where something is known."""
+def _unstable(model: UncertainLTI) -> list[str]:
+    """Whether the nominal model, of every block, stays bounded in a free run."""
+    found = []
+    for r, block in enumerate(model.blocks):
+        at = f" at {model.block_name(r)}" if model.schedule is not None else ""
+        unstable = [v for v in block.eigenvalues() if v.real > 0]
+        if unstable:
+            values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
+            found.append(f"eigenvalues {values} 1/s{at}")
+        elif block.spectral_radius() > 1.0 + 1e-9:
+            found.append(f"spectral radius {block.spectral_radius():.4g} at the recorded step{at}")
+    if not found:
+        return []
+    listed = "; ".join(found[:3]) + (f"; and {len(found) - 3} more" if len(found) > 3 else "")
+    return [
+        f"the nominal model is unstable ({listed}): one-step bounds restart from the measured state and stay valid, "
+        f"a free run does not"
+    ]
+
+
+def _wide(sums: Moments, mean_width: Array, names: Sequence[str]) -> list[str]:
+    """States whose envelope is as wide as what they do."""
     span = (sums.high - sums.low)[: len(mean_width)]
     wide = np.flatnonzero((span > 0) & (mean_width > WIDE * span)).tolist()
-    groups: dict[str, list[int]] = {}
-    for i in wide:
-        if few is not None and few.carry(i):
-            cause = "a few samples carry the width (see above)"
-        elif i in follow:
-            cause = "a state that moves it is not among the signals (see above)"
-        elif known.like_noise(i):
-            cause = "noise is most of what the recordings show of it"
-        elif slow:
-            cause = "one step is long for it, or what moves it is not among the controls"
-        else:
-            cause = "what moves it is not among the controls, or the noise is as large"
-        groups.setdefault(cause, []).append(i)
-    messages = []
-    for cause, those in groups.items():
-        listed = ", ".join(f"'{states[i]}' ({mean_width[i] / span[i]:.0%})" for i in those)
-        messages.append(
-            f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show "
-            f"there: {cause}"
-        )
-    return messages
+    if not wide:
+        return []
+    listed = ", ".join(f"'{names[i]}' ({mean_width[i] / span[i]:.0%})" for i in wide)
+    return [
+        f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show there: "
+        f"what moves it is not among the controls, one step is long for it, or the noise is as large; without an "
+        f"additive term noise near rest alone does it (--additive noise)"
+    ]
 
 
 def remedies(messages: Sequence[str], additive: str, state: str) -> str:
     """What of a fit's messages would narrow the bounds of a state; "" where they name nothing."""
     named = [m for m in messages if f"'{state}'" in m]
-    if any(words in m for m in named for words in (sensors.STANDS_FOR_NONE, sensors.CHANGES_SIGN, sensors.WRAPS)):
+    if any(words in m for words in (_CODE, "wraps around", "change sign together") for m in named):
         return "it jumps without moving, as said above"
-    found = []
-    if any("as wide as the rest needs" in m for m in named):
-        found.append("look at the few samples that carry the width, named above")
-    if any("like noise from sample to sample" in m for m in named):
+    if any(_NOISE in m for m in named):
         return "it moves like noise: leave it out, or record the machine at work"
-    if any("one sample earlier explains" in m for m in named):
-        found.append("add its value one sample earlier, as said above")
-    if additive == "none":
-        found.append("try --additive noise")
-    if any("`delay:" in m for m in messages):
-        found.append("set the delay that the notes propose")
-    if any(m.startswith(SLOW) for m in messages):
-        found.append("sample faster")
-    if any("moves too little" in m or "is not identifiable" in m for m in messages):
-        found.append("record the controls moving more")
-    return ", or ".join(found)
+    found = [remedy for words, own, remedy in _REMEDIES if any(words in m for m in (named if own else messages))]
+    return ", or ".join(dict.fromkeys([*found, *(["try --additive noise"] if additive == "none" else [])]))
 
 
-def _near_rest(problem: Problem, part: Problem, sums: Moments, mean_width: Array, states: Sequence[str]) -> list[str]:
-    """Widths that come from samples near rest; part: `_stretches`."""
-    floor = 1e-9 * np.abs(part.z_columns[: part.n]).max(axis=1)  # below it both are rounding
-    box = _least_squares_box(part, sums)
-    if part is not problem and (mean_width > box).any():  # the band of all samples is no narrower: a screen
-        box = _least_squares_box(problem, sums, enough=mean_width)
-    blown = [i for i in range(problem.n) if mean_width[i] > box[i] > floor[i]]
-    if not blown:
-        return []
-    size = np.abs(part.z_columns).sum(axis=0)
-    rest = float(np.mean(size <= 0.02 * np.quantile(size, 0.95)))
-    worst = max(blown, key=lambda i: float(mean_width[i] / box[i]))
-    return [
-        f"the envelope of {_list([states[i] for i in blown])} is absurdly wide: the mean width of {states[worst]} is "
-        f"{mean_width[worst] / box[worst]:.3g} times that of a constant band around least squares, because noise near "
-        f"rest ({rest:.0%} of the samples) inflates the half-widths; use an additive term: --additive noise, or "
-        f"--additive disturbance"
-    ]
-
-
-def _least_squares_box(problem: Problem, sums: Moments, enough: Array | None = None) -> Array:
-    """Width of a constant band around least squares that contains every sample, (n,), per step.
-
-    Where it is known to reach `enough` in every state, what it reaches beyond is not sought.
-    """
-    free = sums.phi_scale > 0
-    theta = np.zeros(sums.target.shape)
-    theta[free] = np.linalg.lstsq(sums.centre[np.ix_(free, free)], sums.target[free], rcond=None)[0]
-    largest = np.zeros(problem.n)
-    for block in problem.blocks():
-        residual = np.abs(block.rate() - theta.T @ block.phi(problem.columns)) * block.dt
-        largest = np.maximum(largest, residual.max(axis=1))
-        if enough is not None and (2.0 * largest >= enough).all():
-            break
-    return 2.0 * largest
+def _quoted(names: Sequence[str]) -> str:
+    """'a', 'b' and 'c'; of many names the first ones, and how many others there are."""
+    marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
+    if len(marked) > MOST_NAMES + 1:
+        return f"{', '.join(marked[:MOST_NAMES])} and {len(marked) - MOST_NAMES} others"
+    return marked[0] if len(marked) == 1 else ", ".join(marked[:-1]) + " and " + marked[-1]

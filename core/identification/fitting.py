@@ -276,7 +276,7 @@ def fit_fleet(
         whole = describe_on.N == sums.count and method == "working-set"
         few = carriers(describe_on, structure) if seek_carriers and whole else None
         facts["rank"], facts["messages"] = describe(
-            model, describe_on, sums, mean_width, max_width, transients, few, discarded if criterion == "qp" else None
+            model, describe_on, sums, mean_width, transients, few, discarded if criterion == "qp" else None
         )
         facts["messages"] += _distance(gap)
     return model.replace(fit_summary=facts, residuals=fleet.residuals(model, judged))

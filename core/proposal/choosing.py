@@ -19,8 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.identification.predictability import NOISE, predicted
-from uncertain_lti.identification.sensors import LONGEST_DELAY, lags
+from uncertain_lti.identification.evidence import LONGEST_DELAY, NOISE, lags, predicted
 from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, Candidate, Source
 from uncertain_lti.proposal.effects import FAINT, SHOWS, Steps, explained, steps_of
 from uncertain_lti.proposal.roles import is_physical

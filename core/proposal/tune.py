@@ -25,8 +25,7 @@ from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.predictability import autocorrelation
-from uncertain_lti.identification.sensors import late_controls
+from uncertain_lti.identification.evidence import autocorrelation, late_controls
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI

@@ -1,0 +1,268 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Evidence: what recordings say of their signals, in numbers; choices and sentences rest on it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import Array
+from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.problem import Problem
+from uncertain_lti.signals.signal_map import Signal
+
+NOISE = 0.5
+"""A state of whose variance less than this share is predicted from one sample to the next moves like noise."""
+FOLLOW, ALTERNATE = 0.5, -0.7
+"""Autocorrelation from which on residuals follow one another. Sensor noise alone gives -0.5 to 0 at one sample, and
+0 at two."""
+GAIN = 1.5
+"""By so much the state's own value one sample earlier must reduce what a step leaves unexplained."""
+CURVED = 0.5
+"""Share of that reduction which curves of the present signals may give: more is a nonlinear machine, not a missing
+state."""
+DETERMINED = 4.0
+"""Standard errors that a control's effect on some state must have to be distinguished from the noise."""
+LONGEST_DELAY = 10
+"""Delays of a control that are tried, samples."""
+SURE_DELAY = 0.1
+"""Share by which a delay leaves less unexplained, below which it must show in either half of the samples."""
+_STRETCHES = 10  # of the samples, dealt out to the halves in turn
+_CLIP = 5.0
+"""Standard deviations at which a residual is cut before it is correlated: one event is no rule."""
+_MOST_PRODUCTS = 12
+"""Signals up to which all products of two are tried as curves; beyond, squares and magnitudes alone."""
+
+
+def successive(problem: Problem) -> NDArray[np.intp]:
+    """Transitions that the next one in the problem continues: same recording, next sample."""
+    same = (problem.source[1:] == problem.source[:-1]) & (problem.k[1:] == problem.k[:-1] + 1)
+    return np.flatnonzero(same)
+
+
+def unexplained(gram: Array, cross: Array, total: Array) -> Array:
+    """Sum of squares of each target that its least-squares fit on some regressors leaves.
+
+    Shares below 1e-11 are not distinguished, which no decision here needs.
+
+    `gram` (..., b, b): products of the regressors with one another; leading axes are other choices of regressors;
+    `cross` (..., b, t): products of the regressors with the targets; `total` (t,): sums of squares of the targets.
+    """
+    return _explained(gram, cross, total)[0]
+
+
+def _explained(gram: Array, cross: Array, total: Array) -> tuple[Array, NDArray[np.intp]]:
+    """As `unexplained`, and the rank of the regressors."""
+    size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
+    unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
+    values, vectors = np.linalg.eigh(gram * unit[..., :, None] * unit[..., None, :])
+    keep = values > 1e-11 * values[..., -1:]
+    root = np.divide(1.0, np.sqrt(values, where=keep, out=np.ones_like(values)), where=keep, out=np.zeros_like(values))
+    turned = np.swapaxes(vectors * root[..., None, :], -1, -2) @ (cross * unit[..., :, None])
+    left = np.maximum(total - np.einsum("...bt,...bt->...t", turned, turned), 1e-11 * total)
+    return np.asarray(left), np.asarray(keep.sum(axis=-1))
+
+
+def predicted(X: Array, U: Array, after: Array) -> Array:
+    """Share of the variance that least squares on [X, U, 1] predicts.
+
+    `X` (N, n): regressors; `U` (N, m): further regressors; `after` (N, k): targets; Returns (k,): at most 1; without
+    the share that any regressor explains by chance, so that it can be negative.
+    """
+    columns = np.hstack([X, U, after])
+    columns = columns - columns.mean(axis=0)
+    columns /= np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300)
+    known, targets = columns[:, : X.shape[1] + U.shape[1]], columns[:, X.shape[1] + U.shape[1] :]
+    total = np.einsum("ki,ki->i", targets, targets)
+    left, rank = _explained(known.T @ known, known.T @ targets, total)
+    left = left * (len(X) - 1) / max(len(X) - 1 - int(rank), 1)
+    return np.asarray(np.where(total > 0.0, 1.0 - left / np.maximum(total, 1e-300), 0.0))
+
+
+@dataclass(frozen=True)
+class Autocorrelation:
+    """What least squares on one sample leaves unexplained of each state's step.
+
+    `correlation` (n, 2): autocorrelation at one and at two samples; `gain` (n,): root mean square over that with the
+    state's own value one sample earlier as well; ones if none is correlated; `curved` (n,): root mean square over that
+    with squares, products and magnitudes of the same sample as well; as above.
+    """
+
+    correlation: Array
+    gain: Array
+    curved: Array
+
+    def follows(self, state: int) -> bool:
+        """Whether the next sample depends on more than these signals at one instant."""
+        correlated = _autocorrelated(*self.correlation[state].tolist())
+        gain = float(self.gain[state])
+        return bool(correlated and gain >= GAIN and self.curved[state] - 1.0 < CURVED * (gain - 1.0))
+
+
+def _correlated(one: float) -> bool:
+    return one >= FOLLOW or one <= ALTERNATE
+
+
+def _autocorrelated(one: float, two: float) -> bool:
+    return _correlated(one) or abs(two) >= FOLLOW
+
+
+def autocorrelation(problem: Problem) -> Autocorrelation | None:
+    """Autocorrelation of least squares, and what would explain them."""
+    n, p = problem.n, problem.p
+    before = successive(problem)
+    if len(before) < 40 * p:
+        return None
+    now = before + 1
+    correlation = _correlation(problem, now)
+    if not any(_autocorrelated(*of) for of in correlation.tolist()):  # nothing follows: what would explain it is idle
+        return Autocorrelation(correlation, np.ones(n), np.ones(n))
+    dt = problem.dt[now, None]
+    z = problem.z[now]
+    step = problem.x_next[now] - z[:, :n]
+    base = np.column_stack([z, np.ones(len(z))])
+    lagged = problem.z[before, :n]
+    basis = np.column_stack([base, lagged, _curves(z)]) * dt
+    gram, cross, total = basis.T @ basis, basis.T @ step, np.einsum("kn,kn->n", step, step)
+    total = np.maximum(total, 1e-300)
+    own = np.arange(p + 1)
+
+    def left(columns: NDArray[np.intp], states: slice) -> Array:
+        return unexplained(gram[np.ix_(columns, columns)], cross[columns, states], total[states])
+
+    plain = left(own, slice(None))
+    past = np.array([left(np.append(own, p + 1 + i), slice(i, i + 1))[0] for i in range(n)])
+    curved = left(np.append(own, np.arange(p + 1 + n, basis.shape[1])), slice(None))
+    return Autocorrelation(correlation, np.sqrt(plain / past), np.sqrt(plain / curved))
+
+
+def _curves(z: Array) -> Array:
+    """Squares, magnitudes and (of few signals) products of two, (K, curves)."""
+    z = z / np.maximum(np.abs(z).max(axis=0), 1e-300)
+    p = z.shape[1]
+    if p > _MOST_PRODUCTS:
+        return np.hstack([z**2, np.abs(z)])
+    i, j = np.triu_indices(p)
+    return np.hstack([z[:, i] * z[:, j], np.abs(z)])
+
+
+def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
+    """Autocorrelation at one and two samples, (n, 2); `now`: transitions that continue the one before."""
+    basis = np.column_stack([problem.z, np.ones(problem.N)]) * problem.dt[:, None]
+    basis = basis / np.maximum(np.abs(basis).max(axis=0), 1e-300)
+    step = problem.x_next - problem.z[:, : problem.n]
+    residual = step - basis @ np.linalg.lstsq(basis, step, rcond=None)[0]
+    spread = np.median(np.abs(residual), axis=0) / 0.6745
+    limit = np.where(spread > 0, _CLIP * spread, np.inf)
+    residual = np.clip(residual, -limit, limit)
+    residual = residual - residual.mean(axis=0)
+    size = np.maximum(np.mean(residual**2, axis=0), 1e-300)
+    twice = now[np.isin(now - 1, now)]
+    one = np.mean(residual[now] * residual[now - 1], axis=0) / size
+    two = np.mean(residual[twice] * residual[twice - 2], axis=0) / size if len(twice) else np.zeros(problem.n)
+    return np.column_stack([one, two])
+
+
+def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
+    """Controls that are a state some samples earlier, or follow from its earlier samples."""
+    states = {(s.topic, s.inner) for s in signals[:n]}
+    return {j for j, s in enumerate(signals) if j >= n and (s.delay > 0 or s.memory) and (s.topic, s.inner) in states}
+
+
+def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dict[int, tuple[int, float]]:
+    """Controls whose effect on every state is lost in the noise: the state on which most, and standard errors."""
+    free = np.flatnonzero(moments.phi_scale > 0)
+    centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
+    if not len(free) or moments.count <= len(free):
+        return {}
+    inverse = np.linalg.pinv(centre, hermitian=True)
+    theta = inverse @ target
+    residual = np.maximum(moments.rate_square - np.einsum("ji,ji->i", theta, target), 1e-14 * moments.rate_square)
+    error = np.outer(np.diagonal(inverse), residual / (moments.count - len(free)))
+    certainty = np.abs(theta) / np.maximum(np.sqrt(np.maximum(error, 0.0)), 1e-300)
+    found = {}
+    for row, j in enumerate(free.tolist()):
+        if not problem.n <= j < problem.p or j in known or moments.low[j] == moments.high[j]:
+            continue
+        best = int(np.argmax(certainty[row]))
+        if certainty[row, best] < DETERMINED:
+            found[j] = (best, float(certainty[row, best]))
+    return found
+
+
+def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tuple[int, float]]:
+    """Controls that explain the states clearly better when taken some samples earlier."""
+    n, p = problem.n, problem.p
+    follows = successive(problem)
+    joined = np.zeros(problem.N, dtype=bool)
+    joined[follows + 1] = True
+    breaks = np.flatnonzero(~joined)
+    # samples before this one in the same unbroken stretch
+    run = np.arange(problem.N) - breaks[np.searchsorted(breaks, np.arange(problem.N), side="right") - 1]
+    usable = np.flatnonzero(run >= LONGEST_DELAY)
+    if len(usable) < 20 * p:
+        return {}
+    lagged = np.stack([problem.z_columns[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
+    now = problem.z_columns[:n, usable]
+    found = lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable])
+    return {j: late for j, late in found.items() if n + j not in past}
+
+
+def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
+    """Controls that explain the states clearly better some samples earlier.
+
+    `x` (n, N): states; `u` (lags + 1, m, N): controls this many samples before; `increment` (n, N): what the states
+    change by in a step; `dt` (N,): step, s.
+    """
+    found = _lags(x, u, increment, dt)
+    if any(share < SURE_DELAY for _, share in found.values()):
+        half = np.arange(x.shape[1]) * _STRETCHES // x.shape[1] % 2 == 0
+        halves = [_lags(x[:, part], u[:, :, part], increment[:, part], dt[part]) for part in (half, ~half)]
+        for j, (lag, share) in [*found.items()]:
+            if share < SURE_DELAY and not all(j in other and abs(other[j][0] - lag) <= 1 for other in halves):
+                del found[j]
+    return found
+
+
+def _lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
+    n, N = x.shape
+    longest, m = len(u) - 1, u.shape[1]
+    movers = [j for j in range(m) if np.ptp(u[0, j]) > 0]
+    late = [u[lag, j] for j in movers for lag in range(1, longest + 1)]
+    regressors = np.empty((n + m + 1 + len(late), N))  # all at once: one product of all with all
+    for row, values in zip(regressors, [*x, *u[0], np.ones(N), *late], strict=True):
+        np.multiply(values, dt, out=row)
+    gram, cross = regressors @ regressors.T, regressors @ increment.T
+    total = np.einsum("nk,nk->n", increment, increment)
+
+    def score(chosen: list[list[int]]) -> Array:
+        which = np.array(chosen)
+        left = unexplained(gram[which[:, :, None], which[:, None, :]], cross[which], total)
+        return np.asarray(np.log(np.maximum(left, 1e-300)).sum(axis=-1))
+
+    found = {}
+    undelayed = [*range(n + m), n + m]
+    for position, j in enumerate(movers):
+        first = n + m + 1 + position * longest
+        later = [[first + lag if c == n + j else c for c in undelayed] for lag in range(longest)]
+        scores = score([undelayed, *later])
+        best = int(np.argmin(scores))
+        gain = float(scores[0] - scores[best])
+        # 5 % less unexplained, and far more than chance: N log-likelihood units per row
+        if not (0 < best < longest and gain > 0.05 and gain * N > 50):  # at the end of what is tried it is no optimum
+            continue
+        # next to a late control the present one adds nothing; if it does, the late one represents past states
+        if scores[best] - score([[*undelayed, first + best - 1]])[0] < 0.3 * gain:
+            found[j] = (best, float(1 - np.exp(-gain / n / 2)))
+    return found
