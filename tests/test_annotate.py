@@ -172,31 +172,6 @@ def test_shipped_recordings(name, tmp_path):
     assert [time for time, _ in found["flags"]] == arrivals
 
 
-REAL = {
-    "micro_gas_turbine/ex_20.mcap": ("micro_gas_turbine", None),
-    "go2/test_3.mcap": ("go2_joint", None),
-    "neato/draw_square.mcap": ("neato", "both"),
-    "crazyflie/yx3bag_0.mcap": ("crazyflie_vicon", None),
-    "crazyflie/yx4bag_0.mcap": ("crazyflie_estimate", "both"),
-    "hunter_se/straight_odd_t_0_5_run_01.mcap": ("hunter_se", None),
-}
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", REAL)
-def test_real_recordings(name, recordings, signals_folder, tmp_path):
-    source = recordings / name
-    if not source.is_file():
-        source = sorted(source.parent.glob("*.mcap"))[0]
-    transients = read_transients(source, signals_folder / f"{REAL[name][0]}.yaml")
-    model = fit(transients, "qp", additive=REAL[name][1])
-    halved = model.replace(dA=model.dA / 2, dB=model.dB / 2, v=model.v / 2, dc=model.dc / 2)
-    verdicts, _ = check(halved, source, tmp_path / "out.mcap")
-    assert verdicts.violated.any() and not verdicts.violated.all()
-    same_recording(source, tmp_path / "out.mcap")
-    same_verdicts(halved, verdicts, tmp_path / "out.mcap")
-
-
 @pytest.mark.parametrize("name", ["split", "service_events", "zstd"])
 def test_odd_recordings_are_copied_whole(name, recordings, tmp_path):
     """Channels that nobody can decode, several parts, other encodings: all are in the copy."""
@@ -407,6 +382,9 @@ def test_the_command_writes_and_says_so(engine, tmp_path, capsys):
     assert main(["check", model_file, *both, "--write", str(tmp_path / "all"), *rule]) == 0
     said = json.loads(capsys.readouterr().out)["recordings"]
     assert [Path(r["written"]["file"]).name for r in said] == ["bad_annotated.mcap", "run_annotated.mcap"]
+    (bag,) = group_recordings([bad])
+    names = [path.name for path in targets(tmp_path / "new", [bag, bag])]
+    assert names == ["bad_annotated.mcap", "bad_2_annotated.mcap"], "of recordings of one name in two folders"
     found = by_rosbags(tmp_path / "all" / "bad_annotated.mcap")
     assert not any(m.data for _, m in found["violation"]) and len(found["violation"]) == 300
     with open(tmp_path / "all" / "bad_annotated.mcap", "rb") as stream:
@@ -467,14 +445,6 @@ def test_a_full_disk_is_one_sentence(engine, tmp_path):
     done = subprocess.run([sys.executable, "-c", limit, *arguments], capture_output=True, text=True)
     assert done.returncode == 2 and "cannot be written" in done.stderr and "Traceback" not in done.stderr
     assert not list((tmp_path / "out").iterdir())
-
-
-def test_names_for_several_recordings_differ(tmp_path):
-    for folder in ("a", "b"):
-        (tmp_path / folder).mkdir()
-        write([Topic("/a")], ramp("/a", range(10))).save(tmp_path / folder / "run_0.mcap")
-    bags = group_recordings([tmp_path / "a" / "run_0.mcap", tmp_path / "b" / "run_0.mcap", tmp_path / "a"][:2])
-    assert [p.name for p in targets(tmp_path / "out", bags)] == ["run_0_annotated.mcap", "run_0_2_annotated.mcap"]
 
 
 @pytest.mark.slow
