@@ -307,7 +307,8 @@ def _coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[s
         if too_small(float(sums.low[j]), float(sums.high[j])):
             continue
         z, steady, scale = problem.z[:, j], float(signal.steady), float(signal.scale)
-        found = codes(z)
+        if not (found := codes(z)):
+            continue
         others = z[~np.isin(z, list(found))] * scale + steady
         messages += [
             f"'{signal.name}' is exactly {code * scale + steady:.9g} in {count} of {problem.N} transitions and "
@@ -323,14 +324,22 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
     """Components of a quaternion that change sign together, and angles that wrap around."""
     states, messages, groups = signals[: problem.n], list[str](), dict[str, list[int]]()
     scale, steady = (np.array([float(getattr(s, name)) for s in states]) for name in ("scale", "steady"))
-    before, after = problem.z[:, : problem.n] * scale + steady, problem.x_next * scale + steady
+    near_a_turn = problem.largest_moves() * scale > 0.8 * 2 * np.pi
+
+    def ends(those: list[int]) -> tuple[Array, Array]:
+        columns = problem.z[:, those], problem.x_next[:, those]
+        return columns[0] * scale[those] + steady[those], columns[1] * scale[those] + steady[those]
+
     for i, signal in enumerate(states):
         if match := _QUATERNION.fullmatch(signal.field) or (not signal.topic and _QUATERNION.fullmatch(signal.name)):
             groups.setdefault(signal.topic + match[1], []).append(i)
-        step = np.abs(after[:, i] - before[:, i])
+        if not near_a_turn[i]:
+            continue
+        before, after = (values[:, 0] for values in ends([i]))
+        step = np.abs(after - before)
         for turn in (2 * np.pi, 360.0):
             jumps = np.abs(step - turn) < 0.1 * turn
-            inside = np.abs(before[:, i]).max() < 0.51 * turn or (before[:, i].min() >= 0 and before[:, i].max() < turn)
+            inside = np.abs(before).max() < 0.51 * turn or (before.min() >= 0 and before.max() < turn)
             if inside and 0 < jumps.sum() < 0.05 * problem.N and step[~jumps].max() < 0.3 * turn:
                 messages.append(
                     f"'{signal.name}' wraps around in {plural(int(jumps.sum()), 'step')} "
@@ -338,7 +347,7 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
                     f"movement, and the envelope is fitted to it; use 'unwrap({signal.field or signal.name})'"
                 )
     for those in groups.values():
-        one, other = before[:, those], after[:, those]
+        one, other = ends(those)
         total, apart = np.square(one + other).sum(axis=1), np.square(one - other).sum(axis=1)
         flips = np.flatnonzero((np.square(one).sum(axis=1) > 0.1) & (total < 0.02 * apart))
         if len(flips) and max(np.abs(one).max(), np.abs(other).max()) < 1.01:  # of a unit quaternion

@@ -148,7 +148,7 @@ def fit_horizons(
         structure = Structure(n, p - n, fixed=halves) if kind == "constant" else None
         horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
         solvers |= fact.pop("solvers")
-        move = np.max([np.abs(block.x_next - block.z[:n]).max(axis=1) for block in part.blocks()], axis=0)
+        move = part.largest_moves()
         if (0.5 * fact["mean_width"] > WIDER * move).all():
             messages.append(
                 f"no horizon of {windows.steps} steps: its envelope is wider than if every state stayed where it was "

@@ -191,6 +191,11 @@ class Problem:
         z, x_next = self.z_columns[:, part], self.next_columns[:, part]
         return Block(part.start or 0, z, x_next, self.dt[part], weights, s, base)
 
+    def largest_moves(self) -> Array:
+        """The largest change of each state in one transition, (n,)."""
+        moves = [np.abs(block.x_next - block.z[: self.n]).max(axis=1) for block in self.blocks()]
+        return np.asarray(np.max(moves, axis=0))
+
     def blocks(self) -> Iterator[Block]:
         """All transitions, in blocks."""
         for start in range(0, self.N, BLOCK):
