@@ -547,6 +547,15 @@ def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[
         np.testing.assert_equal(u[-1, i - n], sampler.latest()[1][i] if plainly else NAN)
 
 
+def test_an_angle_that_needs_no_turn_loses_only_the_sign_of_its_zero() -> None:
+    signals = SignalMap((Signal("x", "/c", "unwrap(data)"),), clock="/c", max_gap=1.0, time={"/c": "log"})
+    arrival = np.arange(5) * TICK
+    values = np.array([[0.1], [-0.0], [NAN], [-0.2], [-0.0]])
+    (_, x, _), _ = Sampler(signals).push_all(np.zeros(5, dtype=np.int64), arrival, arrival, [values])
+    np.testing.assert_array_equal(x, values)
+    assert not np.signbit(x[1, 0])
+
+
 def test_a_recording_that_does_not_fit_its_topics_is_refused() -> None:
     one, two = np.zeros(1, dtype=np.int64), np.zeros(2, dtype=np.int64)
     for topic, values in ((two, [np.zeros((1, 1)), np.zeros((0, 1))]), (one, [np.zeros((1, 2)), np.zeros((0, 1))])):

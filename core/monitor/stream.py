@@ -403,7 +403,7 @@ class Stream:
         if topic != sampler.clock:
             sampler.push(topic, arrival_ns, stamp_ns, values)  # decides nothing
             return _NOTHING, False
-        samples = sampler.counters["samples"]
+        samples = sampler.number
         verdicts = []
         for step in sampler.push(topic, arrival_ns, stamp_ns, values):
             before = self.alarm
@@ -418,7 +418,7 @@ class Stream:
             self.latched = self.latched or (self.rule.latch and verdict.alarm)
             verdicts.append(verdict)
             self._count(verdict, before, now)
-        return verdicts, sampler.counters["samples"] > samples
+        return verdicts, sampler.number > samples
 
     @cython.cfunc
     def _learn_condition(self, topic: str, data: bytes) -> None:

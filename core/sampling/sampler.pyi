@@ -46,6 +46,7 @@ class Sampler:
     max_gap_ns: int
     min_step_ns: int
     counters: Counters
+    number: int
     def __init__(self, signals: SignalMap) -> None: ...
     def push(self, topic: str, arrival_ns: int, stamp_ns: int | None, values: Sequence[float]) -> list[Step]: ...
     def push_all(

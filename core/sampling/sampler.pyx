@@ -395,7 +395,7 @@ cdef class Sampler:
     `signals`: with clock, max_gap and a time source for every topic resolved (`reading.read_transients` and the model
     file do that); `counters`: samples, gaps, resets and missing; dropped messages by status value; `late <topic>` for
     messages that came after the sample they belonged to was closed; `missing <signal>` and `stale <signal>` per sample;
-    `invalid <signal>` per message whose value is outside `valid` or in `ignore`.
+    `invalid <signal>` per message whose value is outside `valid` or in `ignore`; `number`: samples opened so far.
     """
 
     cdef readonly object signals
@@ -414,7 +414,7 @@ cdef class Sampler:
     cdef Py_ssize_t[::1] late, old, lacking, invalid, dropped
     # sample k: the clock message that opened it, and how many did before
     cdef Message open
-    cdef Py_ssize_t number
+    cdef readonly Py_ssize_t number
     cdef int open_status
     cdef double open_dt
     cdef bint closed_one  # there is z of sample k-1, fixed when it closed
