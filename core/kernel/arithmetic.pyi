@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 
 JUDGED: int
-LEFT: int
 VIOLATION: int
 OUTSIDE: int
 UNKNOWN: int

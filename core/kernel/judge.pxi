@@ -11,9 +11,9 @@
 
 LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION = range(5)
 """What a `Judgement` holds of each state."""
-JUDGED, LEFT, VIOLATION, OUTSIDE, UNKNOWN, UNLISTED = 1, 2, 4, 8, 16, 32
-"""Bits of what is said of a transition: there is a verdict; some state left its bounds; one that counts did; it leaves
-the fitted domain; its regime is unknown; its mode is not listed, so that there is no verdict."""
+JUDGED, VIOLATION, OUTSIDE, UNKNOWN, UNLISTED = 1, 4, 8, 16, 32
+"""Bits of what is said of a transition: there is a verdict; some state that counts left its bounds; it leaves the
+fitted domain; its regime is unknown; its mode is not listed, so that there is no verdict."""
 cdef enum:
     _JUDGED = 1
     _LEFT = 2

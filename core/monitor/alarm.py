@@ -308,8 +308,8 @@ class Alarm:
         each = np.empty((count, len(self.parts)), dtype=bool) if each is None else each
         values = np.empty((count, len(self.names))) if values is None else values
         parts = list(zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True))
-        for alike in [parts] if count >= _WORTH_THREADS else [[part] for part in parts]:
-            on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), alike)
+        together = count >= _WORTH_THREADS
+        on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), parts, together)
         self.reset()
         return np.asarray(np.logical_or.reduce(list(each.T))), each, values
 

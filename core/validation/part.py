@@ -224,8 +224,8 @@ def _longer(
         if half.size:
             width[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
     with_none = ((0, 0), (0, 1), (0, 0))
-    every = (np.pad(values, with_none, constant_values=np.nan)[:, places] for values in (utilisation, residual))
-    return *every, width[places]  # type: ignore[return-value]
+    sizes, left = (np.pad(values, with_none, constant_values=np.nan)[:, places] for values in (utilisation, residual))
+    return sizes, left, width[places]
 
 
 def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
