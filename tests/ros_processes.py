@@ -170,6 +170,7 @@ class World:
             print(f"--- {process.name}\n{process.output}")  # seen where the test fails
         self._ends = True
         self._thread.join()
+        self._executor.shutdown()  # first: the middleware calls it as long as it knows of the node's entities
         self.node.destroy_node()
         self._context.try_shutdown()
 

@@ -115,6 +115,7 @@ def test_two_monitors_in_one_process(world: World, tmp_path: Path) -> None:
     finally:
         ends.set()
         thread.join()
+        executor.shutdown()
         for node in nodes:
             node.finish()
             node.destroy_node()

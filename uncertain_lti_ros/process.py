@@ -143,6 +143,8 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
         if stop:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.alarm(_LAST)
+        for life in lives:
+            life.executor.shutdown()  # before its node: the middleware calls into it as long as it knows the entities
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
