@@ -151,6 +151,22 @@ def test_large_problem_reaches_the_same_optimum(criterion):
     assert ((lower <= s.x_next) & (s.x_next <= upper)).all()
 
 
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_transitions_furthest_from_least_squares_first_change_no_optimum(criterion, monkeypatch):
+    transient = drawn(small_plant(3), 3 * SUBSAMPLE, 3, noise=1e-3)
+    said = {}
+    found = {}
+    for many in (working_set._MANY, 1):
+        monkeypatch.setattr(working_set, "_MANY", many)
+        said[many] = []
+        found[many] = fit([transient], criterion, additive="noise", progress=said[many].append)
+    usual, early = found.values()
+    np.testing.assert_allclose(early.fit_summary["objective"], usual.fit_summary["objective"], rtol=2e-7)
+    assert count_outside(early, [transient]) == 0
+    outside = [int(next(text for text in texts if "outside" in text).split()[2]) for texts in said.values()]
+    assert outside[1] < 0.5 * outside[0]
+
+
 @pytest.mark.parametrize("method", ["working-set", "cvxpy"])
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_both_methods_agree_and_contain(method, criterion):

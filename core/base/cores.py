@@ -26,9 +26,7 @@ def core_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def on_cores(
-    function: Callable[..., T], arguments: Sequence[tuple[Any, ...]], worth_threads: bool = True
-) -> list[T]:
+def on_cores(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]], worth_threads: bool = True) -> list[T]:
     """function(*arguments) for each, in their order, by threads where what each does takes longer than to begin one."""
     if not worth_threads:
         return [function(*some) for some in arguments]

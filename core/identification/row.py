@@ -416,16 +416,18 @@ class Row:
         self.plain_phi, self.psi = self.plain_phi[keep], self.psi[keep]
         self.y, self.half, self.width = self.y[keep], self.half[keep], self.width[keep]
 
-    def reach(self, share: float) -> tuple[float, float]:
+    def reach(self, share: float, evenly: NDArray[np.bool_]) -> tuple[float, float]:
         """Slack below which so large a share of all samples is expected: from leaving the bounds, from being too wide.
+
+        `evenly` (K,): samples held that stand for all; where none is left, all do.
 
         Where the widths of many samples are the largest one, which is so where noise alone makes them, only those
         that are too wide matter.
         """
         inside, room = self.slacks()
-        least = 10 * self.tolerance
-        wanted = max(float(np.quantile(inside, share)), least)
-        width = 0.0 if room is None else float(np.quantile(room, share))
+        least, those = 10 * self.tolerance, evenly if evenly.any() else slice(None)
+        wanted = max(float(np.quantile(inside[those], share)), least)
+        width = 0.0 if room is None else float(np.quantile(room[those], share))
         return wanted, min(width, wanted) if width > 1e-6 else 0.0
 
     def widen_pool(self, most: int | None = None) -> bool:

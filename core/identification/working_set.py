@@ -32,7 +32,10 @@ from uncertain_lti.identification.structure import Structure, narrowed
 _FURTHER = 2.5
 """After the first pass, samples are held whose slack is up to this many times as large: few are left there."""
 SUBSAMPLE = 10_000
-"""Transitions of the first solve; up to twice as many are held as a whole."""
+"""Transitions of the first solve, evenly spaced; up to twice as many are held as a whole."""
+_FURTHEST, _MANY = 4_000, 100
+"""Transitions that join them, those furthest from least squares, about: nearly all that decide are among them. With
+as many unknowns a row its programmes take longer than the pass that finds them."""
 MAX_ROUNDS, FEW_ROUNDS = 200, 60
 Settle = Callable[[Row], None]
 _HELD_BYTES = 300_000_000
@@ -86,8 +89,8 @@ class WorkingSet:
         self.progress = progress or (lambda text: None)
         self.excluded = np.empty(0, dtype=np.intp) if excluded is None else excluded
         self.whole = fleet.N <= 2 * SUBSAMPLE
-        stride = 1 if self.whole else fleet.N // SUBSAMPLE
-        self.sums, self._first = fleet.moments(stride)
+        self._stride = 1 if self.whole else fleet.N // SUBSAMPLE
+        self.sums, self._first = fleet.moments(self._stride)
         structure = structure or Structure(fleet.n, fleet.p - fleet.n)
         columns = fleet.columns
         self.tied = tied_blocks(self.sums, columns, fleet.p)
@@ -115,8 +118,7 @@ class WorkingSet:
         """Solve (10)."""
         if self.sums.coupled is not None:
             return self._coupled_quadratic()
-        self._start(self._settle_quadratic)
-        self._prove(self._settle_quadratic)
+        self._solve(self._settle_quadratic)
         gaps = np.array(on_cores(Programmes.duality_gap, [(own,) for own in self.programmes]))
         again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
         if again:
@@ -181,8 +183,7 @@ class WorkingSet:
         """(10) with full weights: one row after the other, in refined coordinates if that is not good."""
         self._together, gap = True, np.inf
         try:
-            self._start(self._settle_in_turn)
-            self._prove(self._settle_in_turn)
+            self._solve(self._settle_in_turn)
             gap = self.coupled_gap()
         except InfeasibleError:
             raise
@@ -288,8 +289,7 @@ class WorkingSet:
             if self.programmes[row.i].exact:
                 self._settle(self.programmes[row.i], Programmes.bounded, polish=True)
 
-        self._start(settle)
-        self._prove(settle)
+        self._solve(settle)
         unknown = [row for row in self.rows if row.unknown]
         bounds = deltas.copy()
         bounds[[row.i for row in unknown]] = on_cores(self._least_width, [(row,) for row in unknown])
@@ -377,13 +377,28 @@ class WorkingSet:
 
     # --- all samples ---
 
-    def _start(self, settle: Settle) -> None:
-        """Solve on the first samples."""
-        for row, samples in zip(self.rows, self._first, strict=True):
-            self._hold(row, samples)
+    def _solve(self, settle: Settle) -> None:
+        """Solve all rows and prove them, those together whose samples fit in memory."""
+        for rows in self._groups(self.rows):
+            self._start(settle, rows)
+            self._prove(settle, rows)
+
+    def _start(self, settle: Settle, rows: list[Row]) -> None:
+        """Solve on the first samples and those furthest from least squares."""
+        for row in rows:
+            self._hold(row, self._first[row.i])
             row.start()
+        if not self.whole and max(row.r + row.q for row in rows) >= _MANY:
+            share = _FURTHEST / self.fleet.N
+            reach = np.zeros(self.fleet.n)
+            reach[[row.i for row in rows]] = [float(np.quantile(row.slack(), share)) for row in rows]
+            found = self.fleet.scan(self._candidate(reach, reach, 2 * _FURTHEST, rows))
+            self.passes += 1
+            for row, (samples, _) in zip(rows, found, strict=True):
+                self._hold(row, Samples.join([self._first[row.i], samples], self.fleet.p))
+        for row in rows:
             row.widen_pool(most=4 * (row.r + row.q))
-        self._each(self.rows, settle)
+        self._each(rows, settle)
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
         """Settle rows on all cores, which the solvers do without the lock; with full weights, all at once."""
@@ -425,7 +440,8 @@ class WorkingSet:
         for _ in range(MAX_ROUNDS):
             for row in rows:  # the samples held after a pass are those of least slack: keep the first reach
                 if self._reach_scales[row.i] != row.scale:
-                    self._reach[:, row.i], self._reach_scales[row.i] = row.reach(share), row.scale
+                    evenly = row.samples.index % self._stride == 0
+                    self._reach[:, row.i], self._reach_scales[row.i] = row.reach(share, evenly), row.scale
             wanted = self._reach
             if scanned:  # few are left near the bounds, and what is held further off need not be looked for again
                 wanted = _FURTHER * wanted
