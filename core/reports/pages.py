@@ -43,7 +43,7 @@ from uncertain_lti.reports.charts import Columns, Panel, Series, Spans
 from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.model_text import model_blocks
-from uncertain_lti.reports.tables import Block, Table, number, share
+from uncertain_lti.reports.tables import Block, Table, number, numbers_of, share
 from uncertain_lti.reports.validation_text import detectable_data, detectable_words, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 
@@ -133,7 +133,7 @@ def html_report(
         charts.base_name(facts["model"]["file"] or "model"),
         plotted,
         about=f"Alarm: {facts['rule']['words']}{conditions}.",
-        cards=list(_cards(facts)),
+        cards=list(_cards(model, facts)),
         sections=[
             _what_happened(facts, drawn),
             ("model", "The model", model_blocks(model)),
@@ -144,7 +144,7 @@ def html_report(
     )
 
 
-def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _cards(model: UncertainLTI, facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     rely, reasons = facts["rely"], facts["rely"]["reasons"]
     items = [{"lead": r["weight"], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons[:6]]
     if len(reasons) > 6:
@@ -160,7 +160,17 @@ def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         items.append({"text": "The model is not to be relied on: the machine may be well, and the model wrong."})
     yield {"title": "What happened?", "tone": look, "answer": what, "list": items}
     faults = detectable_data(facts["validation"] or {})
-    if faults is None or faults.get("refused"):
+    alarm = model.fit_summary.get("alarm")
+    jumps = numbers_of(alarm.get("biases"), model.n) if isinstance(alarm, Mapping) else None
+    within = numbers_of([alarm.get("within")], 1) if isinstance(alarm, Mapping) else None
+    if faults is None and jumps and within:
+        seen = f"Jumps within {number(within[0])} s, from these sizes on"
+        items = [
+            {"text": f"{s.name} {number(jump)} {s.unit}".rstrip()}
+            for s, jump in zip(model.signals.states[:6], jumps, strict=False)
+        ]
+        items.append({"text": "of others: run uncertain-lti validate MODEL --output MODEL"})
+    elif faults is None or faults.get("refused"):
         why = faults["refused"] if faults else "run uncertain-lti validate MODEL --output MODEL"
         seen, items = "Unknown", [{"text": why}]
     else:

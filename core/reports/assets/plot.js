@@ -12,18 +12,19 @@
     return found;
   };
   const dark = matchMedia("(prefers-color-scheme: dark)");
+  let paper = false; // which is white
   const element = (name, text) => Object.assign(document.createElement(name), { textContent: text ?? "" });
   const FIRST = 8; // panels shown at first
 
   let recording = 0, view = $("view").value, plots = [], busy = false, shown = new Set();
 
   function colours() {
-    const ink = dark.matches ? "#e6e6e6" : "#000000";
+    const night = dark.matches && !paper, ink = night ? "#e6e6e6" : "#000000";
     return {
-      ink, soft: dark.matches ? "#a2a9b1" : "#57606a", grid: dark.matches ? "#33383e" : "#e6e8ea",
-      bounds: "#56B4E9", band: dark.matches ? "rgba(86,180,233,.38)" : "rgba(86,180,233,.5)",
-      score: dark.matches ? "rgba(230,230,230,.6)" : "rgba(0,0,0,.6)", violated: dark.matches ? "#ff8a3d" : "#D55E00",
-      alarm: dark.matches ? "rgba(240,228,66,.22)" : "rgba(240,228,66,.45)", silent: "rgba(140,140,140,.3)",
+      ink, soft: night ? "#a2a9b1" : "#57606a", grid: night ? "#33383e" : "#e6e8ea",
+      bounds: "#56B4E9", band: night ? "rgba(86,180,233,.38)" : "rgba(86,180,233,.5)",
+      score: night ? "rgba(230,230,230,.6)" : "rgba(0,0,0,.6)", violated: night ? "#ff8a3d" : "#D55E00",
+      alarm: night ? "rgba(240,228,66,.22)" : "rgba(240,228,66,.45)", silent: "rgba(140,140,140,.3)",
     };
   }
 
@@ -245,6 +246,8 @@
   $("before").addEventListener("click", () => jump(-1));
   $("after").addEventListener("click", () => jump(1));
   dark.addEventListener("change", () => render(true));
+  addEventListener("beforeprint", () => { paper = true; render(true); });
+  addEventListener("afterprint", () => { paper = false; render(true); });
   let width = innerWidth;
   addEventListener("resize", () => {
     if (innerWidth === width) return;
