@@ -16,13 +16,15 @@ import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.cli.options import Option, declare
 
 if TYPE_CHECKING:
     from uncertain_lti import Transient, UncertainLTI
@@ -36,11 +38,6 @@ known whether there is an alarm.
 """
 
 SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
-RECORDINGS = "recordings (MCAP, .db3, .bag, tables) and folders"
-GROUP = (
-    "leave out whole groups of recordings that are alike: folder, hours=H (recordings that follow one another within "
-    "H hours), metadata=NAME (of the bag), name=PATTERN (of the file)"
-)
 
 
 @dataclass(frozen=True)
@@ -50,20 +47,31 @@ class Command:
     The files of this room declare them, and `main.COMMANDS` lists them. A file imports at its top nothing that
     takes time to load: every command is declared whenever one is run.
 
-    `name`: the word on the command line; `help`: what the command does, for the list of commands; `add_arguments`:
-    declares the arguments on a parser; `run`: runs the command with the parsed options and returns the exit status.
+    `name`: the word on the command line; `help`: what the command does, for the list of commands; `options`: its
+    arguments and options; `run`: runs the command with the parsed options and returns the exit status;
     `options.progress` is a `Progress`; `quiet`: what `--quiet` does, for the help; empty if the command has no such
-    option; `verbose`: what `--verbose` does, likewise; `deferred`: `add_arguments` imports what not every installation
-    has: it is called for the chosen command alone.
+    option; `verbose`: what `--verbose` does, likewise; `of_ros`: module of `uncertain_lti_ros` that declares the
+    options and runs; not every installation has what it imports.
     """
 
     name: str
     help: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], int]
+    options: tuple[Option, ...] = ()
+    run: Callable[[argparse.Namespace], int] | None = None
     quiet: str = ""
     verbose: str = ""
-    deferred: bool = False
+    of_ros: str = ""
+
+    def declare(self, parser: argparse.ArgumentParser, chosen: str, every: bool) -> None:
+        """Declare the arguments on a parser; those of a module of ROS if it is chosen, or where it can be imported."""
+        if self.run is not None:
+            declare(parser, self.options)
+            parser.set_defaults(run=self.run)
+        elif every or self.name == chosen:
+            with nullcontext() if self.name == chosen else suppress(ModuleNotFoundError):
+                module = import_module(f"uncertain_lti_ros.{self.of_ros}")
+                module.add_arguments(parser)
+                parser.set_defaults(run=module.run)
 
 
 def print_summary(options: argparse.Namespace, text: str) -> None:
@@ -80,10 +88,10 @@ def print_summary(options: argparse.Namespace, text: str) -> None:
             drop_output()
 
 
-def drop_output() -> None:
-    """Let the end of the process find nothing that it cannot write."""
+def drop_output(stream: TextIO | None = None) -> None:
+    """Let the end of the process find nothing that it cannot write; default standard output."""
     with suppress(OSError, AttributeError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        os.dup2(os.open(os.devnull, os.O_WRONLY), (stream or sys.stdout).fileno())
 
 
 def complain(command: str, text: str) -> None:
@@ -91,8 +99,7 @@ def complain(command: str, text: str) -> None:
     try:
         print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
     except (OSError, AttributeError):
-        with suppress(OSError, AttributeError, ValueError):  # the end of the process shall not find it unwritten
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+        drop_output(sys.stderr)
 
 
 def print_json(data: Any) -> None:
@@ -119,42 +126,6 @@ def load_model(name: str) -> UncertainLTI:
         if near := meant(name, ["leibov2006"]):
             raise ModelError(f"{name}: there is no such model file{near}; write one with `uncertain-lti fit`")
     return UncertainLTI.load(name)
-
-
-def add_model(parser: argparse.ArgumentParser, published: bool = False) -> None:
-    """Declare the model file that a command takes."""
-    more = ", or leibov2006 for the published one" if published else ""
-    parser.add_argument("model", metavar="MODEL", help=f"model file{more}")
-
-
-def add_recordings(
-    parser: argparse.ArgumentParser, more: str = "", *, about: str = "", metavar: str = "BAG", required: bool = True
-) -> None:
-    """Declare the recordings that a command takes, as `options.bags`."""
-    parser.add_argument("bags", metavar=metavar, nargs="+" if required else "*", help=about or f"{RECORDINGS}{more}")
-
-
-def add_signals(parser: argparse.ArgumentParser) -> None:
-    """Declare the signals file that a command needs."""
-    parser.add_argument(
-        "--signals", required=True, metavar="FILE", help="signals file (YAML): which field is which signal"
-    )
-
-
-def add_output(parser: argparse.ArgumentParser, required: bool) -> None:
-    """Declare the model file that a command writes, and `--force`."""
-    parser.add_argument("--output", required=required, metavar="MODEL", help="model file to write (*.model.json)")
-    add_force(parser)
-
-
-def add_force(parser: argparse.ArgumentParser) -> None:
-    """Declare the option that lets `model_target` replace a model."""
-    parser.add_argument("--force", action="store_true", help="write over a model that is there already")
-
-
-def add_json(parser: argparse.ArgumentParser, about: str = "print JSON") -> None:
-    """Declare the output for programs."""
-    parser.add_argument("--json", action="store_true", help=about)
 
 
 def read_labelled(

@@ -12,15 +12,10 @@
 from __future__ import annotations
 
 import argparse
-from importlib import import_module
 
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.cli.command import DONE, Command, add_json, add_model, load_model, print_json, print_summary
-
-
-def _add_info(parser: argparse.ArgumentParser) -> None:
-    add_model(parser, published=True)
-    add_json(parser, "print the file as JSON; of a scheduled model with `regimes`, what each rests on")
+from uncertain_lti.cli.command import DONE, Command, load_model, print_json, print_summary
+from uncertain_lti.cli.options import PUBLISHED, helped
 
 
 def run_info(options: argparse.Namespace) -> int:
@@ -44,14 +39,6 @@ def run_info(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _add_layout(parser: argparse.ArgumentParser) -> None:
-    add_model(parser, published=True)
-    parser.add_argument("--foxglove", metavar="FILE.json", help="for Foxglove and Lichtblick")
-    parser.add_argument("--plotjuggler", metavar="FILE.xml", help="for PlotJuggler")
-    parser.add_argument("--topics", metavar="NAME", help="what the topics begin with (default: /envelope_monitor)")
-    add_json(parser, "print the paths as JSON")
-
-
 def run_layout(options: argparse.Namespace) -> int:
     """Write the layouts that are asked for."""
     from uncertain_lti.reports.layouts import write_layouts
@@ -63,12 +50,6 @@ def run_layout(options: argparse.Namespace) -> int:
     for path in written:
         print(f"layout written to {path}")
     return DONE
-
-
-def _add_reproduce(parser: argparse.ArgumentParser) -> None:
-    about = "for figures, models and numbers"
-    parser.add_argument("--output", default="reproduce-output", metavar="FOLDER", help=about)
-    add_json(parser, "print the numbers as JSON")
 
 
 def run_reproduce(options: argparse.Namespace) -> int:
@@ -83,13 +64,6 @@ def run_reproduce(options: argparse.Namespace) -> int:
     if options.json:
         print_json({"output": options.output, **data})
     return DONE
-
-
-def _add_completion(parser: argparse.ArgumentParser) -> None:
-    about = (
-        'whose; for this session: eval "$(uncertain-lti completion bash)", for each one: put that into ~/.bashrc or '
-    )
-    parser.add_argument("shell", choices=("bash", "zsh"), help=f"{about}~/.zshrc")
 
 
 def run_completion(options: argparse.Namespace) -> int:
@@ -109,27 +83,29 @@ def run_completion(options: argparse.Namespace) -> int:
     return DONE
 
 
-def _of_ros(name: str, module: str, text: str) -> Command:
-    """A command of a module that needs rclpy and is imported only when the command is chosen."""
-
-    def add_arguments(parser: argparse.ArgumentParser) -> None:
-        import_module(f"uncertain_lti_ros.{module}").add_arguments(parser)
-
-    def run(options: argparse.Namespace) -> int:
-        return int(import_module(f"uncertain_lti_ros.{module}").run(options))
-
-    return Command(name, text, add_arguments, run, deferred=True)
-
-
-_LAYOUT = "write layouts of viewers for what a model's monitor publishes"
-_REPRODUCE = "run the paper's experiment on the nonlinear turbofan"
-_IN_THE_FOLDER = "print errors only; everything is in the folder"
+INFO = Command(
+    "info",
+    "show what is in a model file",
+    (PUBLISHED, helped("--json", "print the file as JSON; of a scheduled model with `regimes`, what each rests on")),
+    run_info,
+)
+LAYOUT = Command(
+    "layout",
+    "write layouts of viewers for what a model's monitor publishes",
+    (PUBLISHED, "--foxglove", "--plotjuggler", "--topics", helped("--json", "print the paths as JSON")),
+    run_layout,
+)
+_FOLDER = {"default": "reproduce-output", "metavar": "FOLDER"}
+REPRODUCE = Command(
+    "reproduce",
+    "run the paper's experiment on the nonlinear turbofan",
+    (helped("--output", "for figures, models and numbers", **_FOLDER), helped("--json", "print the numbers as JSON")),
+    run_reproduce,
+    quiet="print errors only; everything is in the folder",
+)
 _COMPLETION = "print what bash or zsh needs to complete commands, options and files"
+COMPLETION = Command("completion", _COMPLETION, ("shell",), run_completion)
+PLAY = Command("play", "publish a recording through rclpy", of_ros="player")
+RECORD = Command("record", "record topics through rclpy", of_ros="recorder")
 _DEMO = "fit shipped recordings of a turbofan and watch another, in which a fault sets in, live"
-INFO = Command("info", "show what is in a model file", _add_info, run_info)
-LAYOUT = Command("layout", _LAYOUT, _add_layout, run_layout)
-REPRODUCE = Command("reproduce", _REPRODUCE, _add_reproduce, run_reproduce, _IN_THE_FOLDER)
-COMPLETION = Command("completion", _COMPLETION, _add_completion, run_completion)
-PLAY = _of_ros("play", "player", "publish a recording through rclpy")
-RECORD = _of_ros("record", "recorder", "record topics through rclpy")
-DEMO = _of_ros("demo", "demo", _DEMO)
+DEMO = Command("demo", _DEMO, of_ros="demo")

@@ -26,15 +26,13 @@ from uncertain_lti.cli.command import (
     SILENT,
     UNKNOWN,
     Command,
-    add_json,
-    add_model,
-    add_recordings,
     complain,
     load_model,
     print_json,
     print_notes,
     print_summary,
 )
+from uncertain_lti.cli.options import DEPLOYED, PUBLISHED, RECORDINGS, helped
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
@@ -45,33 +43,8 @@ if TYPE_CHECKING:
     from uncertain_lti.sampling.reading import Decisions
 
 
-def add_margin_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare another rule of containment than the model's."""
-    add, own = parser.add_argument, "(default: the model's)"
-    rules = f"alarm: the rules of another model file, or of JSON as its field alarm has them {own}"
-    add("--rules", metavar="FILE", help=rules)
-    add("--violations", type=int, help=f"alarm: number of violations {own}")
-    add("--window", type=int, help=f"alarm: number of last verdicts they are counted in {own}")
-    add("--margin", type=float, help=f"factor on the half-widths {own}")
-
-
-def add_rule_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the options of the alarm rule, as the node has them as parameters."""
-    add_margin_arguments(parser)
-    add, first = parser.add_argument, "so many s after the first sample"
-    masked = "states, separated by commas, that never raise the alarm"
-    enable = "no alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, such as '/engine/mode data == 3'"
-    grace = f"no alarm for {first}, a reset, and after --enable began to hold"
-    add("--masked", default="", metavar="STATES", help=masked)
-    add("--enable", default="", metavar="CONDITION", help=enable)
-    add("--grace", type=float, default=0.0, metavar="S", help=grace)
-    add("--latch", action="store_true", help="an alarm lasts to the end of the recording")
-    add("--from", dest="start", type=float, metavar="S", help=f"judge from {first} on")
-    add("--to", dest="stop", type=float, metavar="S", help=f"judge up to {first}")
-
-
 def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> DeployedMonitor:
-    """The monitor that the options of `add_rule_arguments` describe."""
+    """The monitor that the options `DEPLOYED` describe."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.model.file import read_rules
     from uncertain_lti.monitor.alarm import Condition
@@ -147,15 +120,6 @@ def _judged(options: argparse.Namespace) -> Judged:
 # --- check -----------------------------------------------------------------------------------------------------------
 
 
-def _add_check(parser: argparse.ArgumentParser) -> None:
-    add_model(parser, published=True)
-    add_recordings(parser)
-    add_rule_arguments(parser)
-    add_json(parser, "print JSON with a verdict per sample")
-    copy = "write a copy of the recording with bounds, utilisation and flags on topics of their own; for several "
-    parser.add_argument("--write", metavar="OUT.mcap", help=f"{copy}recordings a folder")
-
-
 def run_check(options: argparse.Namespace) -> int:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.reports.check import check_data, check_text, outcome
@@ -193,14 +157,6 @@ def run_check(options: argparse.Namespace) -> int:
 # --- report ----------------------------------------------------------------------------------------------------------
 
 
-def _add_report(parser: argparse.ArgumentParser) -> None:
-    add_model(parser, published=True)
-    add_recordings(parser, " to check against it")
-    add_rule_arguments(parser)
-    parser.add_argument("--output", metavar="FILE.html", help="page to write (default: report.html; with --json none)")
-    add_json(parser, "print the same facts as JSON")
-
-
 def run_report(options: argparse.Namespace) -> int:
     """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.reports.findings import findings, findings_text
@@ -226,16 +182,6 @@ def run_report(options: argparse.Namespace) -> int:
 
 
 # --- plot ------------------------------------------------------------------------------------------------------------
-
-
-def _add_plot(parser: argparse.ArgumentParser) -> None:
-    about = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
-    add_recordings(parser, about=f"{about}(what happened, and when)", metavar="WHAT")
-    parser.add_argument("--signals", metavar="FILE", help="signals file: draw its signals, not every number that moves")
-    to = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
-    parser.add_argument("--output", metavar="FILE", help=f"{to}plot.png)")
-    add_rule_arguments(parser)
-    add_json(parser, "print the path, and whether the alarm was raised, as JSON")
 
 
 def run_plot(options: argparse.Namespace) -> int:
@@ -337,9 +283,41 @@ def _write_page(title: str, bags: Sequence[Recording], plotted: list[Plotted], o
     write_page(output, interactive_page(f"{title}: {shortlist(names, 1)}", plotted))
 
 
-_LONG = "say what took how long"
-_REPORT = "write a page that says whether a model may be relied on, and what happened in recordings"
-_PLOT = "draw a model, recordings, or what happened in recordings by a model"
-CHECK = Command("check", "check a recording against a model", _add_check, run_check, quiet=SILENT, verbose=_LONG)
-REPORT = Command("report", _REPORT, _add_report, run_report, quiet=SILENT, verbose=_LONG)
-PLOT = Command("plot", _PLOT, _add_plot, run_plot, quiet=SILENT, verbose=_LONG)
+CHECK = Command(
+    "check",
+    "check a recording against a model",
+    (PUBLISHED, "bags", *DEPLOYED, helped("--json", "print JSON with a verdict per sample"), "--write"),
+    run_check,
+    quiet=SILENT,
+    verbose="say what took how long",
+)
+REPORT = Command(
+    "report",
+    "write a page that says whether a model may be relied on, and what happened in recordings",
+    (
+        PUBLISHED,
+        helped("bags", f"{RECORDINGS} to check against it"),
+        *DEPLOYED,
+        helped("--output", "page to write (default: report.html; with --json none)", metavar="FILE.html"),
+        helped("--json", "print the same facts as JSON"),
+    ),
+    run_report,
+    quiet=SILENT,
+    verbose=CHECK.verbose,
+)
+_WHAT = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
+_IMAGE = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
+PLOT = Command(
+    "plot",
+    "draw a model, recordings, or what happened in recordings by a model",
+    (
+        helped("bags", f"{_WHAT}(what happened, and when)", metavar="WHAT"),
+        helped("--signals", "signals file: draw its signals, not every number that moves", required=False),
+        helped("--output", f"{_IMAGE}plot.png)", metavar="FILE"),
+        *DEPLOYED,
+        helped("--json", "print the path, and whether the alarm was raised, as JSON"),
+    ),
+    run_plot,
+    quiet=SILENT,
+    verbose=CHECK.verbose,
+)

@@ -27,13 +27,13 @@ from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.packages import absent
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import delegated, fit, judge, signature, start, tune, validate
+from uncertain_lti.cli import delegated, fit, judge, start, validate
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output
 
 COMMANDS: tuple[Command, ...] = (
-    start.START, start.TOPICS, start.INIT, fit.COMMAND, tune.COMMAND, judge.CHECK, judge.REPORT, judge.PLOT,
-    delegated.LAYOUT, validate.COMMAND, signature.COMMAND, delegated.INFO, delegated.REPRODUCE, delegated.PLAY,
-    delegated.RECORD, delegated.DEMO, delegated.COMPLETION,
+    start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, delegated.LAYOUT,
+    validate.VALIDATE, validate.SIGNATURE, delegated.INFO, delegated.REPRODUCE, delegated.PLAY, delegated.RECORD,
+    delegated.DEMO, delegated.COMPLETION,
 )  # fmt: skip
 """Every command, in the order of the help."""
 
@@ -125,17 +125,12 @@ def build_parser(chosen: str = "", every: bool = False) -> argparse.ArgumentPars
     for command in COMMANDS:
         text = command.help
         sub = parsers.add_parser(command.name, help=text, description=text[0].upper() + text[1:] + ".")
-        sub.set_defaults(run=command.run)
         if command.quiet:
             output = sub.add_mutually_exclusive_group()
             output.add_argument("-q", "--quiet", action="store_true", help=command.quiet)
             if command.verbose:
                 output.add_argument("-v", "--verbose", action="store_true", help=command.verbose)
-        if not command.deferred or command.name == chosen:
-            command.add_arguments(sub)
-        elif every:
-            with suppress(ModuleNotFoundError):
-                command.add_arguments(sub)
+        command.declare(sub, chosen, every)
     return parser
 
 

@@ -22,29 +22,14 @@ from typing import Any
 
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.cli.command import (
-    DONE,
-    SILENT,
-    Command,
-    add_force,
-    add_json,
-    add_recordings,
-    model_target,
-    print_json,
-    print_notes,
-    print_summary,
-)
+from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.cli.options import RECORDINGS, helped
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000
 
 
 # --- topics ----------------------------------------------------------------------------------------------------------
-
-
-def _add_topics(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("bag", metavar="BAG", help="recording (MCAP, .db3, .bag, table), or folder of one")
-    add_json(parser)
 
 
 def run_topics(options: argparse.Namespace) -> int:
@@ -82,18 +67,6 @@ def run_topics(options: argparse.Namespace) -> int:
 
 
 # --- init ------------------------------------------------------------------------------------------------------------
-
-
-def _add_init(parser: argparse.ArgumentParser) -> None:
-    add, field = parser.add_argument, "TOPIC[:FIELD]"
-    add_recordings(parser, " of the same machine")
-    add("--output", metavar="FILE", help="signals file to write; must not exist yet (default: print it)")
-    states = "what may be a state, in place of what looks like one; * stands for any letters"
-    add("--states", metavar=field, nargs="+", default=[], help=states)
-    add("--controls", metavar=field, nargs="+", default=[], help="likewise for the controls")
-    like = "of many alike (joints, motors) the one that the file is drawn up for, such as j3"
-    add("--like", metavar="MEMBER", default="", help=like)
-    add_json(parser, "print what is proposed as JSON, with the text of the file")
 
 
 def run_init(options: argparse.Namespace) -> int:
@@ -138,16 +111,6 @@ def run_init(options: argparse.Namespace) -> int:
 
 
 # --- start -----------------------------------------------------------------------------------------------------------
-
-
-def _add_start(parser: argparse.ArgumentParser) -> None:
-    add_recordings(parser, " of the healthy machine")
-    check = "recordings to report on (default: those that are fitted)"
-    parser.add_argument("--check", metavar="BAG", nargs="+", default=[], help=check)
-    output = "write NAME.yaml, which is used as it is if it is there already, NAME.model.json and NAME.html"
-    parser.add_argument("--output", metavar="NAME", default="machine", help=f"{output} (default: machine)")
-    add_force(parser)
-    add_json(parser, "print what init, fit and report say, as JSON")
 
 
 def run_start(options: argparse.Namespace) -> int:
@@ -203,11 +166,37 @@ def _on_the_robot(model: str) -> str:
     )
 
 
-_TOPICS = "list the topics of a recording, and which fields could be signals"
-_INIT = "propose a signals file for a recording, with reasons, for you to edit"
-_INIT_QUIET = "print errors only (and without --output the file): no summary, no notes, no progress"
-_START = "from recordings of the healthy machine to a monitor: init, fit and report in one go"
-_SCANS = "report every scan of the data, and what took how long"
-TOPICS = Command("topics", _TOPICS, _add_topics, run_topics, "print the list and errors only: no notes, no progress")
-INIT = Command("init", _INIT, _add_init, run_init, _INIT_QUIET)
-START = Command("start", _START, _add_start, run_start, SILENT, _SCANS)
+TOPICS = Command(
+    "topics",
+    "list the topics of a recording, and which fields could be signals",
+    ("bag", "--json"),
+    run_topics,
+    quiet="print the list and errors only: no notes, no progress",
+)
+INIT = Command(
+    "init",
+    "propose a signals file for a recording, with reasons, for you to edit",
+    (
+        helped("bags", f"{RECORDINGS} of the same machine"),
+        helped("--output", "signals file to write; must not exist yet (default: print it)", metavar="FILE"),
+        *("--states", "--controls", "--like"),
+        helped("--json", "print what is proposed as JSON, with the text of the file"),
+    ),
+    run_init,
+    quiet="print errors only (and without --output the file): no summary, no notes, no progress",
+)
+_WRITTEN = "write NAME.yaml, which is used as it is if it is there already, NAME.model.json and NAME.html"
+START = Command(
+    "start",
+    "from recordings of the healthy machine to a monitor: init, fit and report in one go",
+    (
+        helped("bags", f"{RECORDINGS} of the healthy machine"),
+        "--check",
+        helped("--output", f"{_WRITTEN} (default: machine)", metavar="NAME", default="machine"),
+        "--force",
+        helped("--json", "print what init, fit and report say, as JSON"),
+    ),
+    run_start,
+    quiet=SILENT,
+    verbose="report every scan of the data, and what took how long",
+)

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Command `uncertain-lti validate`: validate a model by leaving out what it was fitted to."""
+"""Commands `validate` and `signature`: what further judging of recordings adds to a model."""
 
 from __future__ import annotations
 
@@ -15,54 +15,24 @@ import argparse
 import os
 from dataclasses import replace
 
-from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.command import (
     DONE,
-    GROUP,
     SILENT,
     Command,
-    add_force,
-    add_model,
-    add_recordings,
+    load_model,
     model_target,
     print_json,
     print_notes,
     print_summary,
+    read_labelled,
 )
+from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
+
+# --- validate --------------------------------------------------------------------------------------------------------
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Declare the arguments of `uncertain-lti validate`."""
-    add_model(parser)
-    add_recordings(parser, " (default: those the model was fitted to)", required=False)
-    parser.add_argument("--blocks", type=int, help="leave out blocks: their number per recording (a single one: 10)")
-    parser.add_argument(
-        "--group", metavar="KEY", help=f"{GROUP}; default: that of the fit; none: single recordings all the same"
-    )
-    parser.add_argument("--gap", type=float, help="s before and after a left-out block that are not fitted either")
-    parser.add_argument("--confidence", type=float, default=0.9, help="of every interval (default: 0.9)")
-    parser.add_argument(
-        "--false-alarms",
-        type=float,
-        metavar="PER_HOUR",
-        help="learn the panel again, for at most so many false alarms per hour with 90%% confidence",
-    )
-    parser.add_argument(
-        "--within",
-        type=float,
-        metavar="S",
-        help="time within which a fault shall be seen (default: 1 s or 20 steps, at most a quarter of a recording)",
-    )
-    parser.add_argument(
-        "--output",
-        metavar="MODEL",
-        help="write the model with this validation, and the panel that was learnt, to this file",
-    )
-    add_force(parser)
-    parser.add_argument("--json", action="store_true", help="print JSON")
-
-
-def run(options: argparse.Namespace) -> int:
+def run_validate(options: argparse.Namespace) -> int:
     """Validate the model and write it with the result, if an output is named."""
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.formats import group_recordings
@@ -88,15 +58,8 @@ def run(options: argparse.Namespace) -> int:
     for transient in transients:
         print_notes(options, transient.notes)
     with options.progress.stage("validating") as step:
-        validation = validate_model(
-            model,
-            transients,
-            blocks=options.blocks,
-            gap=options.gap,
-            groups=options.group,
-            confidence=options.confidence,
-            progress=step,
-        )
+        given = {name: getattr(options, name) for name in ("blocks", "gap", "confidence")}
+        validation = validate_model(model, transients, **given, groups=options.group, progress=step)
     said: list[str] = []
     if options.false_alarms is not None:
         on = [s.name for s in model.signals.scheduling]
@@ -114,18 +77,80 @@ def run(options: argparse.Namespace) -> int:
         model.save(output)
     if options.json:
         print_json({"model": output or options.model, "validation": model.to_dict()["validation"]})
-    else:
-        print_summary(options, validation_text(data))
-        if output is not None:
-            print_summary(options, f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
+    print_summary(options, validation_text(data))
+    if output is not None:
+        print_summary(options, f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
     return DONE
 
 
-COMMAND = Command(
+# --- signature -------------------------------------------------------------------------------------------------------
+
+
+def run_signature(options: argparse.Namespace) -> int:
+    """Learn the signatures and write the model with them."""
+    from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.reports.validation_text import signature_text
+    from uncertain_lti.validation.signatures import learn_signatures
+
+    output = model_target(options.output, options.force)
+    pairs = [text.partition("=") for text in options.bags]
+    for text, (label, _, bag) in zip(options.bags, pairs, strict=True):
+        if not (label.strip() and bag):
+            raise ModelError(f"{text!r} is not LABEL=BAG; write for example stuck_valve=run7.mcap")
+    model = load_model(options.model)
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
+    labelled = read_labelled(options, [(label, bag) for label, _, bag in pairs], model.signals)
+    checked = [(label, monitor.check(transient)) for label, transient in labelled]
+    learnt = learn_signatures(model, checked, options.force)
+    model.replace(signatures=learnt.signatures).save(output)
+    if options.json:
+        faults = [
+            {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
+            for s in learnt.signatures
+        ]
+        named = [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named]
+        alike = [{"labels": [a, b], "match": match} for a, b, match in learnt.alike]
+        print_json({"model": str(output), "signatures": faults, "named": named, "alike": alike})
+    print_summary(options, signature_text(learnt))
+    print_summary(options, f"model written to {output}")
+    return DONE
+
+
+VALIDATE = Command(
     "validate",
     "estimate how far to trust a model, by leaving out what it was fitted to",
-    add_arguments,
-    run,
+    (
+        "model",
+        helped("bags", f"{RECORDINGS} (default: those the model was fitted to)", nargs="*"),
+        "--blocks",
+        helped(
+            "--group", f"{OPTIONS['--group']['help']}; default: that of the fit; none: single recordings all the same"
+        ),
+        *("--gap", "--confidence"),
+        helped(
+            "--false-alarms",
+            "learn the panel again, for at most so many false alarms per hour with 90%% confidence",
+        ),
+        "--within",
+        helped("--output", "write the model with this validation, and the panel that was learnt, to this file"),
+        *("--force", "--json"),
+    ),
+    run_validate,
     quiet=SILENT,
     verbose="say every fit, and what took how long",
+)
+_LABELLED = "a fault, and a recording of it in which the alarm is raised; several recordings may have one label"
+SIGNATURE = Command(
+    "signature",
+    "learn what known faults look like from labelled recordings",
+    (
+        "model",
+        helped("bags", _LABELLED, metavar="LABEL=BAG"),
+        ("--output", {"required": True}),
+        "--force",
+        *RULES,
+        "--json",
+    ),
+    run_signature,
+    quiet=SILENT,
 )
