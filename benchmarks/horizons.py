@@ -30,8 +30,7 @@ from measure import table
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
-from uncertain_lti.model.horizon import Horizon
-from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.plants.turbofan_faults import Fault
 from uncertain_lti.plants.turbofan_runs import DT, turbofan_signals

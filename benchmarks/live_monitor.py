@@ -91,9 +91,8 @@ def save_model(path: Path, n: int, rate: float, armed: bool = False) -> None:
 def arms(rng: np.random.Generator, matrices: tuple[Any, ...], dt: float) -> dict[str, Any]:
     """Everything that a model may have; statistics over 50 to 400 steps."""
     from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
-    from uncertain_lti.model.horizon import Horizon
+    from uncertain_lti.model.horizon import Horizon, Residuals
     from uncertain_lti.model.repeats import Repeats
-    from uncertain_lti.model.residuals import Residuals
     from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 
     knots = (-0.02, 0.0, 0.02)

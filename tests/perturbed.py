@@ -29,9 +29,8 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.cli.judge import check_recording
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
-from uncertain_lti.model.horizon import Horizon, Run
+from uncertain_lti.model.horizon import Horizon, Residuals, Run
 from uncertain_lti.model.repeats import Repeats
-from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor.alarm import Condition

@@ -21,8 +21,7 @@ from uncertain_lti import Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
-from uncertain_lti.model.horizon import Horizon
-from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.monitor.alarm import Alarm, AlarmWindow, Arming, Condition, Nearest, back_and_restarts, steps_back
 
 ZEROS = np.zeros((2, 2))

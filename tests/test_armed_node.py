@@ -21,9 +21,8 @@ import pytest
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.model.alarm_rule import KINDS, AlarmRule, StatisticRule
-from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.model.repeats import Repeats
-from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 

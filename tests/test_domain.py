@@ -25,8 +25,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import Judge
-from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for
-from uncertain_lti.model.jumps import jumps
+from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for, jumps
 
 
 def levels(values: list[float], rng: np.random.Generator, count: int = 1000) -> Transient:

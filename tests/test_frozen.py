@@ -28,7 +28,7 @@ from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model import repeats
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.model.repeats import Repeats, repeats_of
+from uncertain_lti.model.repeats import Repeats, repeats_in, together
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.frozen import needs, repeat_words
 from uncertain_lti.monitor.reason import over_recording
@@ -41,6 +41,10 @@ from uncertain_lti.sampling.transient import Transitions
 
 DT = 0.01
 MS = 1_000_000
+
+
+def repeats_of(model: UncertainLTI, transients: list[Transient]) -> Repeats:
+    return together(model.n, [repeats_in(model, transient) for transient in transients])
 
 
 def run(seed: int, seconds: float = 8.0, rest: tuple[float, float] = (0.0, 0.0), noise: float = 1e-4) -> Transient:

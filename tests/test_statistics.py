@@ -21,8 +21,7 @@ from uncertain_lti.identification.fleet import likelier_alone
 from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, PER_STATE, AlarmRule, StatisticRule
-from uncertain_lti.model.horizon import Horizon
-from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
 from uncertain_lti.sampling.sampler import Step

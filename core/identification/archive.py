@@ -35,7 +35,7 @@ from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, 
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.jumps import largest_steps
+from uncertain_lti.model.domain import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import Found, repeats_in, together
 from uncertain_lti.model.schedule import Schedule

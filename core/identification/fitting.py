@@ -38,9 +38,8 @@ from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.domain import Domain, Sampling, largest_steps
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
-from uncertain_lti.model.jumps import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import repeats_in, together
 from uncertain_lti.model.schedule import Schedule

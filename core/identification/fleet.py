@@ -26,7 +26,7 @@ from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Partition, Problem
 from uncertain_lti.model.domain import Occupancy, cells_for
-from uncertain_lti.model.residuals import Residuals
+from uncertain_lti.model.horizon import Residuals
 
 T = TypeVar("T")
 

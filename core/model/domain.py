@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import reprlib
 from base64 import b64decode, b64encode
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
 
 
@@ -168,3 +169,36 @@ class Domain:
         """As `outside`, of columns z (n + m, K)."""
         occupied = None if self.measure is None else self.measure.occupied
         return np.asarray(outside_domain(z, self.least, self.greatest, occupied))
+
+
+def largest_steps(model: Any, found: Iterable[Any]) -> Array:
+    """The largest change of each state in one transition (n,), normalised; `found`: of recordings, `repeats.Found`."""
+    largest = np.max([np.zeros(model.n), *(one.largest for one in found)], axis=0)
+    return np.asarray(np.minimum(largest / model.operating_point.X, LARGEST))
+
+
+def jumps(model: Any, before: ArrayLike, after: ArrayLike) -> tuple[Array, Array]:
+    """How far states moved in one step, where that is farther than ever in the fit.
+
+    Returns (n,): the largest of the fit, recorded units; infinite where that is not known.
+    """
+    known = model.domain.step_max
+    limit = np.full(model.n, np.inf) if known is None else known * model.operating_point.X
+    with np.errstate(over="ignore", invalid="ignore"):
+        change = np.asarray(after, dtype=np.float64) - np.asarray(before, dtype=np.float64)
+    # the product with the scale rounds: what is as large as the largest of the fit is not larger
+    return np.where(np.abs(change) > limit * (1.0 + 1e-9), change, 0.0), limit
+
+
+def jump_words(name: str, change: float, largest: float) -> str:
+    """What is said of a jump."""
+    return f"{name} jumped by {change:.3g} in one step (at most {largest:.3g} in the fit)"
+
+
+def jumps_in_words(model: Any, before: Sequence[float], after: Sequence[float], flags: Sequence[float]) -> list[str]:
+    """What is said of the states that jumped out of their bounds."""
+    if model.domain.step_max is None:
+        return []
+    change, limit = jumps(model, before[: model.n], after)
+    rows = zip(model.state_names, change.tolist(), limit.tolist(), flags, strict=True)
+    return [jump_words(name, by, most) for name, by, most, flag in rows if by and flag == 1.0]

@@ -21,9 +21,8 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended, centre_and_half
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.domain import Domain
-from uncertain_lti.model.horizon import Horizon, Run, Windows, unbroken_over, windows_of
+from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbroken_over, windows_of
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns, normalised
-from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, Elements, Term
 from uncertain_lti.sampling.transient import Transitions

@@ -15,7 +15,7 @@ import json
 import math
 import os
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import fields, replace
 from typing import Any
 
@@ -28,9 +28,8 @@ from uncertain_lti.base.files import kind_of, whole_file
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
-from uncertain_lti.model.horizon import Horizon, Run
+from uncertain_lti.model.horizon import Horizon, Residuals, Run
 from uncertain_lti.model.repeats import Repeats
-from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, object_of
@@ -44,6 +43,7 @@ _IN_EVERY_FILE = ("A", "B", "dA", "dB", "c", "dc", "v")  # the arrays of format 
 _STATE = ("name", "topic", "type", "field", "unit", "steady", "scale")
 _SCHEDULING = (*_STATE, "max_hold")
 _CONTROL = (*_SCHEDULING, "delay")
+_NEWER = {"schedule", "scheduling", "blocks", "horizons", "run", "residuals", "frozen", "signatures"}
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
@@ -52,56 +52,52 @@ def structure(model: Any) -> dict[str, Any]:
     """The structure of a model file, in the oldest format that holds the model."""
     signals, sampling, domain, rule = model.signals, model.sampling, model.domain, model.alarm_rule
     arrays = [name for name in ARRAYS if name in _IN_EVERY_FILE or getattr(model, name).any()]
-    one_rule = model.alarm == (rule,)
-    newer_sampling = _known(step=sampling.step, table=signals.table and signals.table.to_dict())
-    newer_domain = _known(
-        measure=domain.measure and domain.measure.to_dict(),
-        step_max=None if domain.step_max is None else domain.step_max.tolist(),
-    )
     regimes = {name: getattr(model, name).tolist() for name in arrays}
     if model.schedule is not None:
-        regimes = {"schedule": model.schedule.to_list()}
-        regimes |= {"scheduling": [_signal(s, _SCHEDULING) for s in signals.scheduling]} if signals.scheduling else {}
         each = zip(model.blocks_to_list(arrays), model.block_data, strict=True)
-        regimes["blocks"] = [b | {"transitions": f.transitions, "tied_to": f.tied_to} for b, f in each]
-    runs = _known(horizons=[h.to_dict() for h in model.horizons] or None, run=model.run and model.run.to_dict())
-    residuals = _known(residuals=model.residuals and model.residuals.to_dict())
-    evidence = _known(
-        frozen=model.repeats and model.repeats.to_dict(),
-        signatures=[signature.to_dict() for signature in model.signatures] or None,
-    )
-    newer = (
-        *(newer_sampling, newer_domain, runs, residuals, evidence),
-        *(model.schedule is not None, not one_rule, len(arrays) > len(_IN_EVERY_FILE), signals.arrivals),
-        *(g.memory or g.valid is not None or g.ignore or g.judged for g in signals),
-    )
-    return {
-        "format": FORMATS[any(newer)],
+        regimes = {
+            "schedule": model.schedule.to_list(),
+            "scheduling": [_signal(s, _SCHEDULING) for s in signals.scheduling] or None,
+            "blocks": [b | {"transitions": f.transitions, "tied_to": f.tied_to} for b, f in each],
+        }
+    steps = {f.name: getattr(sampling, f.name) for f in fields(Sampling)} | {"time": dict(sampling.time)}
+    box = {name: getattr(domain, name).tolist() for name in ("x_min", "x_max", "u_min", "u_max")}
+    whole = {
+        "format": FORMATS[0],
         "states": [_signal(s, _STATE) for s in signals.states],
         "controls": [_signal(s, _CONTROL) for s in signals.controls],
-        "sampling": {f.name: getattr(sampling, f.name) for f in fields(Sampling) if f.name != "step"}
-        | {"time": dict(sampling.time)}
-        | newer_sampling,
+        "sampling": _known(steps | {"table": _dict(signals.table)}, ("step", "table")),
         **regimes,
-        **runs,
-        "domain": {
-            name: [v if math.isfinite(v) else None for v in getattr(domain, name).tolist()]
-            for name in ("x_min", "x_max", "u_min", "u_max")
-        }
-        | newer_domain,
-        **residuals,
+        "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
+        "run": _dict(model.run),
+        "domain": {name: [v if math.isfinite(v) else None for v in limits] for name, limits in box.items()}
+        | _known({"measure": _dict(domain.measure), "step_max": _plain(domain.step_max)}, ("measure", "step_max")),
+        "residuals": _dict(model.residuals),
         "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
-        if one_rule
+        if model.alarm == (rule,)
         else {"rules": [rule.to_dict() for rule in model.alarm]},
-        **evidence,
+        "frozen": _dict(model.repeats),
+        "signatures": [signature.to_dict() for signature in model.signatures] or None,
         "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
         "validation": _plain(model.validation),
     }
+    whole = _known(whole, whole)
+    newer = (
+        *(whole.keys() & _NEWER, signals.arrivals, "rules" in whole["alarm"], len(arrays) > len(_IN_EVERY_FILE)),
+        *(whole["sampling"].keys() & {"step", "table"}, whole["domain"].keys() & {"measure", "step_max"}),
+        *(g.memory or g.valid is not None or g.ignore or g.judged for g in signals),
+    )
+    return whole | {"format": FORMATS[any(newer)]}
 
 
-def _known(**fields: Any) -> dict[str, Any]:
-    """Those of some fields that are not None."""
-    return {name: value for name, value in fields.items() if value is not None}
+def _known(entries: dict[str, Any], which: Collection[str]) -> dict[str, Any]:
+    """Without those of these entries that are None."""
+    return {name: value for name, value in entries.items() if value is not None or name not in which}
+
+
+def _dict(part: Any) -> Any:
+    """A part of a model as it is in the file; None for none."""
+    return None if part is None else part.to_dict()
 
 
 def _signal(signal: Signal, keys: Sequence[str]) -> dict[str, Any]:
@@ -127,14 +123,14 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
             f"format is {reprlib.repr(data['format'])}, and this version reads {', '.join(FORMATS)}; fit the model "
             f"again, or use the version that wrote it"
         )
-    scheduled = data["format"] != FORMATS[0] and "schedule" in data
+    newer = data["format"] != FORMATS[0]
+    scheduled = newer and "schedule" in data
     known = {"format", "states", "controls", "sampling", "domain", "alarm", "fit", "validation"}
-    known |= {"schedule", "scheduling", "blocks"} if scheduled else set(ARRAYS)
-    known |= {"horizons", "run", "residuals", "frozen", "signatures"} if data["format"] != FORMATS[0] else set()
+    regimes = {"schedule", "scheduling", "blocks"}
+    known |= (regimes if scheduled else set(ARRAYS)) | (_NEWER - regimes if newer else set())
     object_of(data, "", known, needed=("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)))
-    older = data["format"] == FORMATS[0]
     own = {f.name for f in fields(Sampling)}
-    said = object_of(data["sampling"], "sampling", own - {"step"} if older else own | {"table"})
+    said = object_of(data["sampling"], "sampling", own | {"table"} if newer else own - {"step"})
     sampling = Sampling(
         clock=_text(said.get("clock", ""), "sampling.clock"),
         clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
@@ -168,41 +164,38 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
             if getattr(signal, key) == "auto":
                 raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
     n, m = len(signals.states), len(signals.controls)
-    arrays, regimes = _blocks(data, n, m) if scheduled else ({name: data.get(name) for name in ARRAYS}, {})
+    arrays, regime_data = _blocks(data, n, m) if scheduled else ({name: data.get(name) for name in ARRAYS}, {})
     if not scheduled:
         checked(data["A"], "A", (n, n))  # against the names, before A says how many rows the others have
         checked(data["B"], "B", (n, m))
-    blocks = regimes["schedule"].blocks if scheduled else None
-    horizons = Horizon.list_from(data["horizons"], n, m, blocks) if "horizons" in data else ()
-    domain = None
-    if "domain" in data:
-        sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
-        newer = {"measure", "step_max"} if data["format"] != FORMATS[0] else set()
-        box = object_of(data["domain"], "domain", set(sizes) | newer)
-        for name in sizes:
-            if name not in box:
-                raise ModelError(f"field 'domain.{name}' is missing; fit the model again")
-        limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
-        measure = Occupancy.from_dict(box["measure"], n + m) if box.get("measure") is not None else None
-        step_max = checked(box["step_max"], "domain.step_max", (n,)) if box.get("step_max") is not None else None
-        if step_max is not None and (step_max < 0.0).any():
-            raise ModelError("field 'domain.step_max' holds a negative number")
-        domain = Domain(**limits, measure=measure, step_max=step_max)
+    blocks = regime_data["schedule"].blocks if scheduled else None
     return {
         **arrays,
-        **regimes,
-        "horizons": horizons,
+        **regime_data,
+        "horizons": Horizon.list_from(data["horizons"], n, m, blocks) if "horizons" in data else (),
         "run": Run.from_dict(data["run"], n, m, blocks) if "run" in data else None,
         "signals": signals,
         "sampling": sampling,
-        "domain": domain,
-        "alarm": _alarm(data.get("alarm", {}), data["format"] != FORMATS[0]),
+        "domain": _domain(data["domain"], n, m, newer) if "domain" in data else None,
+        "alarm": _alarm(data.get("alarm", {}), newer),
         "residuals": Residuals.from_dict(data["residuals"]) if "residuals" in data else None,
         "signatures": Signature.list_from(data.get("signatures", [])),
         "repeats": Repeats.from_dict(data["frozen"]) if data.get("frozen") is not None else None,
         "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in object_of(data.get("fit", {}), "fit").items()},
         "validation": object_of(data.get("validation", {}), "validation"),
     }
+
+
+def _domain(data: Any, n: int, m: int, newer: bool) -> Domain:
+    sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
+    also = {"measure", "step_max"} if newer else set()
+    box = object_of(data, "domain", set(sizes) | also, sizes)
+    limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
+    measure, step_max = (box.get(name) for name in ("measure", "step_max"))
+    if step_max is not None and ((step_max := checked(step_max, "domain.step_max", (n,))) < 0.0).any():
+        raise ModelError("field 'domain.step_max' holds a negative number")
+    seen = None if measure is None else Occupancy.from_dict(measure, n + m)
+    return Domain(**limits, measure=seen, step_max=step_max)
 
 
 def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:
@@ -302,7 +295,7 @@ def _positive(value: Any, name: str, zero: bool = False, null: bool = True, most
     except OverflowError:
         number = math.nan
     if not (0.0 < number <= most or (zero and number == 0.0)):
-        limit = "" if math.isnan(number) or number <= most else f", at most {most:g}"
+        limit = f", at most {most:g}" if number > most else ""
         raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")
     return number
 

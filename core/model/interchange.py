@@ -24,8 +24,9 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import whole_file
+from uncertain_lti.model.file import FORMATS
 from uncertain_lti.model.operating_point import normalised
-from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -275,11 +276,55 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
     ModelError
         The file is missing, is not a MATLAB file that can be read, or what it holds is no model; names the variable.
     """
+    data = _variables(path)
+    for name in REQUIRED:
+        if name not in data:
+            raise ModelError(f"{path}: there is no variable '{name}'; a model needs A, B, dA and dB")
+    try:
+        A, B = (_real(data[name], name) for name in ("A", "B"))
+        n, m = len(A), B.shape[1] if B.size else 0
+        kinds, knots, blocks = [], [], None
+        if "schedule_signals" in data:
+            names, kinds = _texts(data["schedule_signals"]), _texts(data["schedule_kinds"])
+            knots = [_real(v, "schedule_values").ravel() for v in np.asarray(data["schedule_values"]).ravel()]
+            if not len(names) == len(kinds) == len(knots) or set(kinds) - {"knots", "modes"}:
+                raise ModelError(
+                    "'schedule_kinds' and 'schedule_values' must have an entry per signal, of knots or modes"
+                )
+            blocks = math.prod(len(v) for v in knots)
+        arrays = _arrays(data, n, m, blocks)
+        whole = json.loads(_texts(data["model_json"])[0]) if "model_json" in data else _named(data, n, m, blocks)
+        changed: Any = [whole]
+        if blocks is not None:
+            if "model_json" not in data:  # in recorded units, until the model has its operating point
+                axes = zip(names, kinds, knots, strict=True)
+                whole["schedule"] = [{"signal": name, kind: values.tolist()} for name, kind, values in axes]
+            changed = whole.get("blocks") if isinstance(whole, dict) else None
+            if not (isinstance(changed, list) and len(changed) == blocks and all(isinstance(b, dict) for b in changed)):
+                raise ModelError(f"'model_json' does not have the {plural(blocks, 'block')} of 'schedule_values'")
+        for r, block in enumerate(changed):
+            if isinstance(block, dict):
+                block |= {name: (array if blocks is None else array[r]).tolist() for name, array in arrays.items()}
+        model = model_class.from_dict(whole, source=os.fspath(path))
+        if blocks is None:
+            return model
+        if [axis.signal for axis in model.schedule.axes] != names:
+            raise ModelError("'schedule_signals' are not those of 'model_json'")
+        schedule = _schedule(model, kinds, knots)
+        return model if schedule == model.schedule else model.replace(schedule=schedule)
+    except (ValueError, LookupError) as error:
+        raise ModelError(f"{path}: 'model_json' or the names are damaged ({error}); write the file anew") from None
+    except (ModelError, SignalError) as error:
+        raise ModelError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
+
+
+def _variables(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """What a MATLAB file holds."""
     from scipy.io import loadmat
 
     try:
         with open(path, "rb") as stream:
-            data = loadmat(stream)
+            return dict(loadmat(stream))
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such file; check the path") from None
     except NotImplementedError:
@@ -289,102 +334,48 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
     except Exception as error:  # a damaged file leads the reader anywhere
         text = (str(error).splitlines() or [type(error).__name__])[0]
         raise ModelError(f"{path}: is not a MATLAB file that can be read ({text}); write it anew") from None
-    for name in REQUIRED:
-        if name not in data:
-            raise ModelError(f"{path}: there is no variable '{name}'; a model needs A, B, dA and dB")
-    try:
-        whole = json.loads(_texts(data["model_json"])[0]) if "model_json" in data else None
-        if "schedule_signals" in data:
-            return _scheduled(model_class, data, whole, path)
-        matrices = {name: _real(data[name], name, path) for name in ARRAYS if name in data}
-        n, m = len(matrices["A"]), matrices["B"].shape[1] if matrices["B"].size else 0
-        for name in _VECTORS:
-            if name in matrices:
-                matrices[name] = matrices[name].ravel()
-        matrices["B"], matrices["dB"] = (
-            matrices[k].reshape(n, m) if not matrices[k].size else matrices[k] for k in ("B", "dB")
-        )
-        if whole is not None:
-            if isinstance(whole, dict):
-                whole |= {name: value.tolist() for name, value in matrices.items()}
-            return model_class.from_dict(whole, source=os.fspath(path))
-        signals = SignalMap(
-            _signals(data, "state", "x", n, path), _signals(data, "control", "u", m, path), source=os.fspath(path)
-        )
-        return model_class(**{name: matrices.get(name) for name in ARRAYS}, signals=signals)
-    except (ValueError, LookupError) as error:
-        raise ModelError(f"{path}: 'model_json' or the names are damaged ({error}); write the file anew") from None
-    except (ModelError, SignalError) as error:
-        raise ModelError(f"{path}: {str(error).removeprefix(f'{path}: ')}") from None
 
 
-def _scheduled(model_class: Any, data: dict[str, Any], whole: Any, path: str | os.PathLike[str]) -> Any:
-    """A scheduled model: its arrays have the block last."""
-    names, kinds = _texts(data["schedule_signals"]), _texts(data["schedule_kinds"])
-    values = [_real(v, "schedule_values", path).ravel() for v in np.asarray(data["schedule_values"]).ravel()]
-    if not len(names) == len(kinds) == len(values) or set(kinds) - {"knots", "modes"}:
-        raise ModelError("'schedule_kinds' and 'schedule_values' must have an entry per signal, of knots or modes")
-    R = math.prod(len(v) for v in values)
-    sizes = {"x": _rows(data["A"]), "u": _rows(data["B"], 1), "1": 1}
-    n = sizes["x"]
+def _arrays(data: dict[str, Any], n: int, m: int, blocks: int | None) -> dict[str, Array]:
+    """The arrays of a model; in the file the block is the last dimension, which MATLAB drops if it is 1."""
     arrays = {}
-    for name in ARRAYS:
-        if name in data:
-            shape = (*SHAPES[name].shape(n, sizes["u"]), R)  # MATLAB drops a last dimension of 1
-            array = _real(data[name], name, path)
-            if array.size != math.prod(shape) or (array.ndim == len(shape) and array.size and array.shape != shape):
-                raise ModelError(f"variable '{name}' has shape {array.shape}; it must be {shape}, the block last")
-            arrays[name] = np.moveaxis(array.reshape(shape), -1, 0)
-    if isinstance(whole, dict):
-        blocks = whole.get("blocks")
-        if not isinstance(blocks, list) or len(blocks) != R or not all(isinstance(block, dict) for block in blocks):
-            raise ModelError(f"'model_json' does not have the {plural(R, 'block')} of 'schedule_values'")
-        for r, block in enumerate(blocks):
-            block |= {name: array[r].tolist() for name, array in arrays.items()}
-        model = model_class.from_dict(whole, source=os.fspath(path))
-        if [axis.signal for axis in model.schedule.axes] != names:
-            raise ModelError("'schedule_signals' are not those of 'model_json'")
-        changed = _changed(model, kinds, values)
-        return model if changed == model.schedule else model.replace(schedule=changed)
-    signals = SignalMap(
-        _signals(data, "state", "x", n, path),
-        _signals(data, "control", "u", sizes["u"], path),
-        _signals(data, "scheduling", "s", len(_texts(data.get("scheduling_names", []))), path),
-        source=os.fspath(path),
-    )
-    named = {s.name: s for s in signals.signals}
-    axes = []
-    for name, kind, there in zip(names, kinds, values, strict=True):
-        if name not in named:
-            raise ModelError(f"schedule: '{name}' is no state, control or scheduling signal")
-        at = normalised(there, float(named[name].steady), float(named[name].scale))
-        axes.append(Axis(name, **{kind: tuple(at.tolist())}))
-    facts = [BlockData(None if math.isnan(a) else int(a), int(b) - 1 if b else None) for a, b in _block_rows(data, R)]
-    return model_class(**arrays, schedule=Schedule(tuple(axes)), block_data=facts, signals=signals)
+    for name in (name for name in ARRAYS if name in data):
+        array = _real(data[name], name)
+        if blocks is None:
+            arrays[name] = array.ravel() if SHAPES[name].regressor == "1" else array
+            continue
+        shape = (*SHAPES[name].shape(n, m), blocks)
+        if array.size != math.prod(shape) or (array.ndim == len(shape) and array.size and array.shape != shape):
+            raise ModelError(f"variable '{name}' has shape {array.shape}; it must be {shape}, the block last")
+        arrays[name] = np.moveaxis(array.reshape(shape), -1, 0)
+    return arrays
 
 
-def _rows(value: Any, axis: int = 0) -> int:
-    """Length of one dimension of an array; 0 where it has no entries."""
-    array = np.asarray(value)
-    return array.shape[axis] if array.size and array.ndim > axis else 0
-
-
-def _block_rows(data: dict[str, Any], R: int) -> list[tuple[float, float]]:
-    """Transitions and tied_to of each block, as `save_mat` writes them."""
+def _named(data: dict[str, Any], n: int, m: int, blocks: int | None) -> dict[str, Any]:
+    """The structure of a model file without arrays, from the names, units and operating point in a MATLAB file."""
+    whole: dict[str, Any] = {"format": FORMATS[-1], "sampling": {}}
+    whole |= {"states": _signals(data, "state", "x", n), "controls": _signals(data, "control", "u", m)}
+    if blocks is None:
+        return whole
     columns = []
-    for name, default in (("transitions", math.nan), ("tied_to", 0.0)):
-        values = np.asarray(data[name], dtype=np.float64).ravel() if name in data else np.full(R, default)
-        if len(values) != R:
-            raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(R, 'block')}")
+    for name, unknown in (("transitions", math.nan), ("tied_to", 0.0)):
+        values = np.asarray(data[name], dtype=np.float64).ravel() if name in data else np.full(blocks, unknown)
+        if len(values) != blocks:
+            raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(blocks, 'block')}")
         columns.append(values.tolist())
-    return list(zip(*columns, strict=True))
+    facts = [
+        {"transitions": None if math.isnan(count) else int(count), "tied_to": int(tied) - 1 if tied else None}
+        for count, tied in zip(*columns, strict=True)
+    ]
+    scheduling = _signals(data, "scheduling", "s", len(_texts(data.get("scheduling_names", []))))
+    return whole | {"blocks": facts} | ({"scheduling": scheduling} if scheduling else {})
 
 
-def _changed(model: Any, kinds: Sequence[str], values: Sequence[Array]) -> Schedule:
-    """The schedule of `model_json`, with the knots or modes that were changed since; the others keep their bits."""
+def _schedule(model: Any, kinds: Sequence[str], knots: Sequence[Array]) -> Schedule:
+    """The schedule with knots or modes in recorded units; those that are as the model has them keep their bits."""
     axes, point, schedule = [], model.operating_point, model.schedule
     before = schedule.recorded_values(model.signals.signals)
-    each = zip(schedule.axes, before, model.scheduling_positions, kinds, values, strict=True)
+    each = zip(schedule.axes, before, model.scheduling_positions, kinds, knots, strict=True)
     for axis, written, i, kind, there in each:
         at = normalised(there, point.steady[i], point.scale[i])
         if len(there) == len(written):
@@ -393,10 +384,10 @@ def _changed(model: Any, kinds: Sequence[str], values: Sequence[Array]) -> Sched
     return Schedule(tuple(axes))
 
 
-def _real(value: Any, name: str, path: str | os.PathLike[str]) -> Array:
+def _real(value: Any, name: str) -> Array:
     array = value.toarray() if hasattr(value, "toarray") else np.asarray(value)  # sparse in MATLAB, too
     if array.dtype.kind not in "fiub":
-        raise ModelError(f"{path}: variable '{name}' is not a real matrix")
+        raise ModelError(f"variable '{name}' is not a real matrix")
     return np.array(array, dtype=np.float64, ndmin=2)
 
 
@@ -410,19 +401,20 @@ def _texts(value: Any) -> list[str]:
     return found
 
 
-def _signals(
-    data: dict[str, Any], kind: str, letter: str, count: int, path: str | os.PathLike[str]
-) -> tuple[Signal, ...]:
-    names = _texts(data[f"{kind}_names"]) if f"{kind}_names" in data else [f"{letter}{i + 1}" for i in range(count)]
-    units = _texts(data[f"{kind}_units"]) if f"{kind}_units" in data else [""] * count
-    point = []
-    for which, default in (("steady", 0.0), ("scale", 1.0)):
-        given = data.get(f"{letter}_{which}")
-        point.append([default] * count if given is None else _real(given, f"{letter}_{which}", path).ravel().tolist())
-    for what, values in ((f"{kind}_names", names), (f"{kind}_units", units), (f"{letter}_steady", point[0])):
+def _signals(data: dict[str, Any], kind: str, letter: str, count: int) -> list[dict[str, Any]]:
+    columns = []
+    for name, usual in (
+        (f"{kind}_names", [f"{letter}{i + 1}" for i in range(count)]),
+        (f"{kind}_units", [""] * count),
+        (f"{letter}_steady", [0.0] * count),
+        (f"{letter}_scale", [1.0] * count),
+    ):
+        values: list[Any] = usual
+        if name in data:
+            values = _texts(data[name]) if name.startswith(kind) else _real(data[name], name).ravel().tolist()
         if len(values) != count:
-            raise ModelError(f"{path}: '{what}' has {plural(len(values), 'entry')} for {plural(count, kind)}")
-    return tuple(
-        Signal(name, "", letter, steady, scale, unit)
-        for name, unit, steady, scale in zip(names, units, *point, strict=True)
-    )
+            raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(count, kind)}")
+        columns.append(values)
+    keys = ("name", "unit", "steady", "scale")
+    rows = zip(*columns, strict=True)
+    return [{"topic": "", "field": letter} | dict(zip(keys, row, strict=True)) for row in rows]

@@ -28,7 +28,7 @@ it, if hardly a value of the state came twice in a recording.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -224,11 +224,6 @@ def walk(
         at.tolist(), on.tolist(), t_ns[at + 1].tolist(), *(a.tolist() for a in given), strict=True
     ):
         yield k, after, Transition(t, *each)
-
-
-def repeats_of(model: Any, transients: Iterable[Any]) -> Repeats:
-    """What recordings of a healthy machine have of exact repeats."""
-    return together(model.n, [repeats_in(model, transient) for transient in transients])
 
 
 class Found(NamedTuple):

@@ -38,10 +38,9 @@ from uncertain_lti.model.alarm_rule import (
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.envelope import Envelope
 from uncertain_lti.model.file import arguments, read, structure, write
-from uncertain_lti.model.horizon import Horizon, Run, checked_horizons
+from uncertain_lti.model.horizon import Horizon, Residuals, Run, checked_horizons
 from uncertain_lti.model.operating_point import OperatingPoint, normalised
 from uncertain_lti.model.repeats import Repeats
-from uncertain_lti.model.residuals import Residuals
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature, checked_signatures
 from uncertain_lti.model.terms import ARRAYS

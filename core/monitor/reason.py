@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
-from uncertain_lti.model.jumps import jumps, jumps_in_words
+from uncertain_lti.model.domain import jumps, jumps_in_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, row_of
 from uncertain_lti.monitor.verdict import Verdict, Verdicts

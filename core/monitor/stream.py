@@ -21,7 +21,7 @@ from typing import Any
 import cython
 
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.jumps import jumps_in_words
+from uncertain_lti.model.domain import jumps_in_words
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Arming, Condition

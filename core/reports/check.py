@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.english import plural, shortlist, times
-from uncertain_lti.model.jumps import jump_words, jumps
+from uncertain_lti.model.domain import jump_words, jumps
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.frozen import repeat_words
