@@ -22,8 +22,7 @@ import sys
 from pathlib import Path
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, STATE_TOPIC
-from uncertain_lti.plants.turbofan_faults import KINDS
-from uncertain_lti.plants.turbofan_runs import RECORDINGS, make_run
+from uncertain_lti.plants.turbofan_runs import KINDS, RECORDINGS, make_run
 from uncertain_lti.recordings.bag import Bag
 
 LEIBOV = {

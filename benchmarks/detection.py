@@ -34,7 +34,7 @@ import numpy as np
 from coil import coil_runs
 from detectors import DETECTORS, WINDOWS, Array, Learn, averaged, least_squares, table
 from shared_recordings import airborne, crazypad_labels
-from turbofan_fleet import simulate_fleet
+from turbofan_fleet import lever_moves, simulate_fleet
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -42,8 +42,7 @@ from tanks import Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, fit
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.plants.turbofan_faults import Fault
-from uncertain_lti.plants.turbofan_runs import DT, LARGE, Run, lever_moves, make_run
+from uncertain_lti.plants.turbofan_runs import DT, LARGE, Fault, Run, make_run
 
 Recording = Sequence[Transient]
 """One recording, in one piece or several."""

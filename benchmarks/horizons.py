@@ -32,8 +32,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.model.terms import ARRAYS, SHAPES
-from uncertain_lti.plants.turbofan_faults import Fault
-from uncertain_lti.plants.turbofan_runs import DT, turbofan_signals
+from uncertain_lti.plants.turbofan_runs import DT, Fault, turbofan_signals
 from uncertain_lti.validation.left_out import cut
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -21,8 +21,7 @@ import numpy as np
 
 from uncertain_lti import EnvelopeMonitor
 from uncertain_lti.identification import fit
-from uncertain_lti.plants.turbofan_faults import KINDS, Fault
-from uncertain_lti.plants.turbofan_runs import DT, make_run, simulate
+from uncertain_lti.plants.turbofan_runs import DT, KINDS, Fault, make_run, simulate
 
 AT, SAMPLES, SEED = 24.0, 1401, 20
 

@@ -9,7 +9,7 @@
 
 """Many runs of the turbofan at once: the plant's own source on arrays, one column per run, about 20 times as fast.
 
-The equations are those of `uncertain_lti.plants`: the three modules of the gas path are loaded a second time, with
+The equations are those of `uncertain_lti.plants`: the two modules of the gas path are loaded a second time, with
 NumPy's functions in place of Python's, so that a float may be an array of floats. Faults, lever, controller and noise
 are the objects of `turbofan_runs.simulate`, one per run. What differs is numerical: Newton's method stops at a relative
 mismatch of 1e-10 in every run, and two steps of Runge-Kutta's fourth order take the place of DOP853.
@@ -32,16 +32,15 @@ import numpy as np
 from uncertain_lti import Transient
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan as one_engine
-from uncertain_lti.plants.turbofan_control import Controller, operating_point, trim
-from uncertain_lti.plants.turbofan_faults import Fault
+from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating_point, trim
 from uncertain_lti.plants.turbofan_runs import (
     DT,
     DT_NS,
     START_NS,
+    Fault,
     Run,
     _lever,
     _rounded,
-    lever_moves,
     pulses,
     simulate,
     turbofan_signals,
@@ -55,14 +54,12 @@ TOLERANCE = 1e-10
 @cache
 def _on_arrays() -> one_engine.Engine:
     """The engine whose `_path` and `derivative` take arrays in place of floats."""
-    gas, components, turbofan = (
-        _again(f"uncertain_lti.plants.{name}") for name in ("turbofan_gas", "turbofan_components", "turbofan")
-    )
-    components.gas = turbofan.gas = gas
+    gas, turbofan = (_again(f"uncertain_lti.plants.{name}") for name in ("turbofan_gas", "turbofan"))
+    turbofan.gas = gas
     for name in ("CompressorMap", "TurbineMap", "burn", "nozzle"):
-        setattr(turbofan, name, getattr(components, name))
+        setattr(turbofan, name, getattr(gas, name))
     engine: one_engine.Engine = turbofan.Engine()  # its sizes, before functions are replaced
-    for module in (gas, components, turbofan):
+    for module in (gas, turbofan):
         vars(module).update(sqrt=np.sqrt, exp=np.exp, log=np.log, max=np.maximum, min=np.minimum)
 
     def mass_flow(area: Array, P: Array, T: Array, w: Array, p: Array) -> Array:
@@ -89,6 +86,37 @@ def _again(name: str) -> ModuleType:
     sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
+
+
+def lever_moves(
+    seconds: float,
+    seed: int,
+    jumps: float = 0.5,
+    rate: tuple[float, float] = (1.0, 4.0),
+    hold: tuple[float, float] = (0.5, 5.0),
+    low: float = 60.0,
+) -> tuple[tuple[float, float], ...]:
+    """Moves of the lever at random, as corners for a `Run` with `ramps`: each move jumps or ramps, and then it rests.
+
+    Angles are uniform, but about one in five is the smallest and one in five the largest: what a machine does from end
+    to end has to be in recordings that shall represent it.
+    """
+    rng = np.random.default_rng(seed)
+    beyond = (MAXIMUM - low) / 3.0
+
+    def angle() -> float:
+        return min(max(float(rng.uniform(low - beyond, MAXIMUM + beyond)), low), MAXIMUM)
+
+    corners = [(0.0, angle())]
+    t = float(rng.uniform(*hold))
+    while t < seconds:
+        start, end = corners[-1][1], angle()
+        corners.append((t, start))
+        if rng.uniform() >= jumps:
+            t += abs(end - start) / float(rng.uniform(*rate))
+        corners.append((t, end))
+        t += float(rng.uniform(*hold))
+    return tuple(corners)
 
 
 class FleetSolver:

@@ -17,23 +17,23 @@ import pytest
 
 pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
 
-from turbofan_fleet import simulate_fleet
+from turbofan_fleet import lever_moves, simulate_fleet
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
-from uncertain_lti.plants.turbofan_components import P_STANDARD, T_STANDARD
 from uncertain_lti.plants.turbofan_control import Controller, fan_speed, operating_point, trim
-from uncertain_lti.plants.turbofan_faults import KINDS, Fault
+from uncertain_lti.plants.turbofan_gas import P_STANDARD, T_STANDARD
 from uncertain_lti.plants.turbofan_runs import (
     DT,
+    KINDS,
     LEVELS,
     RECORDINGS,
     START_NS,
+    Fault,
     Run,
     _advance,
-    lever_moves,
     make_run,
     pulses,
     simulate,

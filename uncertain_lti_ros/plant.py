@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
-from uncertain_lti.plants.turbofan_faults import KINDS
+from uncertain_lti.plants.turbofan_runs import KINDS
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti_ros.arguments import Declared, declare, run_node
 from uncertain_lti_ros.process import Life, living

@@ -32,14 +32,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
-from uncertain_lti.plants.turbofan_components import (
-    P_STANDARD,
-    T_STANDARD,
-    CompressorMap,
-    TurbineMap,
-    burn,
-    nozzle,
-)
+from uncertain_lti.plants.turbofan_gas import P_STANDARD, T_STANDARD, CompressorMap, TurbineMap, burn, nozzle
 
 STATES = (
     "fan_speed",
@@ -367,7 +360,7 @@ class GasPathSolver:
     """
 
     TOLERANCE = 1e-12
-    ROUNDING = 1e-10  # accepted where a fresh Jacobian gains nothing more
+    ROUNDING = 1e-10  # accepted where a step gains nothing more
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
@@ -404,39 +397,32 @@ class GasPathSolver:
     def _newton(self, x: Sequence[float], u: Sequence[float], health: Health) -> GasPath | None:
         q = self._q
         mismatch, path = self._try(q, x, u, health)
-        fresh = False
         for _ in range(60):
-            if path is None:
+            if path is None or path.residual <= self.TOLERANCE:
                 break
-            if path.residual <= self.TOLERANCE:
-                self._q = q
-                return path
+            fresh = self._inverse is None
             if self._inverse is None:
-                self._inverse, fresh = self._jacobian_inverse(q, mismatch, x, u, health), True
-                if self._inverse is None:
-                    break
+                self._inverse = self._jacobian_inverse(q, mismatch, x, u, health)
+            if self._inverse is None:
+                return None
             step = self._inverse @ mismatch
-            length = min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-300))  # keeps flows and drops positive
-            while True:
-                trial = q - length * step
-                found, there = self._try(trial, x, u, health)
-                better = there is not None and there.residual < path.residual
-                if better or not fresh or length < 1e-6:
+            step *= min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-300))  # keeps flows and drops positive
+            for length in 0.5 ** np.arange(20 if fresh else 1):
+                found, there = self._try(q - length * step, x, u, health)
+                if there is not None and there.residual < path.residual:
                     break
-                length *= 0.5
-            before = path.residual
-            if better:
-                q, mismatch, path = trial, found, there
-            if not better or (path is not None and path.residual > 0.1 * before):
-                if fresh and not better:
-                    if before > self.ROUNDING:
-                        break
-                    self._q = q
-                    return path
+                there = None
+            if there is None and fresh:
+                break
+            if there is None or there.residual > 0.1 * path.residual:
                 self._inverse = None
-            fresh = False
-        self._inverse = None
-        return None
+            if there is not None:
+                q, mismatch, path = q - length * step, found, there
+        if path is None or path.residual > self.ROUNDING:
+            self._inverse = None
+            return None
+        self._q = q
+        return path
 
     def _try(self, q: Array, x: Sequence[float], u: Sequence[float], health: Health) -> tuple[Array, GasPath | None]:
         """As `Engine._path`; None where the trial lies outside what the components are defined for."""

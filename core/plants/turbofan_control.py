@@ -15,13 +15,12 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from scipy.optimize import root
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.plants.turbofan import Engine, GasPath, GasPathSolver, Health, engine
-from uncertain_lti.plants.turbofan_components import T_STANDARD
+from uncertain_lti.plants.turbofan_gas import T_STANDARD
 
 IDLE, MAXIMUM = 12.0, 68.0
 """Power-lever angle, deg."""
@@ -73,6 +72,8 @@ class Trim:
 
 def trim(pla: float, plant: Engine | None = None, health: Health | None = None) -> Trim:
     """Steady state at a lever angle: fan speed, area and vanes by schedule, fuel and compressor speed by balance."""
+    from scipy.optimize import root
+
     plant, health = plant or engine(), health or Health()
     d, low, area = plant.design, fan_speed(pla, plant), nozzle_area(pla, plant)
     solver = GasPathSolver(plant)

@@ -15,11 +15,11 @@ Every run is sampled at 0.025 s; controls are recorded as commands and held betw
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
@@ -36,7 +36,6 @@ from uncertain_lti.plants.turbofan import (
     engine,
 )
 from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating_point, trim
-from uncertain_lti.plants.turbofan_faults import KINDS, Fault
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -82,6 +81,83 @@ def turbofan_signals() -> SignalMap:
         time={STATE_TOPIC: "header", CONTROL_TOPIC: "header"},
         source="turbofan",
     )
+
+
+KINDS = {
+    "fuel_stuck": "the fuel flow stays where it is, whatever is commanded",
+    "nozzle_stuck": "the nozzle area stays where it is, whatever is commanded",
+    "sensor_bias": "the reading of the compressor exit pressure jumps by 2 % of its scale",
+    "sensor_drift": "the reading of the turbine exit temperature drifts by 0.2 % of its scale per second",
+    "compressor_wear": "the compressor loses efficiency at 0.1 % per second, down to 3 % less",
+    "fan_damage": "the fan loses 2 % of its efficiency at once",
+}
+"""Kinds of fault, each with what happens; the sizes are the ones below."""
+
+BIAS, DRIFT = 0.02, 0.002  # of the scale; of the scale per s
+WEAR, WORST_WEAR = 0.001, 0.03  # of the efficiency per s; at most
+DAMAGE = 0.02  # of the efficiency
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A kind of fault and the instant of its onset.
+
+    `kind`: one of KINDS; `at`: onset, s after the first sample; `size`: of the fault, over the size that KINDS states:
+    2 is a bias, a drift, a rate of wear or a loss twice as large.
+    """
+
+    kind: str
+    at: float
+    size: float = 1.0
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise UncertainLTIError(f"turbofan: there is no fault '{self.kind}'; there are {', '.join(KINDS)}")
+        if not 0.0 < self.size < math.inf:
+            raise UncertainLTIError(f"turbofan: a fault of size {self.size:g}; it must be a positive number")
+        if self.size != 1.0 and self.kind.endswith("stuck"):
+            raise UncertainLTIError(
+                f"turbofan: {self.kind} of size {self.size:g}; what is stuck has no size, leave it 1"
+            )
+
+    def first_sample(self, dt: float) -> int:
+        """The first sample that can show it: a sensor's at the onset, anything else one step later."""
+        onset = int(np.ceil(self.at / dt - 1e-9))
+        return onset if self.kind.startswith("sensor") else onset + 1
+
+    def health(self, t: float) -> Health:
+        """Efficiency factors at one instant."""
+        if self.kind == "compressor_wear" and t > self.at:
+            return Health(compressor=1.0 - self.size * min(WEAR * (t - self.at), WORST_WEAR))
+        if self.kind == "fan_damage" and t >= self.at:
+            return Health(fan=1.0 - self.size * DAMAGE)
+        return Health()
+
+    def reading(self, t: float, x: Array, X: Array) -> Array:
+        """What the sensors read.
+
+        `x` (5,): states, recorded units; `X` (5,): scales of the states; Returns (5,): readings; `x` itself where no
+        sensor is at fault.
+        """
+        if t < self.at or not self.kind.startswith("sensor"):
+            return x
+        x = x.copy()
+        if self.kind == "sensor_bias":
+            i = STATES.index("compressor_exit_total_pressure")
+            x[i] += self.size * BIAS * X[i]
+        else:
+            i = STATES.index("turbine_exit_total_temperature")
+            x[i] += self.size * DRIFT * (t - self.at) * X[i]
+        return x
+
+    def stuck(self, t: float) -> int | None:
+        """Position of the control that no longer follows its command, if any."""
+        if t < self.at:
+            return None
+        return {
+            "fuel_stuck": CONTROLS.index("main_fuel_flow"),
+            "nozzle_stuck": CONTROLS.index("nozzle_throat_area"),
+        }.get(self.kind)
 
 
 @dataclass(frozen=True)
@@ -173,6 +249,8 @@ def _advance(plant: Engine, solver: GasPathSolver, x: Array, u: Array, X: Array,
     def rate(_: float, z: Array) -> Array:
         return plant.derivative((z * X).tolist(), controls, health, solver) / X
 
+    from scipy.integrate import solve_ivp  # the node says its parameters without it
+
     found = solve_ivp(rate, (0.0, DT), x / X, method="DOP853", rtol=1e-9, atol=1e-11, first_step=DT)
     if not found.success:
         raise UncertainLTIError(f"turbofan: the step was not integrated: {found.message}")
@@ -194,37 +272,6 @@ def _lever(run: Run, t: float) -> float:
     until, target = run.lever[last + 1]
     low, high = sorted((pla, target))
     return min(max(pla + (target - pla) * (t - since) / (until - since), low), high)
-
-
-def lever_moves(
-    seconds: float,
-    seed: int,
-    jumps: float = 0.5,
-    rate: tuple[float, float] = (1.0, 4.0),
-    hold: tuple[float, float] = (0.5, 5.0),
-    low: float = 60.0,
-) -> tuple[tuple[float, float], ...]:
-    """Moves of the lever at random, as corners for a `Run` with `ramps`: each move jumps or ramps, and then it rests.
-
-    Angles are uniform, but about one in five is the smallest and one in five the largest: what a machine does from end
-    to end has to be in recordings that shall represent it.
-    """
-    rng = np.random.default_rng(seed)
-    beyond = (MAXIMUM - low) / 3.0
-
-    def angle() -> float:
-        return min(max(float(rng.uniform(low - beyond, MAXIMUM + beyond)), low), MAXIMUM)
-
-    corners = [(0.0, angle())]
-    t = float(rng.uniform(*hold))
-    while t < seconds:
-        start, end = corners[-1][1], angle()
-        corners.append((t, start))
-        if rng.uniform() >= jumps:
-            t += abs(end - start) / float(rng.uniform(*rate))
-        corners.append((t, end))
-        t += float(rng.uniform(*hold))
-    return tuple(corners)
 
 
 def make_run(
