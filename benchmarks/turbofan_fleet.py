@@ -32,17 +32,20 @@ import numpy as np
 from uncertain_lti import Transient
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan as one_engine
-from uncertain_lti.plants.turbofan_control import MAXIMUM, Controller, operating_point, trim
 from uncertain_lti.plants.turbofan_runs import (
     DT,
     DT_NS,
+    MAXIMUM,
     START_NS,
+    Controller,
     Fault,
     Run,
     _lever,
     _rounded,
+    operating_point,
     pulses,
     simulate,
+    trim,
     turbofan_signals,
 )
 

@@ -23,8 +23,7 @@ from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.english import printable
-from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError
-from uncertain_lti.base.packages import absent
+from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError, absent
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive

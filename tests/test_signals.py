@@ -621,7 +621,7 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
     path.write_text(bomb)
     with pytest.raises(SignalError, match=r"at line 2: an alias \(\*name\); write out what it stands for"):
         SignalMap.load(path)
-    from uncertain_lti.base.plain_yaml import compose, construct
+    from uncertain_lti.signals.file_values import compose, construct
 
     text = "{a: 010, b: 1:30, c: 1_000, d: 10, e: 1.5e-3, f: -0.5, g: 0x10, h: 0}"
     assert construct(compose(text)) == {

@@ -23,7 +23,6 @@ from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
-from uncertain_lti.plants.turbofan_control import Controller, fan_speed, operating_point, trim
 from uncertain_lti.plants.turbofan_gas import P_STANDARD, T_STANDARD
 from uncertain_lti.plants.turbofan_runs import (
     DT,
@@ -31,12 +30,16 @@ from uncertain_lti.plants.turbofan_runs import (
     LEVELS,
     RECORDINGS,
     START_NS,
+    Controller,
     Fault,
     Run,
     _advance,
+    fan_speed,
     make_run,
+    operating_point,
     pulses,
     simulate,
+    trim,
     turbofan_signals,
 )
 from uncertain_lti.recordings.bag import Bag

@@ -11,6 +11,9 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
+
 from uncertain_lti.base.english import printable
 
 
@@ -49,3 +52,36 @@ def refuse_other(value: object, kind: type | tuple[type, ...], what: str, instea
     if not isinstance(value, kind):
         of = "None" if value is None else f"of type {type(value).__name__}"
         raise error(f"{what} is {of}; {instead}")
+
+
+_EXTRAS = {
+    "fit": "daqp highspy piqp scipy threadpoolctl",
+    "oracle": "cvxpy osqp",
+    "plots": "PIL jinja2 markupsafe matplotlib",
+    "tables": "pyarrow",
+    "control": "control",
+    "cluster": "distributed",
+    "completion": "shtab",
+    "ros": "rclpy rosgraph_msgs sensor_msgs std_msgs std_srvs uncertain_lti_ros",
+    "": "lz4 mcap rosbags tqdm zstandard",
+}
+"""What brings which packages: an extra of setup.py, or every installation."""
+
+
+def _made_by_run() -> bool:
+    """Whether this is the environment that ./run makes for the programs alone."""
+    made_for = Path(sys.prefix, "made-for")
+    return made_for.is_file() and made_for.read_text() == "use\n"
+
+
+def absent(package: str | None) -> str:
+    """That a package is not installed, and the remedy; empty where it is none of ours."""
+    first = (package or "").partition(".")[0]
+    for extra, packages in _EXTRAS.items():
+        if first in packages.split():
+            ros = "source a ROS 2 Jazzy installation, or " * (extra == "ros")
+            what = "pip install " + (f"'.[{extra}]'" if extra else "., or rosdep with its folder rosdep")
+            if _made_by_run():
+                what = "./run setup --all"
+            return f"the Python package {first} is not installed; {ros}in the checkout: {what}"
+    return ""

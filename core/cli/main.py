@@ -24,8 +24,7 @@ from contextlib import suppress
 from typing import Any, NoReturn
 
 from uncertain_lti import __version__
-from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.base.packages import absent
+from uncertain_lti.base.errors import UncertainLTIError, absent
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli import delegated, fit, judge, start, validate
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from uncertain_lti.base.english import plural
@@ -29,12 +29,19 @@ MOST_RULES = 64
 """Rules of one model, at most."""
 CONTAINMENT = "containment"
 """Kind of `AlarmRule`."""
-PER_STATE = ("energy", "mean", "ewma", "cusum")
-"""Kinds of `StatisticRule` that look at the utilisation of each state."""
-JOINT = ("chi2", "mewma")
-"""Kinds of `StatisticRule` that look at the utilisation of all states together."""
-KINDS = (*PER_STATE, *JOINT)
+_WORDS = {
+    "energy": "mean square",
+    "mean": "mean",
+    "ewma": "moving average",
+    "cusum": "cumulative sum",
+    "chi2": "chi-square",
+    "mewma": "joint moving average",
+}
+KINDS = tuple(_WORDS)
 """Kinds of `StatisticRule`."""
+JOINT = ("chi2", "mewma")
+"""Kinds that look at the utilisation of all states together; the others, `PER_STATE`, look at that of each state."""
+PER_STATE = tuple(kind for kind in KINDS if kind not in JOINT)
 FADING = ("ewma", "cusum", "mewma")
 """Kinds that forget little by little; the others forget what is older than the window."""
 
@@ -78,13 +85,7 @@ class AlarmRule:
 
     def to_dict(self) -> dict[str, Any]:
         """The rule as the model file holds it."""
-        return {
-            "kind": self.kind,
-            "horizon": self.horizon,
-            "violations": self.violations,
-            "window": self.window,
-            "margin": self.margin,
-        }
+        return {"kind": self.kind, "horizon": self.horizon, **asdict(self)}
 
 
 @dataclass(frozen=True)
@@ -167,14 +168,7 @@ class StatisticRule:
     def words(self) -> str:
         """The rule in words."""
         over = "" if self.horizon == 1 else f" at {self.horizon} steps"
-        what = {
-            "energy": f"mean square of the utilisation{over}",
-            "mean": f"mean of the utilisation{over}",
-            "ewma": f"moving average of the utilisation{over}",
-            "cusum": f"cumulative sum of the utilisation{over}",
-            "chi2": f"chi-square of the utilisation{over}",
-            "mewma": f"joint moving average of the utilisation{over}",
-        }[self.kind]
+        what = f"{_WORDS[self.kind]} of the utilisation{over}"
         span = f"over {self.window_s:.3g} s" if self.window_s else "of one verdict"
         limits = self.threshold if isinstance(self.threshold, tuple) else (self.threshold,)
         low, high = f"{min(limits):.3g}", f"{max(limits):.3g}"

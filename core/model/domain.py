@@ -26,6 +26,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
+from uncertain_lti.signals.signal_map import SignalMap
 
 
 @dataclass(frozen=True)
@@ -49,6 +50,14 @@ class Sampling:
     min_step: float = 0.0
     max_skew: float | None = None
     step: float | None = None
+
+    @classmethod
+    def of(cls, signals: SignalMap) -> Sampling:
+        """What a signal map says of it."""
+        types = [s.type for s in signals.states if s.topic == signals.clock]
+        given = {name: getattr(signals, name) for name in ("max_gap", "min_step", "max_skew")}
+        step = None if isinstance(signals.step, str) else signals.step
+        return cls(signals.clock or "", types[0] if types else "", dict(signals.time), **given, step=step)
 
     @property
     def step_range(self) -> tuple[float, float]:

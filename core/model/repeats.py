@@ -77,6 +77,11 @@ class Repeats:
         The shapes do not fit one another, or a number is negative or not finite.
     """
 
+    largest_run: Array
+    largest_sum: Array
+    active_beyond: Array
+    noisy_steps: Array
+
     def __init__(
         self,
         longest_repeat_s: ArrayLike,
@@ -89,11 +94,10 @@ class Repeats:
         if self.longest_repeat_s.ndim != 1:
             raise ModelError("field 'frozen.longest_repeat_s' must be a list with one number per state")
         shape = self.longest_repeat_s.shape
-        unknown = np.full(shape, np.inf)
-        self.largest_run = unknown if largest_run is None else checked(largest_run, "frozen.largest_run", shape)
-        self.largest_sum = unknown if largest_sum is None else checked(largest_sum, "frozen.largest_sum", shape)
-        self.active_beyond = unknown if active_beyond is None else checked(active_beyond, "frozen.active_beyond", shape)
-        self.noisy_steps = np.zeros(shape) if noisy_steps is None else checked(noisy_steps, "frozen.noisy_steps", shape)
+        given = zip(_KEYS[1:], (largest_run, largest_sum, active_beyond, noisy_steps), strict=True)
+        for name, values in given:
+            unknown = np.full(shape, 0.0 if name == "noisy_steps" else np.inf)
+            setattr(self, name, unknown if values is None else checked(values, f"frozen.{name}", shape))
         for name in _KEYS:
             array = getattr(self, name)
             array.flags.writeable = False

@@ -46,6 +46,10 @@ from uncertain_lti.model.signature import Signature, checked_signatures
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
+_PARTS = ("schedule", "block_data", "horizons", "run", "signals", "sampling", "domain", "alarm", "residuals", "repeats",
+          "signatures", "fit_summary", "validation")  # fmt: skip
+"""What a model is made of beside its arrays, by the arguments of the constructor."""
+
 
 class UncertainLTI(Envelope):
     r"""dx/dt = (A ± ΔA) x + (B ± ΔB) u + (c ± Δc), measured with noise of at most v.
@@ -162,7 +166,7 @@ class UncertainLTI(Envelope):
         self.block_data = tuple(block_data or (BlockData() for _ in range(lead[0] if lead else 1)))
         if len(self.block_data) != (lead[0] if lead else 1):
             raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(*lead or (1,), 'block')}")
-        self.sampling = sampling or _sampling(signals)
+        self.sampling = sampling or Sampling.of(signals)
         unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
         self.domain = domain or unbounded
         self.residuals = residuals
@@ -437,13 +441,7 @@ class UncertainLTI(Envelope):
         UncertainLTI
             A new model.
         """
-        arguments = {
-            name: getattr(self, name)
-            for name in (
-                *ARRAYS, "schedule", "block_data", "horizons", "run", "signals", "sampling", "domain", "alarm",
-                "residuals", "repeats", "signatures", "fit_summary", "validation",
-            )
-        }  # fmt: skip
+        arguments = {name: getattr(self, name) for name in (*ARRAYS, *_PARTS)}
         if self.repeats is not None and not {*ARRAYS, "schedule"}.isdisjoint(changes):
             arguments["repeats"] = Repeats(self.repeats.longest_repeat_s)  # how far another model moves is not known
         if not {*ARRAYS, "schedule", "horizons"}.isdisjoint(changes):
@@ -535,17 +533,3 @@ class UncertainLTI(Envelope):
         except (ModelError, SignalError) as error:
             text = str(error).removeprefix(source).removeprefix(": ")
             raise ModelError(f"{source}: {' '.join(text.split())}") from None  # names may hold line breaks
-
-
-def _sampling(signals: SignalMap) -> Sampling:
-    """What a signal map says of sampling."""
-    types = [s.type for s in signals.states if s.topic == signals.clock]
-    return Sampling(
-        clock=signals.clock or "",
-        clock_type=types[0] if types else "",
-        time=dict(signals.time),
-        max_gap=signals.max_gap,
-        min_step=signals.min_step,
-        max_skew=signals.max_skew,
-        step=None if isinstance(signals.step, str) else signals.step,
-    )

@@ -30,8 +30,7 @@ from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.plants.turbofan import engine
-from uncertain_lti.plants.turbofan_control import operating_point, trim
-from uncertain_lti.plants.turbofan_runs import DT, LARGE, NOISE, SMALL, make_run, simulate
+from uncertain_lti.plants.turbofan_runs import DT, LARGE, NOISE, SMALL, make_run, operating_point, simulate, trim
 from uncertain_lti.reports.figures import envelope_figure, save, utilisation_figure
 from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.transient import Transient

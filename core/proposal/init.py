@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from uncertain_lti.base.english import meant, shortlist
-from uncertain_lti.base.errors import BagError, TransientError
-from uncertain_lti.base.packages import absent
+from uncertain_lti.base.errors import BagError, TransientError, absent
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.effects import earlier, held

@@ -24,8 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.packages import absent
+from uncertain_lti.base.errors import BagError, absent
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"

@@ -7,19 +7,45 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Values in a YAML file, checked, with errors that name them."""
+"""Values in a YAML file, read without its traps and checked, with errors that name them."""
 
 from __future__ import annotations
 
 import math
 import os
+import re
 import reprlib
-from typing import Any
+from typing import Any, TextIO
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.files import kind_of
-from uncertain_lti.base.plain_yaml import compose, construct
+
+_ODD = re.compile(r"[-+]?0[0-7_]+|.*[:_].*")  # octal, sexagesimal, with underscores
+
+
+def compose(text: str | TextIO) -> Any:
+    """Nodes of a text; aliases are refused, and `010` and `1:30`, 8 and 90 by YAML 1.1, stay the words they are."""
+    import yaml  # the live node reads signals from the model file and needs no YAML
+
+    class Loader(yaml.SafeLoader):
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            if self.check_event(yaml.AliasEvent):
+                mark = self.peek_event().start_mark  # type: ignore[no-untyped-call]
+                raise yaml.composer.ComposerError(None, None, "an alias (*name); write out what it stands for", mark)
+            node: Any = super().compose_node(parent, index)
+            if str(node.tag).endswith((":int", ":float")) and _ODD.fullmatch(node.value):
+                node.tag = "tag:yaml.org,2002:str"
+            return node
+
+    return yaml.compose(text, Loader=Loader)
+
+
+def construct(node: Any) -> Any:
+    """What nodes of `compose` stand for."""
+    import yaml
+
+    return yaml.SafeLoader("").construct_document(node) if node else None
 
 
 def load_yaml(path: str | os.PathLike[str]) -> Any:
