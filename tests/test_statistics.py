@@ -20,7 +20,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.fleet import likelier_alone
 from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, some_beyond
-from uncertain_lti.model.alarm_rule import JOINT, KINDS, PER_STATE, AlarmRule, StatisticRule
+from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
@@ -347,7 +347,6 @@ def test_rules_of_a_monitor_take_the_place_of_the_models() -> None:
 def test_kinds_are_numbered_in_the_order_of_the_rules() -> None:
     for number, name in enumerate(KINDS):
         assert getattr(arithmetic, name.upper()) == number
-    assert (*PER_STATE, *JOINT) == KINDS
 
 
 @pytest.mark.parametrize("relative", [True, False])

@@ -9,7 +9,7 @@
 
 """One-step bounds, Leibov (2006), eqs. (6)-(9).
 
-With phi = [x; u; 1], psi = |phi| and the terms of the model side by side (`model.terms.tables`), for each state
+With phi = [x; u; 1], psi = |phi| and the terms of the model side by side (`Elements.tables`), for each state
 
     centre = x + dt * (Theta phi)
     half   = dt * (Delta psi) + v

@@ -40,8 +40,7 @@ _WORDS = {
 KINDS = tuple(_WORDS)
 """Kinds of `StatisticRule`."""
 JOINT = ("chi2", "mewma")
-"""Kinds that look at the utilisation of all states together; the others, `PER_STATE`, look at that of each state."""
-PER_STATE = tuple(kind for kind in KINDS if kind not in JOINT)
+"""Kinds that look at the utilisation of all states together; the others look at that of each state."""
 FADING = ("ewma", "cusum", "mewma")
 """Kinds that forget little by little; the others forget what is older than the window."""
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any, Literal
 
 import numpy as np
@@ -84,32 +84,6 @@ SHAPES = {name: term for term in TERMS for name in term.names}
 """The term of each array."""
 
 
-def regressors(x: Array, u: Array) -> Array:
-    """phi of the terms that the step multiplies: [x; u; 1].
-
-    `x` (n, ...): normalised states; `u` (m, ...): normalised controls; Returns (n + m + 1, ...): φ; ψ is its absolute
-    value.
-    """
-    one = np.ones((1, *x.shape[1:]))
-    return np.concatenate([{"x": x, "u": u, "1": one}[term.regressor] for term in _RATES])
-
-
-def tables(arrays: dict[str, Array]) -> tuple[Array, Array, Array]:
-    """Nominal elements and half-widths of the rates side by side, and what dt does not multiply.
-
-    Returns (n, n + m + 1): one column for each of `regressors`; Returns (n,): sum of the half-widths of the other
-    terms.
-    """
-
-    def side_by_side(which: str) -> Array:
-        columns = [arrays[getattr(term, which)] for term in _RATES]
-        return np.concatenate([column.reshape(*rows, -1) for column in columns], axis=-1)
-
-    rows = arrays["v"].shape
-    others = [arrays[term.half] for term in TERMS if not term.times_dt]
-    return side_by_side("nominal"), side_by_side("half"), np.sum(others, axis=0) if len(others) > 1 else others[0]
-
-
 class Elements:
     """The arrays of one envelope, read-only; with a schedule of R blocks each has a leading axis of R.
 
@@ -158,8 +132,13 @@ class Elements:
 
     @cached_property
     def tables(self) -> tuple[Array, Array, Array]:
-        """Nominal elements and half-widths side by side, and what dt does not multiply (`tables`)."""
-        return tables(self.arrays)
+        """Nominal elements and half-widths (n, n + m + 1) on [x; u; 1], and what dt does not multiply (n,)."""
+        rows = self.v.shape
+        nominal, half = (
+            np.concatenate([getattr(self, name).reshape(*rows, -1) for name in names], axis=-1)
+            for names in ([term.nominal for term in _RATES], [term.half for term in _RATES])
+        )
+        return nominal, half, reduce(np.add, [getattr(self, term.half) for term in TERMS if not term.times_dt])
 
     def fits(self, other: Elements, name: str) -> None:
         """Refuse the elements of another envelope, called so, if it has other states, controls or blocks."""
