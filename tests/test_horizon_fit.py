@@ -198,8 +198,7 @@ def test_weights_are_those_of_the_arrival() -> None:
 
     def width_at(one: UncertainLTI, arrival: int) -> float:
         (windows,) = one.windows(np.arange(59), z, transient.dt, [5])
-        centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
-        one.horizons[0].columns_centre_and_half(windows.z, windows.time, centre, half, windows.run)
+        _, half = one.horizons[0].centre_and_half_at(windows.z, windows.time, windows.run)
         return float(half[0, list(windows.last).index(arrival - 1)])
 
     assert width_at(model, 41) < width_at(plain, 41)

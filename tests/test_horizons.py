@@ -310,7 +310,7 @@ def expected_ahead(model: UncertainLTI, step: Step) -> tuple[bytes, bytes] | Non
     point, count = model.operating_point, model.steps[-1]
     z = normalised(np.array([*step.after, *step.before[model.n :]]), point.steady, point.scale)
     z = np.repeat(z[:, None], count, axis=1)
-    if not np.isfinite(z).all() or not model.regime(z)[0].all():
+    if not np.isfinite(z).all() or (model.main_block(z) < 0).any():
         return None
     *_, (_, centre, half) = model.envelopes(np.arange(count), z, np.full(count, 0.01))
     lower, upper = (point.recorded_x(bound) for bound in edges(centre[:, 0], half[:, 0], 1.5))

@@ -519,8 +519,7 @@ def judged_sample(seed):
     model = UncertainLTI(A[:, :n], A[:, n:], D[:, :n], D[:, n:], c=c, dc=np.abs(dc), v=np.abs(v))
     z = rng.normal(size=(n + m, N)) * rng.choice([1e-6, 1.0, 1e6], size=(n + m, 1))
     dt = np.full(N, 0.01) if seed % 2 else rng.uniform(0.005, 0.02, N)
-    centre, half = np.empty((2, n, N))
-    model.columns_centre_and_half(z, dt, centre, half)
+    centre, half = model.columns_centre_and_half(z, dt)
     x_next = centre + half * rng.uniform(-1, 1, centre.shape)
     edge = rng.integers(0, N, 20)
     x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
@@ -545,8 +544,7 @@ def scheduled_sample(seed):
     if seed % 4 > 1:
         z[n] = rng.choice([0.0, 2.0], size=N)
     dt = np.full(N, 0.01) if seed % 3 else rng.uniform(0.005, 0.02, N)
-    centre, half = np.empty((2, n, N))
-    model.columns_centre_and_half(z, dt, centre, half)
+    centre, half = model.columns_centre_and_half(z, dt)
     x_next = centre + half * rng.uniform(-1, 1, centre.shape)
     edge = rng.integers(0, N, 20)
     x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
@@ -561,8 +559,7 @@ def scheduled_sample(seed):
 
 def by_bounds(model, problem):
     """Transitions outside, the largest width and the largest √w x width of each state, by the model's own bounds."""
-    centre, half = np.empty((2, problem.n, problem.N))
-    model.columns_centre_and_half(problem.z_columns, problem.dt, centre, half)
+    centre, half = model.columns_centre_and_half(problem.z_columns, problem.dt)
     inside = (centre - half <= problem.next_columns) & (problem.next_columns <= centre + half)
     weighted = 2 * half * np.sqrt(problem.row_weights().T)
     return (~inside).sum(axis=1), 2 * half.max(axis=1), weighted.max(axis=1)

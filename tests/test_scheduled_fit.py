@@ -293,8 +293,7 @@ def test_recorded_knots_are_those_of_the_units():
 
 def outside_normalised(model, transient):
     steps = transient.transitions()
-    centre, half = np.empty((2, model.n, len(steps.dt)))
-    model.columns_centre_and_half(model.normalised_columns(steps), steps.dt, centre, half)
+    centre, half = model.columns_centre_and_half(model.normalised_columns(steps), steps.dt)
     x_next = model.operating_point.normalise_x(steps.x_next).T
     return int((~((centre - half <= x_next) & (x_next <= centre + half))).any(axis=0).sum())
 
@@ -362,8 +361,7 @@ def test_facts_of_each_block():
     transient = drawn(THREE, 500, 9, noise=1e-3, jitter=0.0)
     model = fit(transient, additive="both", schedule=THREE)
     problem = written(transient, THREE, "both")
-    centre, half = np.empty((2, 2, problem.N))
-    model.columns_centre_and_half(problem.z_columns, problem.dt, centre, half)
+    centre, half = model.columns_centre_and_half(problem.z_columns, problem.dt)
     largest = THREE.weights(problem.z_columns[[2]]).argmax(axis=0)
     for r, facts in enumerate(model.fit_summary["blocks"]):
         assert facts["transitions"] == np.count_nonzero(largest == r) == model.block_data[r].transitions

@@ -172,12 +172,9 @@ class Domain:
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         z = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (x, u)], axis=-1)
-        return self.outside_columns(z.reshape(-1, z.shape[-1]).T).reshape(lead)
-
-    def outside_columns(self, z: Array) -> NDArray[np.bool_]:
-        """As `outside`, of columns z (n + m, K)."""
         occupied = None if self.measure is None else self.measure.occupied
-        return np.asarray(outside_domain(z, self.least, self.greatest, occupied))
+        columns = z.reshape(-1, z.shape[-1]).T
+        return np.asarray(outside_domain(columns, self.least, self.greatest, occupied)).reshape(lead)
 
 
 def largest_steps(model: Any, found: Iterable[Any]) -> Array:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended, centre_and_half
+from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbroken_over, windows_of
@@ -71,20 +71,12 @@ class Envelope(Elements):
             raise ModelError(f"alarm: {kind} needs the covariance of the utilisation{over}; fit the model again")
         return found
 
-    def columns_centre_and_half(
-        self, z: Array, dt: Array, centre: Array, half: Array, base: Array | None = None
-    ) -> None:
-        """Centre and half-width (n, K) of the bounds, into given arrays.
-
-        `z` (n + m + q, K): normalised [x; u; s]; `dt` (K,): s; `base` (n, K): what the rates are added to; default the
-        states.
-        """
+    def columns_centre_and_half(self, z: Array, dt: Array) -> tuple[Array, Array]:
+        """Centre and half-width (n, K) of the bounds at normalised [x; u; s] = z (n + m + q, K); `dt` (K,): s."""
         z, rows = np.asarray(z, dtype=np.float64), self.n + self.m
         if self.schedule is None:
-            centre_and_half(self.tables, z[:rows], dt, centre, half, base=base)
-        else:
-            blocks, s = self.schedule.table, z[self._positions]
-            centre_and_half(self.tables, z[:rows], dt, centre, half, blocks, s, base)
+            return self.centre_and_half_at(z[:rows], dt)
+        return self.centre_and_half_at(z[:rows], dt, None, self.schedule.table, z[self._positions])
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """Normalised [x; u; s] (n + m + q, K) of K transitions in recorded units."""
@@ -96,18 +88,14 @@ class Envelope(Elements):
         normalise_columns(run.s[:-1], steps.k, point.s_s, point.S, of_s)
         return z
 
-    def regime(self, z: Array) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Of samples z (n + m + q, K) whether every mode is listed, and whether the regime is unknown.
-
-        It is where a scheduling signal lies beyond its end knots, or no recording visited a block that holds.
-        """
-        count = z.shape[1]
+    def unknown(self, z: Array) -> NDArray[np.bool_]:
+        """Where the regime of samples z (n + m + q, K) is unknown: beyond end knots, or where no recording was."""
         if self.schedule is None:
-            return np.ones(count, dtype=bool), np.zeros(count, dtype=bool)
+            return np.zeros(z.shape[1], dtype=bool)
         s = z[self._positions]
         places, weights = self.schedule.corners(s)
         known = np.array([data.known for data in self.block_data])
-        return places[0] >= 0, self.schedule.unknown(s, places, weights, known)
+        return np.asarray(self.schedule.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0))
 
     @property
     def scheduling_positions(self) -> tuple[int, ...]:
@@ -220,8 +208,7 @@ class Envelope(Elements):
 
     def envelopes(self, k: NDArray[np.intp], z: Array, dt: Array) -> Iterator[tuple[Windows, Array, Array]]:
         """Windows of each horizon, with centre and half-width (n, K) of its envelope; arguments as of `windows`."""
-        windows_of_each = self.windows(k, z, dt, self.steps)
+        windows_of_each, rows = self.windows(k, z, dt, self.steps), self.n + self.m
         for horizon, windows in zip(self.horizons, windows_of_each, strict=True):
-            centre, half = np.empty(windows.run.shape), np.empty(windows.run.shape)
-            horizon.columns_centre_and_half(windows.z, windows.time, centre, half, windows.run, self.schedule)
-            yield windows, centre, half
+            blocks, s = (None, None) if self.schedule is None else (self.schedule.table, windows.z[rows:])
+            yield windows, *horizon.centre_and_half_at(windows.z[:rows], windows.time, windows.run, blocks, s)

@@ -32,7 +32,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import Judge, centre_and_half
+from uncertain_lti.kernel.arithmetic import Judge
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import Elements, blocks_of, checked, object_of
 
@@ -248,18 +248,6 @@ class Horizon(Elements):
     def with_residuals(self, residuals: Residuals | None) -> Horizon:
         """The same envelope with other residuals."""
         return Horizon(self.steps, **self.arrays, widths=self.widths, residuals=residuals)
-
-    def columns_centre_and_half(
-        self, z: Array, time: Array, centre: Array, half: Array, base: Array, schedule: Schedule | None = None
-    ) -> None:
-        """Centre and half-width of the envelope at the end of windows, into given arrays.
-
-        `z` (n + m + axes, K): state at the begin, mean control and scheduling vector at the begin, normalised; `time`
-        (K,): T, s; `centre, half` (n, K): take the result, normalised; `base` (n, K): x̂, normalised.
-        """
-        p = self.n + self.m
-        blocks, s = (None, None) if schedule is None else (schedule.table, z[p:])
-        centre_and_half(self.tables, z[:p], time, centre, half, blocks, s, base)
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file."""

@@ -220,7 +220,7 @@ def walk(
     follows = np.concatenate([[False], np.diff(steps.k) == 1])[: len(steps.k)]
     rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
     z = model.normalised_columns(steps.take(rows))
-    outside = model.domain.beyond(z) | model.regime(z)[1]
+    outside = model.domain.beyond(z) | model.unknown(z)
     given = steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[rows], upper[rows], model.own_rates(z).T, outside
     on = np.append(False, np.diff(steps.k[rows]) == 1) if len(rows) else rows
     at = steps.k[rows]
@@ -252,9 +252,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
     some, largest = changes(transient.x, steps.k)
     steps = steps.take(some)
     with np.errstate(over="ignore", invalid="ignore"):
-        z = model.normalised_columns(steps)
-        centre, half = np.empty((model.n, len(steps.k))), np.empty((model.n, len(steps.k)))
-        model.columns_centre_and_half(z, steps.dt, centre, half)
+        centre, half = model.columns_centre_and_half(model.normalised_columns(steps), steps.dt)
         lower, upper = (point.recorded_x(bound.T) for bound in edges(centre, half, 1.0))
     follow = Repeating(model.n)
     for _, follows, step in walk(model, transient.t_ns, steps, lower, upper):
@@ -291,9 +289,8 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
     for a in begin:
         part, at = steps.take(slice(a, a + length)), t[a : a + length]
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            centre, half = np.empty((model.n, len(at))), np.empty((model.n, len(at)))
             z = model.normalised_columns(part)
-            model.columns_centre_and_half(z, part.dt, centre, half)
+            centre, half = model.columns_centre_and_half(z, part.dt)
             own = model.own_rates(z).T * part.x  # does not change in a repeat, and must not count here
             movement = model.operating_point.recorded_x(centre.T) - part.x
             rate = movement / part.dt[:, None] - own

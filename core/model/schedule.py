@@ -188,16 +188,6 @@ class Schedule:
         found: NDArray[np.intp] = np.take_along_axis(places, np.argmax(weights, axis=0)[None], axis=0)[0]
         return found
 
-    def unknown(
-        self, s: ArrayLike, places: NDArray[np.intp], weights: Array, known: NDArray[np.bool_]
-    ) -> NDArray[np.bool_]:
-        """Whether the regime is unknown (K,): s lies beyond its end knots, or no recording visited a block that holds.
-
-        `s` (axes, K): normalised; `places, weights` (C, K): of `corners`; `known` (blocks,): that a recording visited.
-        """
-        unknown: NDArray[np.bool_] = self.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0)
-        return unknown
-
     def beyond(self, s: ArrayLike) -> NDArray[np.bool_]:
         """Whether normalised s (axes, K) lies beyond the end knots of some axis; False for modes and for NaN."""
         s = np.asarray(s, dtype=np.float64)

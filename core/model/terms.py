@@ -32,6 +32,7 @@ from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.kernel.arithmetic import Blocks, centre_and_half
 
 
 @dataclass(frozen=True)
@@ -139,6 +140,18 @@ class Elements:
             for names in ([term.nominal for term in _RATES], [term.half for term in _RATES])
         )
         return nominal, half, reduce(np.add, [getattr(self, term.half) for term in TERMS if not term.times_dt])
+
+    def centre_and_half_at(
+        self, z: Array, dt: Array, base: Array | None = None, blocks: Blocks | None = None, s: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Centre and half-width (n, K) of the envelope at normalised [x; u] = z (n + m, K).
+
+        `dt` (K,): s; `base` (n, K): what the rates are added to, default the states; `blocks`, `s` (axes, K): of a
+        schedule, and where it is.
+        """
+        centre, half = np.empty((self.n, len(dt))), np.empty((self.n, len(dt)))
+        centre_and_half(self.tables, z, dt, centre, half, blocks, s, base)
+        return centre, half
 
     def fits(self, other: Elements, name: str) -> None:
         """Refuse the elements of another envelope, called so, if it has other states, controls or blocks."""

@@ -352,8 +352,7 @@ class UncertainLTI(Envelope):
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], s.shape[:-1], dt.shape)
         count = math.prod(lead)  # not -1: that says nothing where there are no controls
         flat = [np.broadcast_to(a, (*lead, a.shape[-1])).reshape(count, a.shape[-1]).T for a in (x, u, s)]
-        centre, half = np.empty((self.n, count)), np.empty((self.n, count))
-        self.columns_centre_and_half(np.vstack(flat), np.broadcast_to(dt, lead).reshape(count), centre, half)
+        centre, half = self.columns_centre_and_half(np.vstack(flat), np.broadcast_to(dt, lead).reshape(count))
         return centre.T.reshape(*lead, self.n), half.T.reshape(*lead, self.n)
 
     def bounds(
