@@ -76,14 +76,8 @@ class Progress:
 
     def say(self, text: str) -> None:
         """Part of the result, on standard output, unless quiet; a bar stays below it."""
-        if self.quiet:
-            return
-        if any(not bar.disable for bar in self._bars):
-            from tqdm import tqdm
-
-            tqdm.write(_coloured(_lines(text)), file=sys.stdout)
-        else:
-            print(_coloured(_lines(text)))
+        if not self.quiet and sys.stdout is not None:
+            self._print(_coloured("\n".join(printable(line, _LONGEST_LINE) for line in text.split("\n"))), sys.stdout)
 
     def detail(self, text: str) -> None:
         """A line for who asked to see the work."""
@@ -146,7 +140,7 @@ class Progress:
         from tqdm import tqdm
 
         columns, lines = self._size()
-        bar = tqdm(file=self._stream, leave=False, ncols=columns, nrows=lines, disable=not self.shown, **options)
+        bar = tqdm(file=self._stream, leave=False, ncols=columns, nrows=lines, **options)
         self._bars.append(bar)
         try:
             yield bar
@@ -165,12 +159,16 @@ class Progress:
 
     def write(self, text: str) -> None:
         """A line on the stream, above the bars."""
-        if any(not bar.disable for bar in self._bars):
+        self._print(text, self._stream)
+        self._stream.flush()
+
+    def _print(self, text: str, stream: TextIO) -> None:
+        if self._bars:
             from tqdm import tqdm
 
-            tqdm.write(text, file=self._stream)
+            tqdm.write(text, file=stream)
         else:
-            print(text, file=self._stream, flush=True)
+            print(text, file=stream)
 
 
 class _Log:
@@ -195,10 +193,6 @@ class _Log:
 def _coloured(text: str) -> str:
     """Lines of an alarm in red, on a terminal that has colours and whose user has not refused them (no-color.org)."""
     refused = os.environ.get("NO_COLOR") or os.environ.get("TERM", "dumb") == "dumb"
-    if refused or sys.stdout is None or not sys.stdout.isatty():
+    if refused or not sys.stdout.isatty():
         return text
     return "\n".join(f"\x1b[1;31m{line}\x1b[0m" if line.startswith("ALARM") else line for line in text.split("\n"))
-
-
-def _lines(text: str) -> str:
-    return "\n".join(printable(line, _LONGEST_LINE) for line in text.split("\n"))
