@@ -63,10 +63,7 @@ def stamped(model: UncertainLTI) -> UncertainLTI:
     time_of = {topic: "header" for topic in signals.topics}
     controls = tuple(replace(s, max_hold=0.5) if s.topic == CONTROL else s for s in signals.controls)
     gear = tuple(replace(s, field="vector.x", type=VECTOR, max_hold=5.0) for s in signals.scheduling)
-    return model.replace(
-        signals=replace(signals, controls=controls, scheduling=gear, time=time_of),
-        sampling=replace(model.sampling, time=time_of),
-    )
+    return model.replace(signals=replace(signals, controls=controls, scheduling=gear, time=time_of))
 
 
 def stamp_of(data: bytes) -> int:

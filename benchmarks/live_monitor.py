@@ -78,7 +78,7 @@ def save_model(path: Path, n: int, rate: float, armed: bool = False) -> None:
         max_gap=100 * dt,
         time={STATE: "header", CONTROL: "header"},
     )
-    sampling = Sampling(STATE, TYPE, dict(signals.time), dt_median=dt, max_gap=100 * dt)
+    sampling = Sampling(dt)
     rng = np.random.default_rng(1)
     matrices = rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.full((n, n), 0.1), np.full((n, m), 0.1)
     if armed:

@@ -136,10 +136,7 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
         horizons=horizons,
         run=Run(*(run[name] for name in ("A", "B", "c"))) if horizons and may(0.3) else None,
         signals=signals,
-        sampling=Sampling(
-            STATE, JOINT_STATE, time, dt_median=STEP_NS * 1e-9, dt_min=0.8 * STEP_NS * 1e-9, dt_max=STEP_NS * 1e-9,
-            max_gap=signals.max_gap, min_step=signals.min_step, step=step,
-        ),
+        sampling=Sampling(STEP_NS * 1e-9, 0.8 * STEP_NS * 1e-9, STEP_NS * 1e-9),
         domain=Domain(
             *(sign * rng.uniform(0.3, 1.2, k) for k in (n, m) for sign in (-1.0, 1.0)),
             Occupancy(4, rng.random((pairs, 4, 4)) < 0.9) if may(0.5) else None,

@@ -167,7 +167,7 @@ def test_shipped_recordings(name, tmp_path):
     found = same_verdicts(model, verdicts, copy)
     # decided by the state message itself, at whose log time it is told
     with AnyReader([source]) as reader:
-        states = [c for c in reader.connections if c.topic == model.sampling.clock]
+        states = [c for c in reader.connections if c.topic == model.signals.clock]
         arrivals = [time for _, time, _ in reader.messages(states)]
     assert [time for time, _ in found["flags"]] == arrivals
 

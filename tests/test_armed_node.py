@@ -165,7 +165,7 @@ def test_everything_armed_stays_offline_through_a_swap_a_kill_and_a_change_of_qo
         came = list(flags)[first - 1 :]
         assert len(came) > 45
         x, u = np.array([sent[t] for t in came]), np.zeros((len(came), 2))
-        max_gap = model.sampling.max_gap
+        max_gap = model.signals.max_gap
         verdicts = EnvelopeMonitor(model).check(Transient(np.array(came), x, u, signals=model.signals, max_gap=max_gap))
         for k, t_ns in enumerate(came):
             np.testing.assert_array_equal(flags[t_ns].position, verdicts.flags[k])

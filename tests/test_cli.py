@@ -68,7 +68,7 @@ def test_fit_says_what_it_used(folder, capsys):
     (source,) = model.fit_summary["sources"]
     assert source["file"].endswith("run.mcap") and len(source["sha256"]) == 64
     assert model.fit_summary["transitions"] == 299 and model.fit_summary["violations"] == 0
-    assert model.sampling.clock == STATE_TOPIC and model.signals.states[0].type == "sensor_msgs/msg/JointState"
+    assert model.signals.clock == STATE_TOPIC and model.signals.states[0].type == "sensor_msgs/msg/JointState"
 
 
 def test_check_tells_when_and_how_long(folder, capsys):

@@ -175,7 +175,7 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
         **{name: getattr(one, name) for name in ARRAYS},
         schedule=schedule,
         signals=signals,
-        sampling=Sampling("/c", time={"/c": "header"}, max_gap=0.05, dt_min=0.01, dt_max=0.015),
+        sampling=Sampling(dt_min=0.01, dt_max=0.015),
         horizons=[horizon(rng, h, blocks, n, m) for h in lengths],
         run=draw(st.sampled_from([None, Run(*(getattr(horizon(rng, 2, blocks, n, m), name) for name in "ABc"))])),
     )

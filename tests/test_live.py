@@ -91,21 +91,14 @@ def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) 
     n, m = len(signals.states), len(signals.controls)
     rng = np.random.default_rng(7)
     clock = signals.states[0].topic
-    sampling = Sampling(
-        clock=clock,
-        clock_type=signals.states[0].type,
-        time=dict.fromkeys(signals.topics, time),
-        dt_median=STEP_NS * 1e-9,
-        max_gap=2.5 * STEP_NS * 1e-9,
-    )
     model = UncertainLTI(
         rng.normal(size=(n, n)) - 2.0 * np.eye(n),
         rng.normal(size=(n, m)),
         rng.uniform(0.1, 0.6, (n, n)),
         rng.uniform(0.1, 0.6, (n, m)),
         v=np.full(n, 1e-4),
-        signals=replace(signals, clock=clock, max_gap=sampling.max_gap, time=dict(sampling.time)),
-        sampling=sampling,
+        signals=replace(signals, clock=clock, max_gap=2.5 * STEP_NS * 1e-9, time=dict.fromkeys(signals.topics, time)),
+        sampling=Sampling(STEP_NS * 1e-9),
         **options,
     )
     return model
@@ -348,7 +341,7 @@ def scheduled_by_hand() -> UncertainLTI:
         schedule=schedule,
         block_data=[BlockData(r) for r in range(schedule.blocks)],
         signals=signals,
-        sampling=replace(one.sampling, time=dict(signals.time)),
+        sampling=one.sampling,
         alarm_rule=one.alarm_rule,
     )
 
@@ -420,16 +413,10 @@ def test_a_real_recording_gives_live_what_it_gives_offline(world: World, tmp_pat
         (Signal("command", topics[1], "position[j2]", type=JOINT_STATE, max_hold=0.05),),
     )
     step = 0.002
-    sampling = Sampling(
-        clock=topics[0],
-        clock_type=JOINT_STATE,
-        time=dict.fromkeys(topics, "header"),
-        dt_median=step,
-        max_gap=2.5 * step,
-    )
+    signals = replace(signals, clock=topics[0], time=dict.fromkeys(topics, "header"), max_gap=2.5 * step)
     model = UncertainLTI(
         [[0.0, 1.0], [-200.0, -10.0]], [[0.0], [200.0]], [[0.0, 0.5], [50.0, 5.0]], [[0.0], [50.0]], v=[1e-3, 0.1],
-        signals=signals, sampling=sampling,
+        signals=signals, sampling=Sampling(step),
     )  # fmt: skip
     path = saved(model, tmp_path)
     verdicts = offline(path, bag)

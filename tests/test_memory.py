@@ -167,7 +167,9 @@ def test_a_model_that_remembers_has_a_newer_format_and_an_older_one_may_not_say_
 def test_a_check_takes_the_step_of_the_model() -> None:
     t = np.array([0.0, 0.1, 0.25, 0.3])
     model = remembering({"A": [[1.0]], "B": np.zeros((1, 0))}, SignalMap((Signal("x", "", "x"),)))
-    model = model.replace(sampling=Sampling(dt_median=0.1, step=0.1), v=np.array([0.5]))
+    model = model.replace(
+        sampling=Sampling(0.1), signals=SignalMap((Signal("x", "", "x"),), step=0.1), v=np.array([0.5])
+    )
     verdicts = EnvelopeMonitor(model).check(Transient(t, np.ones((4, 1)), np.empty((4, 0)), max_gap=1.0))
     assert verdicts.upper[1:, 0].tolist() == [1.6] * 3
 

@@ -354,16 +354,13 @@ def models(draw: st.DrawFn) -> UncertainLTI:
         step=draw(st.sampled_from(["recorded", 0.002])),
         time={"/x": "header"} | ({"/u": "log"} if m > len(memories) else {}),
     )
-    step = None if signals.step == "recorded" else signals.step
-    limits = signals.max_gap, signals.min_step, signals.max_skew, step
-    sampling = Sampling("/x", "pkg/msg/Type", signals.time, 0.1, 0.05, 0.2, *limits)
     box = [draw(hnp.arrays(float, k, elements=number)) for k in (n, n, m, m)]
     if draw(st.booleans()):
         box[0][0] = -INF
     return model.replace(
         A=draw(hnp.arrays(float, (n, n), elements=number)),
         signals=signals,
-        sampling=sampling,
+        sampling=Sampling(0.1, 0.05, 0.2),
         domain=draw(st.sampled_from([Domain(*box), None])),
         alarm_rule=AlarmRule(2, draw(st.integers(2, 9)), draw(positive)),
         fit_summary={"criterion": "qp", "numbers": [1, 2.5, None], "inner": {"a": "ä"}},
@@ -469,7 +466,7 @@ def write(folder: Path, data: Any) -> Path:
 
 def test_the_base_of_the_damaged_files_is_whole(tmp_path: Path) -> None:
     model = UncertainLTI.load(write(tmp_path, base()))
-    assert (model.n, model.m, model.alarm_rule.window, model.sampling.max_skew) == (2, 1, 3, 0.1)
+    assert (model.n, model.m, model.alarm_rule.window, model.signals.max_skew) == (2, 1, 3, 0.1)
     assert model.to_dict() == base()
 
 

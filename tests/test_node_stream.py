@@ -201,7 +201,7 @@ def saved(
         block_data=schedule and [BlockData(int(r != 1)) for r in range(schedule.blocks)],
         domain=Domain(np.full(n, -0.2), np.full(n, 0.2), np.full(m, -0.2), np.full(m, np.inf)),
         signals=signals,
-        sampling=Sampling(STATE, VECTOR, dict(signals.time), dt_median=0.01, max_gap=0.055),
+        sampling=Sampling(0.01),
         alarm_rule=AlarmRule(3, 20, margin),
     )
     model.save(path)
@@ -356,7 +356,7 @@ def test_the_shortest_messages_are_taken(ros: None, tmp_path: Path) -> None:
         (Signal("x0", STATE, "position[x0]", type=VECTOR),), (level,), clock=STATE, max_gap=0.055,
         time={STATE: "header", SETPOINT: "log"},
     )  # fmt: skip
-    sampling = Sampling(STATE, VECTOR, dict(signals.time), dt_median=0.01, max_gap=0.055)
+    sampling = Sampling(0.01)
     UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[1.0], signals=signals, sampling=sampling).save(
         tmp_path / "model.json"
     )

@@ -70,7 +70,7 @@ def plain(seed: int = 2) -> UncertainLTI:
     none = np.zeros((n, n))
     return UncertainLTI(
         -0.5 * np.eye(n), none, np.full((n, n), 0.1), none, v=np.full(n, 0.05), alarm_rule=AlarmRule(1, 1),
-        signals=kept, sampling=replace(model.sampling, time=time, step=None),
+        signals=kept, sampling=model.sampling,
         horizons=[Horizon(3, none, none, none, none, v=np.full(n, 0.1))],
     )  # fmt: skip
 

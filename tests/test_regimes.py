@@ -81,9 +81,7 @@ def model_of(case: str, **changes: Any) -> UncertainLTI:
     return model.replace(
         **small,
         signals=signals,
-        sampling=Sampling(
-            signals.clock or "", "sensor_msgs/msg/JointState", signals.time, 0.05, 0.05, 0.05, 0.2, 0.0, 0.2
-        ),
+        sampling=Sampling(0.05, 0.05, 0.05),
         block_data=[BlockData(100 * r, 1 if r in (0, R - 1) else None) for r in range(R)],
         fit_summary=facts,
         **changes,

@@ -59,8 +59,7 @@ def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp
         clock=topics[str(model.signals.clock)],
         time={topics[t]: source for t, source in model.signals.time.items()},
     )
-    sampling = replace(model.sampling, clock=signals.clock, time=dict(signals.time))
-    model = type(model)(model.A, model.B, model.dA, model.dB, signals=signals, sampling=sampling)
+    model = type(model)(model.A, model.B, model.dA, model.dB, signals=signals, sampling=model.sampling)
     world.monitor(saved(model, tmp_path), use_sim_time=simulated)
     node = world.node
 

@@ -381,7 +381,7 @@ def _jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> l
     ratio = (left[0] / np.maximum(left[1], 1e-300))[moving]
     if ratio.max() < JITTER or ratio.min() < 1 / 1.05:
         return []
-    clock = model.sampling.clock
+    clock = model.signals.clock or ""
     return [
         f"the stamps jitter: steps range from {dt.min() * 1e3:.3g} to {dt.max() * 1e3:.3g} ms around "
         f"{usual * 1e3:.3g} ms, and a constant step leaves {1 - 1 / ratio.max():.0%} less of "

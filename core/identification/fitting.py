@@ -427,24 +427,12 @@ def _model(
     arrays |= {term.half: half[:, k] for k, term in enumerate(columns.half, start=p)}
     if columns.regimes is None:
         arrays = {name: values[0] for name, values in arrays.items()}
-    clock_types = [s.type for s in signals.states if s.topic == signals.clock]
     return UncertainLTI(
         **arrays,
         schedule=None if columns.regimes is None else columns.regimes.schedule,
         block_data=None if columns.regimes is None else block_data(sums, tied),
         signals=signals,
-        sampling=Sampling(
-            clock=signals.clock or "",
-            clock_type=clock_types[0] if clock_types else "",
-            time=dict(signals.time),
-            dt_median=dt_median,
-            dt_min=sums.dt_min,
-            dt_max=sums.dt_max,
-            max_gap=signals.max_gap,
-            min_step=signals.min_step,
-            max_skew=signals.max_skew,
-            step=None if isinstance(signals.step, str) else signals.step,
-        ),
+        sampling=Sampling(dt_median, sums.dt_min, sums.dt_max),
         domain=domain,
         alarm_rule=alarm_rule,
     )

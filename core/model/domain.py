@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 import reprlib
 from base64 import b64decode, b64encode
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -26,38 +26,15 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
-from uncertain_lti.signals.signal_map import SignalMap
 
 
 @dataclass(frozen=True)
 class Sampling:
-    """How samples were cut when the model was fitted, and what the steps were.
+    """Median, shortest and longest step of the recordings that a model was fitted to, s; None where none was."""
 
-    `clock`: topic whose messages define the sample instants; empty for arrays; `clock_type`: its message type; `time`:
-    per topic, what its instant is; `dt_median`: median step, s; None where nothing was fitted; `dt_min`: shortest step,
-    s; likewise; `dt_max`: longest step, s; likewise; `max_gap`: longest step that is a transition, s; None for no
-    limit; `min_step`: shortest step, s; a message sooner than that is dropped; `max_skew`: greatest age of a state from
-    another topic than the clock, s; None for `max_gap`; `step`: Δt of every transition, s; None for that of the stamps.
-    """
-
-    clock: str = ""
-    clock_type: str = ""
-    time: Mapping[str, str] = field(default_factory=dict)
     dt_median: float | None = None
     dt_min: float | None = None
     dt_max: float | None = None
-    max_gap: float | None = None
-    min_step: float = 0.0
-    max_skew: float | None = None
-    step: float | None = None
-
-    @classmethod
-    def of(cls, signals: SignalMap) -> Sampling:
-        """What a signal map says of it."""
-        types = [s.type for s in signals.states if s.topic == signals.clock]
-        given = {name: getattr(signals, name) for name in ("max_gap", "min_step", "max_skew")}
-        step = None if isinstance(signals.step, str) else signals.step
-        return cls(signals.clock or "", types[0] if types else "", dict(signals.time), **given, step=step)
 
     @property
     def step_range(self) -> tuple[float, float]:

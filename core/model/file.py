@@ -16,7 +16,7 @@ import math
 import os
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,8 @@ _IN_EVERY_FILE = ("A", "B", "dA", "dB", "c", "dc", "v")  # the arrays of format 
 _STATE = ("name", "topic", "type", "field", "unit", "steady", "scale")
 _SCHEDULING = (*_STATE, "max_hold")
 _CONTROL = (*_SCHEDULING, "delay")
+_STEPS = ("dt_median", "dt_min", "dt_max")
+_SAMPLING = {"clock", "clock_type", "time", *_STEPS, "max_gap", "min_step", "max_skew"}
 _NEWER = {"schedule", "scheduling", "blocks", "horizons", "run", "residuals", "frozen", "signatures"}
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
@@ -60,13 +62,21 @@ def structure(model: Any) -> dict[str, Any]:
             "scheduling": [_signal(s, _SCHEDULING) for s in signals.scheduling] or None,
             "blocks": [b | {"transitions": f.transitions, "tied_to": f.tied_to} for b, f in each],
         }
-    steps = {f.name: getattr(sampling, f.name) for f in fields(Sampling)} | {"time": dict(sampling.time)}
+    said = {
+        "clock": signals.clock or "",
+        "clock_type": next((s.type for s in signals.states if s.topic == signals.clock), ""),
+        "time": dict(signals.time),
+        **asdict(sampling),
+        **{name: getattr(signals, name) for name in ("max_gap", "min_step", "max_skew")},
+        "step": None if isinstance(signals.step, str) else signals.step,
+        "table": _dict(signals.table),
+    }
     box = {name: getattr(domain, name).tolist() for name in ("x_min", "x_max", "u_min", "u_max")}
     whole = {
         "format": FORMATS[0],
         "states": [_signal(s, _STATE) for s in signals.states],
         "controls": [_signal(s, _CONTROL) for s in signals.controls],
-        "sampling": _known(steps | {"table": _dict(signals.table)}, ("step", "table")),
+        "sampling": _known(said, ("step", "table")),
         **regimes,
         "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
         "run": _dict(model.run),
@@ -129,34 +139,22 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
     regimes = {"schedule", "scheduling", "blocks"}
     known |= (regimes if scheduled else set(ARRAYS)) | (_NEWER - regimes if newer else set())
     object_of(data, "", known, needed=("states", "controls", "sampling", *(("blocks",) if scheduled else REQUIRED)))
-    own = {f.name for f in fields(Sampling)}
-    said = object_of(data["sampling"], "sampling", own | {"table"} if newer else own - {"step"})
-    sampling = Sampling(
-        clock=_text(said.get("clock", ""), "sampling.clock"),
-        clock_type=_text(said.get("clock_type", ""), "sampling.clock_type"),
-        time={
-            _text(k, "sampling.time"): _text(v, f"sampling.time[{k}]")
-            for k, v in object_of(said.get("time", {}), "sampling.time").items()
-        },
-        min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
-        **{
-            key: _positive(said.get(key), f"sampling.{key}")
-            for key in ("dt_median", "dt_min", "dt_max", "max_gap", "max_skew", "step")
-        },
-    )
-    for topic, kind in sampling.time.items():
-        if kind not in ("header", "log"):
+    said = object_of(data["sampling"], "sampling", {*_SAMPLING, "step", "table"} if newer else _SAMPLING)
+    steps = {key: _positive(said.get(key), f"sampling.{key}") for key in (*_STEPS, "max_gap", "max_skew", "step")}
+    _text(said.get("clock_type", ""), "sampling.clock_type")
+    time = object_of(said.get("time", {}), "sampling.time")
+    for topic, kind in time.items():
+        if _text(kind, f"sampling.time[{topic}]") not in ("header", "log"):
             raise ModelError(f"sampling.time[{topic}] is {reprlib.repr(kind)}; it must be header or log")
+    listed = {key: data.get(key) for key in ("states", "controls", "scheduling")}
     signals = replace(
-        SignalMap.from_dict(
-            {key: data.get(key) for key in ("states", "controls", "scheduling")}, source=source, need_topics=False
-        ),
-        clock=sampling.clock or None,
-        max_gap=sampling.max_gap,
-        min_step=sampling.min_step,
-        max_skew=sampling.max_skew,
-        step=sampling.step or "recorded",
-        time={t: "log" if k == "log" else "header" for t, k in sampling.time.items()},
+        SignalMap.from_dict(listed, source=source, need_topics=False),
+        clock=_text(said.get("clock", ""), "sampling.clock") or None,
+        max_gap=steps["max_gap"],
+        min_step=_positive(said.get("min_step", 0.0), "sampling.min_step", zero=True) or 0.0,
+        max_skew=steps["max_skew"],
+        step=steps["step"] or "recorded",
+        time=time,
         table=TableLayout.from_dict(said["table"], "sampling.table") if "table" in said else None,
     )
     for signal in signals.signals:
@@ -175,7 +173,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "horizons": Horizon.list_from(data["horizons"], n, m, blocks) if "horizons" in data else (),
         "run": Run.from_dict(data["run"], n, m, blocks) if "run" in data else None,
         "signals": signals,
-        "sampling": sampling,
+        "sampling": Sampling(**{key: steps[key] for key in _STEPS}),
         "domain": _domain(data["domain"], n, m, newer) if "domain" in data else None,
         "alarm": _alarm(data.get("alarm", {}), newer),
         "residuals": Residuals.from_dict(data["residuals"]) if "residuals" in data else None,

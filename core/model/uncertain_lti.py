@@ -90,7 +90,7 @@ class UncertainLTI(Envelope):
     signals : SignalMap, optional
         Names, topics, operating point; default names x1, x2, ..., u1, u2, ... and values used as they are.
     sampling : Sampling, optional
-        How samples were cut in the fit; default unknown.
+        Median, shortest and longest step of the fit; default unknown. How samples are cut is in `signals`.
     domain : Domain, optional
         Ranges seen in the fit; default none.
     alarm_rule : AlarmRule, optional
@@ -166,7 +166,7 @@ class UncertainLTI(Envelope):
         self.block_data = tuple(block_data or (BlockData() for _ in range(lead[0] if lead else 1)))
         if len(self.block_data) != (lead[0] if lead else 1):
             raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(*lead or (1,), 'block')}")
-        self.sampling = sampling or Sampling.of(signals)
+        self.sampling = sampling or Sampling()
         unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
         self.domain = domain or unbounded
         self.residuals = residuals
@@ -277,11 +277,10 @@ class UncertainLTI(Envelope):
 
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
-        read = {s.topic for s in (*self.signals.states, *self.signals.controls)}
         return UncertainLTI(
             **arrays,
             signals=replace(self.signals.scheduled_on(()), schedule=()),
-            sampling=replace(self.sampling, time={t: k for t, k in self.sampling.time.items() if t in read}),
+            sampling=self.sampling,
             domain=self.domain,
             alarm_rule=self.alarm_rule,
         )

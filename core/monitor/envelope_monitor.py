@@ -429,8 +429,9 @@ class EnvelopeMonitor:
                 f"{transient.name}: {plural(transient.s.shape[1], 'further scheduling signal')}, and the model has "
                 f"{model.q}; read it with the signals of the model"
             )
-        if transient.step != model.sampling.step:
-            transient = transient.replace(step=model.sampling.step or "recorded")
+        step = None if isinstance(model.signals.step, str) else model.signals.step
+        if transient.step != step:
+            transient = transient.replace(step=step or "recorded")
         steps = transient.transitions()
         count, n = len(transient), model.n
         fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)

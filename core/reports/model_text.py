@@ -70,12 +70,12 @@ def fit_text(model: UncertainLTI) -> str:
 
 def model_blocks(model: UncertainLTI) -> list[Block]:
     """What is in a model: its signals, elements, widths, alarm, and the faults that it sees."""
-    s, facts = model.sampling, model.fit_summary
+    s, steps, facts = model.signals, model.sampling, model.fit_summary
     blocks: list[Block] = [repr(model)]
     if s.clock:
         blocks.append(
-            f"clock {s.clock} ({s.time.get(s.clock, '?')} time), step {number(s.dt_median)} s "
-            f"({number(s.dt_min)} to {number(s.dt_max)}), max_gap {number(s.max_gap)} s"
+            f"clock {s.clock} ({s.time.get(s.clock, '?')} time), step {number(steps.dt_median)} s "
+            f"({number(steps.dt_min)} to {number(steps.dt_max)}), max_gap {number(s.max_gap)} s"
         )
     rows = [
         [f"{kind} {x.name}", x.topic or "-", x.field, number(float(x.steady)), number(float(x.scale)), x.unit or "-"]
