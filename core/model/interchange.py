@@ -70,15 +70,14 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot
     offset = bool(np.any(model.c))
     if offset and DISTURBANCE in model.control_names:
         raise ModelError(f"a control is called '{DISTURBANCE}', as the input for c would be; rename it")
-    if model.schedule is None:
-        if knot is not None:
-            raise ModelError(f"knot is {knot}, and the model has no schedule; leave it out")
-        return _system(model, dt, recorded, offset)
-    if knot is None:
-        return [_system(block, dt, recorded, offset) for block in model.blocks]
-    if not 0 <= knot < len(model.blocks):
+    if model.schedule is None and knot is not None:
+        raise ModelError(f"knot is {knot}, and the model has no schedule; leave it out")
+    if knot is not None and not 0 <= knot < len(model.blocks):
         raise ModelError(f"knot is {knot}; the model has blocks 0 to {len(model.blocks) - 1}")
-    return _system(model.blocks[knot], dt, recorded, offset)
+    systems = [
+        _system(block, dt, recorded, offset) for block in (model.blocks if knot is None else [model.blocks[knot]])
+    ]
+    return systems if model.schedule is not None and knot is None else systems[0]
 
 
 def _system(model: Any, dt: float | None, recorded: bool, offset: bool) -> Any:

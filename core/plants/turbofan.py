@@ -119,13 +119,10 @@ class Health:
 class GasPath:
     """Everything at one operating condition; the stations are those of the module's docstring.
 
-    `P3`: total pressure, Pa; `T3`: total temperature, K; `T4`: total temperature, K; `P5`: total pressure, Pa; `T5`:
-    total temperature, K; `P13`: total pressure, Pa; `T13`: total temperature, K; `P6`: total pressure, Pa; `T6`: total
-    temperature, K; `w4`: mass fraction of burnt fuel at station 4; `w6`: mass fraction of burnt fuel at station 6;
-    `W2`: flow, kg/s; `W25`: flow, kg/s; `W4`: flow, kg/s; `W5`: flow, kg/s; `W16`: flow, kg/s; `W8`: flow, kg/s;
-    `fuel`: fuel flow, kg/s; `thrust`: gross thrust, N; `fan_power`: taken by the fan, W; `compressor_power`: taken by
-    the compressor, W; `high_turbine_power`: given by the turbine of the compressor's spool, W; `low_turbine_power`:
-    given by the turbine of the fan's spool, W; `residual`: largest relative mismatch of the five flow balances.
+    P: total pressures, Pa; T: total temperatures, K; `w6`: mass fraction of burnt fuel at station 6; W: flows, kg/s;
+    `fuel`: kg/s; `thrust`: gross, N; `fan_power`, `compressor_power`: taken by each, W; `high_turbine_power`: given by
+    the turbine of the compressor's spool, W; `low_turbine_power`: by that of the fan's spool, W; `residual`: largest
+    relative mismatch of the five flow balances.
     """
 
     P3: float
@@ -137,12 +134,10 @@ class GasPath:
     T13: float
     P6: float
     T6: float
-    w4: float
     w6: float
     W2: float
     W25: float
     W4: float
-    W5: float
     W16: float
     W8: float
     fuel: float
@@ -285,7 +280,7 @@ class Engine:
             ]
         )
         path = GasPath(
-            P3, T3, T4, P5, T5, P13, T13, P6, T6, w, w6, W2, W25, W4, W4, W16, W8, fuel, thrust,
+            P3, T3, T4, P5, T5, P13, T13, P6, T6, w6, W2, W25, W4, W16, W8, fuel, thrust,
             fan_power=W2 * (gas.enthalpy(T13, 0.0) - gas.enthalpy(T_STANDARD, 0.0)),
             compressor_power=W25 * (gas.enthalpy(T3, 0.0) - gas.enthalpy(T13, 0.0)),
             high_turbine_power=W4 * (gas.enthalpy(T4, w) - gas.enthalpy(T45, w)),

@@ -54,8 +54,8 @@ PULSE = 3.75
 PROPORTION = np.array([1.0, 0.3, 0.5, 0.5])
 """Height of the pulses of each control, over its scale, for an amplitude of 1: a nozzle or a vane acts more than fuel
 does for the same share of its range, and none may push the engine off its maps."""
-PULSE_SAMPLES = 1201
-CHECK_SAMPLES, LEVELS_SAMPLES = 101, 2401
+SAMPLES = {"pulses": 1201, "check": 101, "levels": 2401}
+"""Usual samples of each manoeuvre."""
 HOLD = 0.2
 """A command older than this is not in force, s."""
 
@@ -437,13 +437,12 @@ def make_run(
     samples: int = 0,
 ) -> Run:
     """A run by name."""
-    usual = {"pulses": PULSE_SAMPLES, "check": CHECK_SAMPLES, "levels": LEVELS_SAMPLES}
-    if manoeuvre not in usual:
-        raise UncertainLTIError(f"turbofan: there is no manoeuvre '{manoeuvre}'; there are {', '.join(usual)}")
+    if manoeuvre not in SAMPLES:
+        raise UncertainLTIError(f"turbofan: there is no manoeuvre '{manoeuvre}'; there are {', '.join(SAMPLES)}")
     if (manoeuvre == "pulses") != (amplitude != 0.0):
         raise UncertainLTIError("turbofan: an amplitude other than 0 is for pulses, and pulses need one")
     return Run(
-        samples or usual[manoeuvre],
+        samples or SAMPLES[manoeuvre],
         amplitude if manoeuvre == "pulses" else None,
         LEVELS if manoeuvre == "levels" else CHECK,
         noise,
