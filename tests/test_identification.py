@@ -167,6 +167,17 @@ def test_transitions_furthest_from_least_squares_first_change_no_optimum(criteri
     assert outside[1] < 0.5 * outside[0]
 
 
+def test_rows_that_do_not_fit_in_memory_together_are_counted_among_all(monkeypatch):
+    transient = drawn(small_plant(3, n=3), 3 * SUBSAMPLE, 3, noise=1e-3)
+    usual = fit([transient], additive="noise")
+    monkeypatch.setattr(working_set, "_HELD_BYTES", 1)
+    said = []
+    apart = fit([transient], additive="noise", progress=said.append)
+    assert apart.fit_summary["objective"] == pytest.approx(usual.fit_summary["objective"], rel=2e-7)
+    counted = [text.partition(",")[0] for text in said if text.startswith("row ")]
+    assert counted == ["row 2 of 3", "row 3 of 3"]
+
+
 @pytest.mark.parametrize("method", ["working-set", "cvxpy"])
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_both_methods_agree_and_contain(method, criterion):

@@ -379,9 +379,13 @@ class WorkingSet:
 
     def _solve(self, settle: Settle) -> None:
         """Solve all rows and prove them, those together whose samples fit in memory."""
+        began, done = perf_counter(), 0
         for rows in self._groups(self.rows):
+            if done:
+                self._say_left(began, done, len(self.rows))
             self._start(settle, rows)
             self._prove(settle, rows)
+            done += len(rows)
 
     def _start(self, settle: Settle, rows: list[Row]) -> None:
         """Solve on the first samples and those furthest from least squares."""
@@ -407,11 +411,19 @@ class WorkingSet:
             return
         began = said = perf_counter()
         for number, _ in enumerate(one_by_one(settle, [(row,) for row in rows]), start=1):
-            now = perf_counter()
-            if now - said > _SILENCE and number < len(rows):
-                said, left = now, (now - began) / number * (len(rows) - number)
-                text = f"row {number + 1} of {len(rows)}, about {left:.0f} s left"
-                self.progress(CountedStep(text, number + 1, len(rows)))
+            if perf_counter() - said > _SILENCE and number < len(rows) and not self._in_groups:
+                said = perf_counter()
+                self._say_left(began, number, len(rows))
+
+    def _say_left(self, began: float, done: int, total: int) -> None:
+        left = (perf_counter() - began) / done * (total - done)
+        text = f"row {done + 1} of {total}, about {left:.0f} s left"
+        self.progress(CountedStep(text, done + 1, total))
+
+    @property
+    def _in_groups(self) -> bool:
+        """The samples of all rows do not fit in memory together; `_solve` then tells how far the rows are."""
+        return len(self._groups(self.rows)) > 1
 
     def _groups(self, rows: list[Row]) -> list[list[Row]]:
         """Rows whose samples fit in memory together; with full weights, all."""
@@ -429,7 +441,7 @@ class WorkingSet:
         groups = self._groups(self.rows if rows is None else rows)
         for rows in groups:
             self._prove_group(settle, rows)
-            if len(self._groups(self.rows)) > 1:
+            if self._in_groups:
                 for row in rows:
                     row.release()
 
