@@ -161,14 +161,13 @@ def _cards(model: UncertainLTI, facts: Mapping[str, Any]) -> Iterator[dict[str, 
     yield {"title": "What happened?", "tone": look, "answer": what, "list": items}
     faults = detectable_data(facts["validation"] or {})
     alarm = model.fit_summary.get("alarm")
-    jumps = numbers_of(alarm.get("biases"), model.n) if isinstance(alarm, Mapping) else None
-    within = numbers_of([alarm.get("within")], 1) if isinstance(alarm, Mapping) else None
+    learnt = alarm if isinstance(alarm, Mapping) else {}
+    jumps, within = numbers_of(learnt.get("biases"), model.n), numbers_of([learnt.get("within")], 1)
     if faults is None and jumps and within:
         seen = f"Jumps within {number(within[0])} s, from these sizes on"
-        items = [
-            {"text": f"{s.name} {number(jump)} {s.unit}".rstrip()}
-            for s, jump in zip(model.signals.states[:6], jumps, strict=False)
-        ]
+        each = zip(model.signals.states, jumps, strict=True)
+        items = [{"text": f"{s.name} {number(jump)} {s.unit}".rstrip()} for s, jump in each]
+        items[6:] = [{"text": f"and {plural(len(items) - 6, 'state')} more", "to": "trust"}] if len(items) > 6 else []
         items.append({"text": "of others: run uncertain-lti validate MODEL --output MODEL"})
     elif faults is None or faults.get("refused"):
         why = faults["refused"] if faults else "run uncertain-lti validate MODEL --output MODEL"
