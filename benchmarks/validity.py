@@ -42,6 +42,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, Rule  # noqa: E402
 from uncertain_lti.validation.detectable import detectable  # noqa: E402
 from uncertain_lti.validation.left_out import validate  # noqa: E402
 from uncertain_lti.validation.panel import learn  # noqa: E402
+from uncertain_lti.validation.part import fitted_parts  # noqa: E402
 from uncertain_lti.validation.result import Validation  # noqa: E402
 
 CONFIDENCE = 0.9
@@ -78,7 +79,7 @@ def true_alarms_of(model: UncertainLTI, x: np.ndarray, u: np.ndarray, rules: Seq
 
 def panel_keeps(validation: Validation, runs: Sequence[Transient], x: np.ndarray, u: np.ndarray) -> bool:
     """Whether the panel's alarms on fresh transients stay below the limit that it states."""
-    panel = learn(validation, runs)
+    panel = learn(validation, fitted_parts(validation.model, runs))
     hours = x.shape[0] * (x.shape[1] - 1) * DT / 3600
     return true_alarms_of(validation.model, x, u, panel.rules) / hours <= panel.limit
 

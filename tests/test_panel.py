@@ -22,6 +22,7 @@ from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import CONFIDENCE, Panel, learn, promises, rules_for, worth
+from uncertain_lti.validation.part import fitted_parts
 from uncertain_lti.validation.result import false_alarms
 
 DT = 0.1
@@ -93,7 +94,7 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
 
     full = plain(runs, "lp", additive="noise", describe_data=False)
     left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
-    panel = learn(left, runs)
+    panel = learn(left, fitted_parts(full, runs))
     sample, energy = (rule for rule in panel.rules if rule.kind == "energy")
     parts = left.parts
     inside = [full_utilisation(full, run) for run in runs]
@@ -270,7 +271,7 @@ def test_states_that_are_blind_are_named(runs):
 
     full = plain(runs, "lp", additive="noise", describe_data=False)
     left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
-    panel = learn(left, runs)
+    panel = learn(left, fitted_parts(full, runs))
     from dataclasses import replace
 
     span = full.domain.x_max - full.domain.x_min

@@ -32,7 +32,7 @@ from uncertain_lti.reports.validation_text import validation_text
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.left_out import cut, remaining_spans, validate, validate_model
 from uncertain_lti.validation.panel import learn
-from uncertain_lti.validation.part import judge, rising
+from uncertain_lti.validation.part import fitted_parts, judge, rising
 from uncertain_lti.validation.result import raised_on
 
 # --- intervals ---
@@ -310,10 +310,11 @@ def test_a_whole_group_is_left_out_at_a_time(days):
 def test_groups_of_one_recording_are_single_recordings(runs, validation):
     alone = validate(runs, groups=range(12), criterion="qp", additive="noise", alarm_rule=AlarmRule(2, 3))
     assert [p.violated for p in alone.parts] == [p.violated for p in validation.parts]
+    seen = fitted_parts(validation.model, runs)
     one, other = alone.to_dict(), validation.to_dict()
     for key in ("inside_interval", "false_alarms"):
         assert one[key] == other[key]
-    assert learn(alone, runs).rules == learn(validation, runs).rules
+    assert learn(alone, seen).rules == learn(validation, seen).rules
 
 
 def test_the_condition_stands_beside_every_interval(days):

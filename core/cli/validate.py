@@ -41,6 +41,7 @@ def run_validate(options: argparse.Namespace) -> int:
     from uncertain_lti.validation.detectable import check_within, detectable
     from uncertain_lti.validation.left_out import validate_model
     from uncertain_lti.validation.panel import learn, promises
+    from uncertain_lti.validation.part import fitted_parts
 
     check_within(options.within)
     model = UncertainLTI.load(options.model)
@@ -62,8 +63,7 @@ def run_validate(options: argparse.Namespace) -> int:
         validation = validate_model(model, transients, **given, groups=options.group, progress=step)
     said: list[str] = []
     if options.false_alarms is not None:
-        on = [s.name for s in model.signals.scheduling]
-        panel = learn(validation, [t.scheduled_on(on) for t in transients], options.false_alarms)
+        panel = learn(validation, fitted_parts(validation.model, transients), options.false_alarms)
         model = model.with_residuals_of(validation.model).replace(alarm=panel.rules)
         said = promises(model, panel)
     data = replace(validation, model=model).to_dict() | ({"promises": said} if said else {})

@@ -24,8 +24,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.panel import Panel, learn, promises, worth
-from uncertain_lti.validation.part import judge
+from uncertain_lti.validation.panel import Panel, figure, learn, promises, worth
+from uncertain_lti.validation.part import Part, fitted_parts
 from uncertain_lti.validation.result import Validation
 
 CLEARLY = 0.9
@@ -36,7 +36,7 @@ FOLDS = 5
 """Fits without a part of the recordings, groups or, of a single recording, blocks."""
 LIMIT = 1e9
 """Elements of all left-out problems together up to which parts are left out: some minutes."""
-_SHOWN = 1_000_000  # transitions that a panel is learnt from where nothing is left out
+_SHOWN, _COMPARED = 1_000_000, 200_000  # transitions that a panel is learnt from, and ways to fit are compared on
 
 
 @dataclass(frozen=True)
@@ -97,7 +97,9 @@ def fit_monitored(
     left.pop("transient_weights", None)
     if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
-        return Monitored(*_armed(model, *_seen(model, transients), false_alarms), None, why, centred)
+        seen = fitted_parts(model, transients, _SHOWN)
+        fitted = Validation(model, seen, "transients", 0.0, 0.9)
+        return Monitored(*_armed(fitted, seen, false_alarms), None, why, centred)
     try:
         validation = leave_out(
             transients,
@@ -109,19 +111,17 @@ def fit_monitored(
             progress=progress,
             **left,
         )
-        runs = [t.scheduled_on([s.name for s in model.signals.scheduling]) for t in transients]
-        return Monitored(*_armed(model, validation, runs, false_alarms), validation, "", centred)
+        seen = fitted_parts(model, transients)
+        return Monitored(*_armed(validation, seen, false_alarms), validation, "", centred)
     except (FitError, ModelError) as error:  # too little is left to fit to: the fit itself is valid
         if false_alarms is not None:
             raise FitError(f"no alarm can be learnt for a rate: {error}") from None
         return Monitored(model, None, None, str(error), centred)
 
 
-def _armed(
-    model: UncertainLTI, validation: Validation, runs: Sequence[Transient], rate: float | None
-) -> tuple[UncertainLTI, Panel]:
-    panel = learn(validation, runs, rate)
-    return model.replace(alarm=panel.rules), panel
+def _armed(validation: Validation, seen: Sequence[Part], rate: float | None) -> tuple[UncertainLTI, Panel]:
+    panel = learn(validation, seen, rate)
+    return validation.model.replace(alarm=panel.rules), panel
 
 
 def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], **options: Any) -> Monitored:
@@ -136,17 +136,18 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
         return first
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
-    best, least = ways[0], learn(*_seen(first.model, transients)).figure
+    best, least = ways[0], figure(first.model, fitted_parts(first.model, transients, _COMPARED))
     for way in ways[1:]:
         asked = {**shared, **way}
         if asked.pop("centred", False):
             asked["operating_point"] = _medians(transients)
         try:
-            figure = learn(*_seen(fit(transients, describe_data=False, **asked), transients)).figure
+            model = fit(transients, describe_data=False, **asked)
+            size = figure(model, fitted_parts(model, transients, _COMPARED))
         except (FitError, ModelError):
             continue
-        if figure < CLEARLY * least:
-            best, least = way, figure
+        if size < CLEARLY * least:
+            best, least = way, size
     if best is ways[0]:
         return first
     taken = fit_monitored(transients, **{**options, **best})
@@ -163,19 +164,3 @@ def _medians(transients: Sequence[Transient]) -> OperatingPoint:
         return replace(OperatingPoint.identity(len(x), len(u)), x_s=x, u_s=u, s_s=s, S=np.ones(len(s)))
     point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
     return replace(point, x_s=x, u_s=u, s_s=s)
-
-
-def _seen(model: UncertainLTI, transients: Sequence[Transient]) -> tuple[Validation, list[Transient]]:
-    """What was fitted, or a stretch of each recording, judged by the fit."""
-    runs = _some(transients, model)
-    parts = tuple(judge(model, model, run, run.name) for run in runs)
-    return Validation(model, parts, "transients", 0.0, 0.9), runs
-
-
-def _some(transients: Sequence[Transient], model: UncertainLTI) -> list[Transient]:
-    """A stretch of each recording, of as many transitions together as a panel is learnt from."""
-    scheduled = [t.scheduled_on([s.name for s in model.signals.scheduling]) for t in transients]
-    share = _SHOWN / max(sum(len(t) for t in scheduled), 1)
-    if share >= 1:
-        return scheduled
-    return [t.replace(slice(0, max(2, int(share * len(t))))) for t in scheduled if len(t) > 1]

@@ -43,9 +43,8 @@ from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm
-from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
-from uncertain_lti.validation.part import Part, by_unit, judge, rising, unit_numbers
+from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 from uncertain_lti.validation.result import Validation
 
 PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 30, 3))
@@ -149,21 +148,15 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     return [size if rule.kind == "mean" else np.sqrt(size) for rule, size in each]
 
 
-def learn(validation: Validation, transients: Sequence[Transient], rate: float | None = None) -> Panel:
+def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = None) -> Panel:
     """The panel of a model, from what was left out of the fit and from the fit itself.
 
-    `transients`: what was fitted; `rate`: false alarms per hour, the upper limit with CONFIDENCE; the thresholds are
-    as near to it as the data can show. Raises FitError if there is nothing to learn from.
+    `fitted`: what was fitted, judged by the model; `rate`: false alarms per hour, the upper limit with CONFIDENCE; the
+    thresholds are as near to it as the data can show. Raises FitError if there is nothing to learn from.
     """
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise FitError(f"false_alarms is {rate}; give a positive number per hour")
-    model = validation.model
-    parts = [part for part in validation.parts if part.judged]
-    if not parts:
-        raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
-    dt = float(np.median(np.concatenate([part.dt for part in parts])))
-    lengths = sorted(part.judged for part in parts)
-    rules = rules_for(model, lengths[len(lengths) // 10], dt)
+    parts, rules, dt = _judged(validation)
     left, unlike = [], []
     for part in parts:
         far = part.extrapolated == 2
@@ -172,16 +165,12 @@ def learn(validation: Validation, transients: Sequence[Transient], rate: float |
             unlike.append(part.name)
         left.append(part.without(far))
     sizes = [sizes_of(rules, part) for part in left]
-    fitted = [sizes_of(rules, judge(model, model, run, run.name)) for run in transients]
+    every = [*sizes, *(sizes_of(rules, part) for part in fitted)]
     units = unit_numbers(parts)
-    thresholds = []
-    for r, rule in enumerate(rules):
-        peaks = _peaks(units, [of[r] for of in sizes])
-        found = _threshold(rule, model.n, dt, np.concatenate([of[r] for of in (*sizes, *fitted)]), peaks)
-        found *= 1.0 + MORE / len(peaks)
-        if validation.what != "block" and len(peaks) >= TELLING:
-            found = np.maximum(found, _of_next(peaks))
-        thresholds.append(np.clip(found, 1e-6, LARGEST**0.5))
+    thresholds = [
+        _threshold(rule, validation, dt, units, [of[r] for of in sizes], [of[r] for of in every])
+        for r, rule in enumerate(rules)
+    ]
     levels = [
         (part, np.max([(s / t).max(axis=1) for s, t in zip(of, thresholds, strict=True)], axis=0))
         for part, of in zip(left, sizes, strict=True)
@@ -190,20 +179,68 @@ def learn(validation: Validation, transients: Sequence[Transient], rate: float |
     hours = sum(part.hours for part, _ in levels)
     factor, limit, alarms = _factor(levels, hours, len(rules), rate)
     thresholds = [factor * t for t in thresholds]
-    usual, median = np.average(
-        [(p.usual_width, p.median_width) for p in parts], axis=0, weights=[p.judged for p in parts]
-    ) / 2.0  # fmt: skip
-    at = max(i for i, rule in enumerate(rules) if rule.kind == "energy" and rule.horizon == 1)
+    at = _of_jumps(rules)
     return Panel(
         tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True)),
-        limit, alarms, hours, int(units.max()) + 1, validation.what, usual * thresholds[at],
-        max(rules[at].window_s, dt), float(np.exp(np.log(np.maximum(median * thresholds[at], 1e-300)).mean())),
-        tuple(unlike), rate,
+        limit, alarms, hours, int(units.max()) + 1, validation.what, _jumps(parts, "usual_width", thresholds[at]),
+        max(rules[at].window_s, dt), _mean(_jumps(parts, "median_width", thresholds[at])), tuple(unlike), rate,
     )  # fmt: skip
 
 
-def _threshold(rule: StatisticRule, n: int, dt: float, every: Array, peaks: Array) -> Array:
-    """Threshold (n,) or (1,) of one rule: of its sizes (K, n) or (K, 1) on all healthy data, and the `_peaks` there."""
+def figure(model: UncertainLTI, fitted: Sequence[Part]) -> float:
+    """`Panel.figure` by what was fitted alone, judged by the model. Raises FitError as `learn` does."""
+    seen = Validation(model, tuple(fitted), "transients", 0.0, 0.9)
+    parts, rules, dt = _judged(seen)
+    rule = rules[_of_jumps(rules)]
+    sizes = [sizes_of([rule], part)[0] for part in parts]
+    return _mean(
+        _jumps(parts, "median_width", _threshold(rule, seen, dt, unit_numbers(parts), sizes, [*sizes, *sizes]))
+    )
+
+
+def _judged(validation: Validation) -> tuple[list[Part], list[StatisticRule], float]:
+    """Parts with a verdict, the rules for such parts, and their typical step, s."""
+    parts = [part for part in validation.parts if part.judged]
+    if not parts:
+        raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
+    dt = float(np.median(np.concatenate([part.dt for part in parts])))
+    lengths = sorted(part.judged for part in parts)
+    return parts, rules_for(validation.model, lengths[len(lengths) // 10], dt), dt
+
+
+def _of_jumps(rules: Sequence[StatisticRule]) -> int:
+    """The rule by whose threshold jumps are promised: the energy over the longest window, of one step."""
+    return max(i for i, rule in enumerate(rules) if rule.kind == "energy" and rule.horizon == 1)
+
+
+def _jumps(parts: Sequence[Part], width: str, threshold: Array) -> Array:
+    """Jumps (n,) that a state's energy sees where its bounds have the usual, or the median, width."""
+    widths = np.average([getattr(part, width) for part in parts], axis=0, weights=[part.judged for part in parts])
+    return np.asarray(widths / 2.0 * threshold)
+
+
+def _mean(jumps: Array) -> float:
+    return float(np.exp(np.log(np.maximum(jumps, 1e-300)).mean()))
+
+
+def _threshold(
+    rule: StatisticRule,
+    validation: Validation,
+    dt: float,
+    units: NDArray[np.intp],
+    left: Sequence[Array],
+    every: Sequence[Array],
+) -> Array:
+    """Threshold (n,) or (1,) of one rule, of its sizes on the parts `left` out, and on `every` healthy data."""
+    peaks = _peaks(units, left)
+    found = _allowed(rule, validation.model.n, dt, np.concatenate(every), peaks) * (1.0 + MORE / len(peaks))
+    if validation.what != "block" and len(peaks) >= TELLING:
+        found = np.maximum(found, _of_next(peaks))
+    return np.asarray(np.clip(found, 1e-6, LARGEST**0.5))
+
+
+def _allowed(rule: StatisticRule, n: int, dt: float, every: Array, peaks: Array) -> Array:
+    """The largest of the sizes (K, n) or (K, 1) on all healthy data, with its allowance, (n,) or (1,)."""
     top, median = every.max(axis=0), np.median(every, axis=0)
     windows = max(3.0, len(every) / 2.0 / max(1, round(rule.window_s / dt)))
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)

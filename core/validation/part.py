@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -176,11 +177,11 @@ def judge(
     found = verdicts.longer_utilisation[judged], verdicts.longer_residual[judged]
     longer, longer_residual, longer_width = _longer(model, full, steps, *found)
     width = (verdicts.upper - verdicts.lower)[judged]
-    point = full.operating_point
-    low, high = full.bounds(
-        point.normalise_x(steps.x), point.normalise_u(steps.u), steps.dt, s=point.normalise_s(steps.s)
-    )
-    whole = (high - low) * point.X
+    if full is model:
+        whole = width
+    else:
+        _, half = full.columns_centre_and_half(full.normalised_columns(steps), steps.dt)
+        whole = 2.0 * half.T * full.operating_point.X
     flags = verdicts.flags[judged] == 1.0
     resets = np.flatnonzero(back_and_restarts(transient.t_ns)[1])
     starts = sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})
@@ -220,12 +221,22 @@ def _longer(
     """Utilisation, residuals and mean widths over the horizons of the full model, NaN where this one lacks one."""
     places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
     width = np.full((len(model.horizons) + 1, model.n), np.nan)
-    for j, (_, _, half) in enumerate(model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)):
+    z = model.normalised_columns(steps) if model.horizons else np.zeros((0, 0))
+    for j, (_, _, half) in enumerate(model.envelopes(steps.k, z, steps.dt) if model.horizons else ()):
         if half.size:
             width[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
     with_none = ((0, 0), (0, 1), (0, 0))
     sizes, left = (np.pad(values, with_none, constant_values=np.nan)[:, places] for values in (utilisation, residual))
     return sizes, left, width[places]
+
+
+def fitted_parts(model: UncertainLTI, transients: Sequence[Transient], most: float = math.inf) -> tuple[Part, ...]:
+    """What was fitted, judged by the fit: all of it, or a stretch of each recording, so many transitions together."""
+    runs = [t.scheduled_on([s.name for s in model.signals.scheduling]) for t in transients]
+    share = most / max(sum(len(t) for t in runs), 1)
+    if share < 1:
+        runs = [t.replace(slice(0, max(2, int(share * len(t))))) for t in runs if len(t) > 1]
+    return tuple(judge(model, model, run, run.name) for run in runs)
 
 
 def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
