@@ -14,13 +14,14 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.limits import LARGEST
@@ -51,6 +52,7 @@ from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""
+_WORTH_THREADS = 20_000  # transitions
 
 
 def fit(
@@ -196,9 +198,6 @@ def fit(
         facts["with_discarded"] = {
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
-    found = [repeats_in(model, transient) for transient in transients]
-    domain = replace(model.domain, step_max=largest_steps(model, found))
-    model = model.replace(repeats=together(model.n, found), domain=domain)
     if not horizons:
         return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]
@@ -271,14 +270,25 @@ def fit_fleet(
     }
     if fleet.columns.regimes is not None:
         facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
-    if describe_on is not None:
+
+    def said() -> tuple[int, list[str]] | None:
+        if describe_on is None:
+            return None
         whole = describe_on.N == sums.count and method == "working-set"
         few = carriers(describe_on, structure) if seek_carriers and whole else None
-        facts["rank"], facts["messages"] = describe(
+        rank, messages = describe(
             model, describe_on, sums, mean_width, transients, few, discarded if criterion == "qp" else None
         )
-        facts["messages"] += _distance(gap)
-    return model.replace(fit_summary=facts, residuals=fleet.residuals(model, judged))
+        return rank, messages + _distance(gap)
+
+    afterwards = (said, partial(fleet.residuals, model, judged), *(partial(repeats_in, model, t) for t in transients))
+    words, residuals, *found = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > _WORTH_THREADS)
+    if words is not None:
+        facts["rank"], facts["messages"] = words
+    if transients:
+        domain = replace(domain, step_max=largest_steps(model, found))
+        model = model.replace(repeats=together(n, found), domain=domain)
+    return model.replace(fit_summary=facts, residuals=residuals)
 
 
 def _block_facts(

@@ -233,14 +233,15 @@ def likelier_alone(residual: Array, half: Array) -> bool:
 
 def _log_likelihood(values: Array) -> float:
     """Of a row, with the likeliest mean and scatter, but for a constant; -inf if the scatter is singular."""
-    n = values.shape[1]
-    weights = np.ones(len(values))
+    columns = np.ascontiguousarray(values.T)
+    n, count = columns.shape
+    weights = np.ones(count)
     for _ in range(_ROUNDS):
-        centred = values - weights @ values / weights.sum()
-        scatter = (centred * weights[:, None]).T @ centred / len(values)
+        centred = columns - (columns @ weights / weights.sum())[:, None]
+        scatter = (centred * weights) @ centred.T / count
         sign, logarithm = np.linalg.slogdet(scatter)
         if sign <= 0.0 or not np.isfinite(logarithm):
             return -np.inf
-        distance = ((centred @ np.linalg.inv(scatter)) * centred).sum(axis=1)
+        distance = np.einsum("ik,ik->k", np.linalg.inv(scatter) @ centred, centred)
         weights = (_FREEDOM + n) / (_FREEDOM + distance)
     return float(-0.5 * logarithm - 0.5 * (_FREEDOM + n) * np.log1p(distance / _FREEDOM).mean())

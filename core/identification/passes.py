@@ -226,6 +226,11 @@ class Samples:
             None if self.s is None else self.s[:, chosen],
         )
 
+    def among(self, others: Samples) -> bool:
+        """Whether others, in order of index, hold all of these."""
+        at = np.searchsorted(others.index, self.index)
+        return not len(at) or bool(at.max() < len(others) and (others.index[at] == self.index).all())
+
     @classmethod
     def join(cls, parts: Sequence[Samples], p: int) -> Samples:
         """All of them, in order of index, each index once."""

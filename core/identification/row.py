@@ -330,7 +330,7 @@ class Row:
         """Hold these samples, and the working set so far; `like`: a row that may hold the same transitions."""
         self._columns = columns
         kept = self.samples[self.pool]
-        if not np.isin(kept.index, samples.index).all():
+        if not kept.among(samples):
             samples = Samples.join([samples, kept], len(samples.z))
         self.samples = samples
         self.pool = np.searchsorted(samples.index, kept.index)

@@ -39,34 +39,31 @@ class Reach:
 
     def __init__(self, model: UncertainLTI, transients: Sequence[Transient]) -> None:
         self._model = model
-        every = np.concatenate([self._rows(t.transitions()) for t in transients])
-        self._low, self._high = every.min(axis=0), every.max(axis=0)
-        some = self._lever(every[:: max(1, len(every) // _MOST)])
-        self._scale = np.maximum(np.abs(some).max(axis=0), 1e-300)
+        every = [model.normalised_columns(t.transitions()) for t in transients]
+        self._low = np.min([z.min(axis=1, initial=np.inf) for z in every], axis=0)[:, None]
+        self._high = np.max([z.max(axis=1, initial=-np.inf) for z in every], axis=0)[:, None]
+        stride = max(1, sum(z.shape[1] for z in every) // _MOST)
+        some = self._lever(np.hstack([z[:, ::stride] for z in every]))
+        self._scale = np.maximum(np.abs(some).max(axis=1, keepdims=True), 1e-300)
         scaled = some / self._scale
-        self._inverse = np.linalg.pinv(scaled.T @ scaled, rcond=_SAME, hermitian=True)
+        self._inverse = np.linalg.pinv(scaled @ scaled.T, rcond=_SAME, hermitian=True)
         self._largest = float(self._leverage(some).max())
 
-    def _rows(self, steps: Transitions) -> Array:
-        return np.ascontiguousarray(self._model.normalised_columns(steps).T)
-
-    def _lever(self, rows: Array) -> Array:
-        return np.hstack([rows[:, : self._model.n + self._model.m], np.ones((len(rows), 1))])
+    def _lever(self, z: Array) -> Array:
+        return np.vstack([z[: self._model.n + self._model.m], np.ones(z.shape[1])])
 
     def _leverage(self, lever: Array) -> Array:
         scaled = lever / self._scale
-        return np.asarray(np.einsum("ki,ki->k", scaled @ self._inverse, scaled))
+        return np.asarray(np.einsum("ik,ik->k", self._inverse @ scaled, scaled))
 
     def level(self, steps: Transitions) -> NDArray[np.intp]:
         """(K,): 0 where a transition begins within what was fitted, 1 beyond it, 2 far beyond."""
-        rows = self._rows(steps)
-        found = np.zeros(len(rows), dtype=np.intp)
-        if not len(rows):
-            return found
-        span, leverage = self._high - self._low, self._leverage(self._lever(rows))
+        z = self._model.normalised_columns(steps)
+        found = np.zeros(z.shape[1], dtype=np.intp)
+        span, leverage = self._high - self._low, self._leverage(self._lever(z))
         for level, (share, times) in enumerate((BEYOND, FAR), start=1):
             edge = share * span + _SAME * np.maximum(np.abs(self._low), np.abs(self._high))
-            beyond = ((rows < self._low - edge) | (rows > self._high + edge)).any(axis=1)
+            beyond = ((z < self._low - edge) | (z > self._high + edge)).any(axis=0)
             found[beyond | (leverage > times * self._largest)] = level
         return found
 
