@@ -142,7 +142,9 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     for start, stop in part.spans:
         span = slice(start, stop)
         values[span] = alarm.over(part.dt[span], np.zeros(stop - start, dtype=bool), part.rows(span))[2]
-    sizes = np.minimum(np.nan_to_num(np.abs(values)), LARGEST)
+    sizes = np.abs(values, out=values)
+    sizes[np.isnan(sizes)] = 0.0
+    np.minimum(sizes, LARGEST, out=sizes)
     ends = np.cumsum([len(rule.thresholds(model.n)) for rule in rules])[:-1]
     each = zip(rules, np.split(sizes, ends, axis=1), strict=True)
     return [size if rule.kind == "mean" else np.sqrt(size) for rule, size in each]
