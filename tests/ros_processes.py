@@ -187,8 +187,8 @@ class World:
         return self.start(module, "-c", _NODES.format(module), "--ros-args", *given, *more)
 
     def command(self, name: str, *arguments: Any) -> Process:
-        """`play` or `record`."""
-        module = {"play": "player", "record": "recorder"}[name]
+        """`play`, `record` or `watch`."""
+        module = {"play": "player", "record": "recorder"}.get(name, name)
         return self.start(name, "-c", _COMMANDS.format(module), *(str(a) for a in arguments))
 
     def monitor(self, model: Path | str, *more: str, name: str = MONITOR, **parameters: Any) -> Process:

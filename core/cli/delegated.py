@@ -107,5 +107,6 @@ _COMPLETION = "print what bash or zsh needs to complete commands, options and fi
 COMPLETION = Command("completion", _COMPLETION, ("shell",), run_completion)
 PLAY = Command("play", "publish a recording through rclpy", of_ros="player")
 RECORD = Command("record", "record topics through rclpy", of_ros="recorder")
+WATCH = Command("watch", "show on a page of this machine what a running monitor says", of_ros="watch")
 _DEMO = "fit shipped recordings of a turbofan and watch another, in which a fault sets in, live"
 DEMO = Command("demo", _DEMO, of_ros="demo")

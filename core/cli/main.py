@@ -32,7 +32,7 @@ from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_R
 COMMANDS: tuple[Command, ...] = (
     start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, delegated.LAYOUT,
     validate.VALIDATE, validate.SIGNATURE, delegated.INFO, delegated.REPRODUCE, delegated.PLAY, delegated.RECORD,
-    delegated.DEMO, delegated.COMPLETION,
+    delegated.WATCH, delegated.DEMO, delegated.COMPLETION,
 )  # fmt: skip
 """Every command, in the order of the help."""
 

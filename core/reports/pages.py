@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment
 from markupsafe import Markup, escape
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
@@ -83,8 +84,7 @@ def write_page(path: str | os.PathLike[str], page: str) -> None:
 
 def interactive_page(title: str, recordings: Sequence[Plotted], **more: Any) -> str:
     """The page of some recordings; `more`: of a report."""
-    data = {"recordings": [_packed(recording) for recording in recordings]}
-    packed = json.dumps(data, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+    packed = packed_data(recordings, more.get("live", 0)).replace("<", "\\u003c")
     scripts = [_asset(name).rstrip("\n") for name in ("uPlot.iife.min.js", "plot.js")]
     allowed = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     views = list(dict.fromkeys(view for recording in recordings for view, _ in recording.views))
@@ -92,6 +92,12 @@ def interactive_page(title: str, recordings: Sequence[Plotted], **more: Any) -> 
     marked = [Markup(script) for script in scripts]
     values = {"title": title, "views": views, "allowed": allowed, "style": style, "data": Markup(packed)}
     return environment().from_string(_asset("page.html")).render(values, scripts=marked, **more)
+
+
+def packed_data(recordings: Sequence[Plotted], every: int = 0) -> str:
+    """What a page draws; a live one asks for it again after so many ms."""
+    data = {"recordings": [_packed(recording) for recording in recordings]} | ({"every": every} if every else {})
+    return json.dumps(data, allow_nan=False, separators=(",", ":"))
 
 
 @cache
@@ -239,7 +245,8 @@ class Plotted:
     """One recording as it is plotted.
 
     `note`: a sentence below the heading; `views`: what can be chosen to be drawn, its name and its panels; `top`: a
-    panel above those of every view; `alarms, silent`: stretches of alarm, and without a verdict, s.
+    panel above those of every view; `alarms, silent`: stretches of alarm, and without a verdict, s; `title`: of the
+    window, where it is not the name.
     """
 
     name: str
@@ -248,6 +255,7 @@ class Plotted:
     top: list[Placed] = field(default_factory=list)
     alarms: Spans = field(default_factory=list)
     silent: Spans = field(default_factory=list)
+    title: str = ""
 
 
 def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) -> Plotted:
@@ -294,6 +302,41 @@ def plotted_fields(
     return Plotted(charts.base_name(name), note, [("values", panels)])
 
 
+def plotted_live(
+    name: str,
+    states: Sequence[str],
+    t: Array,
+    flags: Array,
+    alarm: NDArray[np.bool_],
+    utilisation: Array,
+    statistics: Mapping[str, Array],
+    note: str,
+) -> Plotted:
+    """What a running monitor has said: times (N,) in s, flags (N, n), alarm (N,), each statistic over its threshold.
+
+    The states that raised the alarm come first.
+    """
+    judged, bad = np.asarray(np.isfinite(flags).all(axis=1)), np.asarray(flags == 1.0)
+    most = _stretches(1, 2 * len(states) + 2)
+    columns = Columns.of(t, None, judged, alarm, np.asarray(bad.any(axis=1) | alarm), most)
+    score = np.abs(np.column_stack(list(statistics.values())) if statistics else utilisation)
+    score = np.fmax.reduce(columns.reduced(score, np.fmax), axis=1, initial=np.nan)
+    score = np.minimum(np.where(columns.alarm, np.fmax(score, 1.0), score), charts.FARTHEST)
+    top = Panel("alarm score, 1 is the threshold", (Series("score", score, score),), levels=(1.0,))
+    shown = np.clip(utilisation, -charts.FARTHEST, charts.FARTHEST)
+    low, high = columns.extremes(shown)
+    blame = dict.fromkeys(states, 0.0)
+    for statistic, values in statistics.items():
+        state = statistic.partition("/")[2]
+        blame[state] = max(blame.get(state, 0.0), float(np.nanmax(np.abs(values[alarm]), initial=0.0)))
+    panels = []
+    for i, state in sorted(enumerate(states), key=lambda at: -blame[at[1]]):
+        marks = columns.worst(bad[:, i], utilisation[:, i], shown[:, i])
+        series = (Series("utilisation", low[:, i], high[:, i] if columns.binned else None),)
+        panels.append((columns, Panel(state, series, marks=marks, levels=(-1.0, 1.0), count=int(bad[:, i].sum()))))
+    return Plotted(name, note, [("utilisation", panels)], [(columns, top)], columns.alarms, columns.silent)
+
+
 def _stretches(recordings: int, numbers: int) -> int:
     """Columns of one recording that has this many numbers in each."""
     return max(MOST_NUMBERS // (max(recordings, 1) * max(numbers, 1)), _FEWEST)
@@ -334,6 +377,7 @@ def _packed(recording: Plotted) -> dict[str, Any]:
 
     return {
         "name": _printable(recording.name), "note": _printable(recording.note),
+        "title": _printable(recording.title or recording.name),
         "top": [panel(p) for p in recording.top],
         "views": {view: [panel(p) for p in panels] for view, panels in recording.views}, "times": times,
         "alarms": recording.alarms, "silent": recording.silent,

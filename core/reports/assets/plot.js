@@ -1,10 +1,11 @@
 "use strict";
 // Draws the page's data: a panel per signal; all panels show the same time.
 (() => {
-  const page = JSON.parse(document.getElementById("data").textContent);
+  let page = JSON.parse(document.getElementById("data").textContent);
   const $ = (id) => document.getElementById(id);
   const bytes = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
-  const times = page.recordings.map((r) => r.times.map((t) => Array.from(new Float64Array(bytes(t)))));
+  const unpacked = () => page.recordings.map((r) => r.times.map((t) => Array.from(new Float64Array(bytes(t)))));
+  let times = unpacked();
   const numbers = (a) => Array.from(new Float32Array(bytes(a.data)), (v) => (Number.isNaN(v) ? null : v + a.offset));
   const placed = (a, count) => { // the few that are there among so many
     const found = new Array(count).fill(null), values = numbers(a);
@@ -215,6 +216,22 @@
     show(...range);
   }
 
+  async function look() { // at what a running monitor has said since; not while something is dragged
+    if (document.querySelector(":active")) return;
+    const before = Object.values(views()).flat().map((p) => p.title).join(), [low, high] = span();
+    const whole = !plots.length || plots[0].scales.x.min <= low && plots[0].scales.x.max >= high;
+    try {
+      page = await (await fetch("data")).json();
+    } catch {
+      $("note").textContent = "The program that serves this page has ended.";
+      return;
+    }
+    times = unpacked();
+    document.title = page.recordings[0].title;
+    const same = Object.values(views()).flat().map((p) => p.title).join() === before;
+    if (same) render(!whole); else choose(0);
+  }
+
   function choose(index) {
     recording = index;
     const every = new Map(Object.values(views()).flat().map((p) => [p.title, p.rank]));
@@ -255,4 +272,5 @@
     for (const u of plots) u.setSize({ width: u.root.parentNode.clientWidth, height: 170 });
   });
   choose(0);
+  if (page.every) setInterval(look, page.every);
 })();

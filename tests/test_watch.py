@@ -1,0 +1,120 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""`watch`: its page shows what the monitor says, to this machine alone, in a browser too."""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import shutil
+import subprocess
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed")
+
+from ros_processes import Process, World, open_world, until
+
+from uncertain_lti import EnvelopeMonitor, fit, read_transients
+from uncertain_lti.plants.turbofan_runs import turbofan_signals
+
+BAGS = Path(__file__).resolve().parents[1] / "bags"
+FITTED = [BAGS / f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels")]
+DAMAGED = BAGS / "turbofan_fan_damage.mcap"
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
+
+
+def address_of(watch: Process) -> str:
+    watch.says("watching")
+    found = re.search(r"http://127\.0\.0\.1:\d+/", watch.output)
+    assert found, watch.output
+    return found[0]
+
+
+def get(address: str, **headers: str) -> tuple[int, str]:
+    try:
+        with urllib.request.urlopen(urllib.request.Request(address, headers=headers), timeout=10) as answer:
+            return answer.status, answer.read().decode()
+    except urllib.error.HTTPError as error:
+        return error.code, ""
+
+
+def drawn(address: str) -> dict[str, Any]:
+    recording: dict[str, Any] = json.loads(get(f"{address}data")[1])["recordings"][0]
+    return recording
+
+
+def numbers(packed: dict[str, Any]) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(packed["data"]), "<f4") + packed["offset"]
+
+
+def test_the_page_draws_what_the_monitor_said(world, tmp_path):
+    model = fit(read_transients(FITTED, turbofan_signals()))
+    model.save(tmp_path / "model.json")
+    world.monitor(tmp_path / "model.json")
+    watch = world.command("watch", "--port", "0")
+    address = address_of(watch)
+    until(lambda: "Waiting" in drawn(address)["note"], "a page without a verdict")
+    world.command("play", DAMAGED, "--rate", "2", "--wait", "20").succeed()
+    (run,) = read_transients([DAMAGED], model.signals)
+    offline = EnvelopeMonitor(model).check(run)
+    until(lambda: f"{len(run)} samples" in drawn(address)["note"], "every sample")
+    said = drawn(address)
+    score = numbers(said["top"][0]["values"]["least"])
+    expected = np.fmax.reduce(np.abs(offline.statistics), axis=1)
+    expected = np.where(offline.alarm, np.fmax(expected, 1.0), expected)
+    np.testing.assert_allclose(score[1:], expected[1:], rtol=1e-5)
+    first = {panel["title"]: numbers(panel["values"]["least"]) for panel in said["views"]["utilisation"]}
+    for i, name in enumerate(model.state_names):
+        np.testing.assert_allclose(first[name][1:], offline.utilisation[1:, i], rtol=1e-4, atol=1e-5)
+    onset = run.t[np.argmax(offline.alarm)] - run.t[-1]
+    assert abs(said["alarms"][0][0] - onset) < 1e-6
+    assert said["title"].startswith("ALARM") == bool(offline.alarm[-1])
+    worst = np.nanmax(np.abs(offline.statistics[offline.alarm]), axis=0)
+    of_state = {
+        s: max(w for n, w in zip(offline.statistic_names, worst, strict=True) if n.endswith(f"/{s}")) for s in first
+    }
+    assert next(iter(first)) == max(of_state, key=lambda state: of_state[state])
+
+    for host in ("evil.example", "evil.example:80", "127.0.0.1.evil.example"):
+        assert get(f"{address}data", Host=host)[0] == 403
+    assert get(f"{address}other")[0] == 404
+    assert get(address)[1].count("<script>") == 2
+
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is not None:  # the page's own script draws every panel
+        command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=4000", "--dump-dom"]
+        profile = f"--user-data-dir={tmp_path / 'browser'}"
+        shown = subprocess.run([*command, profile, address], capture_output=True, text=True, timeout=120).stdout
+        assert shown.count('class="uplot') == 1 + model.n
+        assert "ALARM /envelope_monitor</title>" in shown
+    watch.signal(2)
+    assert watch.wait() == 0
+
+
+def test_a_port_that_is_taken_is_named(world):
+    address = address_of(world.command("watch", "--port", "0"))
+    port = address.rsplit(":", 1)[1].strip("/")
+    other = world.start("watch", "-m", "uncertain_lti.cli.main", "watch", "--port", port)
+    assert other.wait() == 2
+    assert "choose another --port" in other.output
+    assert "Traceback" not in other.output

@@ -1,0 +1,225 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""A page that shows what a running monitor says, for the eye: the alarm's score, and the states that raise it.
+
+The page is that of `plot`, and asks every second for what came since. It is served to this machine alone unless another
+address is given; a request that names another host is refused, so that no other page in the browser can read it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+import numpy as np
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Bool, String
+
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti.monitor.outputs import NODE
+from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
+from uncertain_lti_ros.process import living, seconds, tell
+
+_EVERY = 1000  # ms between two looks of the page
+_MOST = 100_000  # samples kept
+_SILENT = 2.0  # s without a message from which on the page says so
+_BEHIND = 200  # samples back at most to that of which a number is
+
+
+@dataclass
+class _Said:
+    """The last samples of one model: `t_ns`, `flags`, `alarm`, `utilisation`, `statistics`, a row each, as a ring."""
+
+    names: list[str]
+    statistic_names: list[str]
+    rows: Any
+    count: int = 0
+
+
+class Watched:
+    """What a monitor has said lately; messages come in one thread, and are read in others.
+
+    `node`: subscribes; `name`: of the monitor; `window`: s that the page shows.
+    """
+
+    def __init__(self, node: Node, name: str, window: float) -> None:
+        self.name, self._window = node.resolve_topic_name(name), window
+        self._lock = threading.Lock()
+        self._said = _room([], [])
+        self._heard, self._reason = 0.0, ""
+        many, latched = QoSProfile(depth=1000), QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        for kind, topic, take, qos in (
+            (JointState, "flags", self._flags, many), (Bool, "violation", self._violation, many),
+            (JointState, "utilisation", self._utilisation, many), (JointState, "statistics", self._statistics, many),
+            (String, "reason", self._why, latched),
+        ):  # fmt: skip
+            node.create_subscription(kind, f"{self.name}/{topic}", take, qos)
+
+    def _flags(self, message: JointState) -> None:
+        with self._lock:
+            if self._said.names != list(message.name):
+                self._said = _room(list(message.name), [])
+            said = self._said
+            row = said.rows[said.count % _MOST]
+            row["alarm"] = said.count and said.rows[(said.count - 1) % _MOST]["alarm"]
+            row["t_ns"], row["flags"] = _t_ns(message), message.position
+            row["utilisation"] = row["statistics"] = np.nan
+            said.count += 1
+            self._heard = time.monotonic()
+
+    def _violation(self, message: Bool) -> None:
+        with self._lock:
+            if self._said.count:
+                self._said.rows["alarm"][(self._said.count - 1) % _MOST] = message.data
+
+    def _utilisation(self, message: JointState) -> None:
+        with self._lock:
+            if self._said.names == list(message.name):
+                self._put("utilisation", message)
+
+    def _statistics(self, message: JointState) -> None:
+        with self._lock:
+            if self._said.statistic_names != list(message.name):
+                self._said = _room(self._said.names, list(message.name), self._said)
+            self._put("statistics", message)
+
+    def _put(self, field: str, message: JointState) -> None:
+        """Numbers of a sample that was flagged lately."""
+        said, t_ns = self._said, _t_ns(message)
+        for back in range(1, min(said.count, _BEHIND, _MOST) + 1):
+            row = said.rows[(said.count - back) % _MOST]
+            if row["t_ns"] == t_ns:
+                row[field] = message.position
+                return
+
+    def _why(self, message: String) -> None:
+        with self._lock:
+            self._reason = message.data
+
+    def plotted(self) -> Plotted:
+        """The last `window` seconds."""
+        with self._lock:
+            said, heard, reason = self._said, self._heard, self._reason
+            order = np.arange(max(0, said.count - _MOST), said.count) % _MOST
+            rows = said.rows[order]
+        if len(rows):
+            rows = rows[rows["t_ns"] > rows["t_ns"][-1] - self._window * 1e9]
+        t = (rows["t_ns"] - rows["t_ns"][-1]) * 1e-9 if len(rows) else np.empty(0)
+        raised = bool(len(rows)) and bool(rows["alarm"][-1])
+        quiet = time.monotonic() - heard
+        if not len(rows):
+            note = f"Waiting for {self.name}: nothing is heard on {self.name}/flags."
+        else:
+            note = f"{plural(len(rows), 'sample')}, 0 s is the newest" + (f"; {reason}." if reason else ".")
+            if quiet > _SILENT:
+                note = f"Nothing has come for {quiet:.0f} s. {note}"
+        if raised:
+            note = f"ALARM. {note}"
+        statistics = dict(zip(said.statistic_names, rows["statistics"].T, strict=True))
+        found = plotted_live(
+            self.name, said.names, t, rows["flags"], rows["alarm"], rows["utilisation"], statistics, note
+        )
+        return replace(found, title=f"{'ALARM ' if raised else ''}{self.name}")
+
+
+def _room(names: list[str], statistics: list[str], before: _Said | None = None) -> _Said:
+    """Room for the samples of a model; `before`: the same without its statistics."""
+    n, s = len(names), len(statistics)
+    rows = np.zeros(
+        _MOST,
+        dtype=[
+            ("t_ns", "i8"), ("alarm", "?"), ("flags", "f8", (n,)), ("utilisation", "f8", (n,)),
+            ("statistics", "f8", (s,)),
+        ],
+    )  # fmt: skip
+    if before is None:
+        return _Said(names, statistics, rows)
+    for field in ("t_ns", "alarm", "flags", "utilisation"):
+        rows[field] = before.rows[field]
+    rows["statistics"] = np.nan
+    return _Said(names, statistics, rows, before.count)
+
+
+def _t_ns(message: JointState) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+@contextmanager
+def serving(watched: Watched, host: str, port: int) -> Iterator[str]:
+    """Serve the page while the block runs; the address. Raises UncertainLTIError where the port is taken."""
+    local = host in ("127.0.0.1", "localhost", "::1")
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+            if local and asked not in ("127.0.0.1", "localhost", "[::1]"):
+                self.send_error(403, "this page is for this machine alone")
+            elif self.path == "/":
+                page = interactive_page(watched.name, [watched.plotted()], live=_EVERY)
+                self._answer("text/html; charset=utf-8", page)
+            elif self.path == "/data":
+                self._answer("application/json", packed_data([watched.plotted()], _EVERY))
+            else:
+                self.send_error(404)
+
+        def _answer(self, kind: str, text: str) -> None:
+            body = text.encode("utf-8", "replace")
+            self.send_response(200)
+            for name, value in (
+                ("Content-Type", kind), ("Content-Length", str(len(body))), ("Cache-Control", "no-store"),
+                ("X-Content-Type-Options", "nosniff"), ("X-Frame-Options", "DENY"),
+            ):  # fmt: skip
+                self.send_header(name, value)
+            self.end_headers()
+            self.wfile.write(body)
+
+        def log_message(self, format: str, *args: Any) -> None:
+            """Nothing: a line a second would hide all others."""
+
+    try:
+        server = ThreadingHTTPServer((host, port), Handler)
+    except (OSError, OverflowError) as error:
+        why = error.strerror if isinstance(error, OSError) else str(error)
+        raise UncertainLTIError(f"{host}:{port}: cannot be served: {why}; choose another --port or --host") from None
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.2}, daemon=True)
+    thread.start()
+    try:
+        yield f"http://{host}:{server.server_address[1]}/"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments of `uncertain-lti watch`."""
+    parser.add_argument("monitor", nargs="?", default=NODE, metavar="NODE", help=f"node to watch (default {NODE})")
+    parser.add_argument("--port", type=int, default=8350, metavar="N", help="port of the page (default 8350; 0: any)")
+    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="default 127.0.0.1, this machine alone")
+    parser.add_argument("--seconds", type=seconds, default=120.0, metavar="S", help="time that it shows (default 120)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Serve the page until SIGINT or SIGTERM."""
+    with living(lambda: Node("uncertain_lti_watch")) as life:
+        with serving(Watched(life.node, args.monitor, args.seconds), args.host, args.port) as address:
+            tell(f"watching {args.monitor} at {address}; stop with Ctrl-C")
+            while life.alive:
+                life.spin_once()
+    return 0
