@@ -21,6 +21,7 @@ from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
 from uncertain_lti.identification.solvers import (
     FEASIBLE,
     Answer,
+    Sense,
     Simplex,
     dual_bound,
     linear_bound,
@@ -155,6 +156,12 @@ class Programmes:
         self._last[kind] = answer
         return answer.xi, answer.solver
 
+    def _active(self, kind: str, count: int, behind: int = 0) -> Sense | None:
+        """What was active in the last programme of a kind, but the last `behind`; None where it has another size."""
+        last = self._last.get(kind)
+        known = None if last is None or last.active is None or len(last.active) != count else last.active
+        return known[: count - behind] if known is not None else None
+
     def quadratic(self) -> str:
         """Solve (10) on the working set."""
         row = self.row
@@ -288,9 +295,12 @@ class Programmes:
         xi = np.concatenate([*row.scaled(), [row.limit]])
         cost = np.append(np.zeros(len(xi) - 1), 1.0)
         low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
-        bound = linear_bound(cost, *self.rows(row.pool), low, high, xi)
-        if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
-            return bound
+        G, h = self.rows(row.pool)
+        active = self._active("regularised", len(xi) + len(h) + len(row.asked), len(row.asked))
+        for known in (active, None) if active is not None else (None,):
+            bound = linear_bound(cost, G, h, low, high, xi, known)
+            if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+                return bound
         inside, room = row.slacks()
         assert room is not None
         few = 2 * (row.r + row.q)
@@ -329,15 +339,18 @@ class Programmes:
             theta = np.linalg.lstsq(row.basis, theta, rcond=None)[0].astype(np.float64)
         H, f = row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        bound = dual_bound(H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper, xi)
-        value = max(row.value(d), row.least_value())
+        programme = H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper, xi
+        objective, value = float(0.5 * xi @ H @ xi + f @ xi), max(row.value(d), row.least_value())
+        above = objective - dual_bound(*programme, self._active("quadratic", len(f) + len(programme[3])))
+        if not above <= GOOD * value:
+            above = min(above, objective - dual_bound(*programme))
         weight = factor * TIE_BREAK * float(np.diagonal(row.gram).min(initial=1.0))
         spread = max(float(d @ row.plain @ d), 0.0)
         smallest = self._least_effect()
         largest = (row.rms_step / row.scale + np.sqrt(spread) + float(np.abs(row.half).max(initial=0.0))) ** 2
         lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
         ties = factor * TIE_BREAK * (1.0 if row.sums.gram is None else float(len(d)))
-        return float(max(0.5 * xi @ H @ xi + f @ xi - bound, 0.0) + lifted) / value + ties
+        return float(max(above, 0.0) + lifted) / value + ties
 
     def _least_effect(self) -> float:
         """Least mean square effect that unknowns of unit length have on the centre, but for those that have none.

@@ -189,7 +189,9 @@ def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _:
 _SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp))
 
 
-def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
+def dual_bound(
+    H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None = None
+) -> float:
     """A lower bound of the optimum of `solve_qp`, whoever found ξ: the dual objective at multipliers made for ξ.
 
     Any non-negative multipliers λ give a bound, -½ |L⁻¹(Cᵀλ - f)|² + lᵀλ with H = L Lᵀ and C ξ >= l what is active at
@@ -198,15 +200,14 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
     there are none.
 
     `H` (v, v): as in `solve_qp`; `f` (v,): as in `solve_qp`; `G` (K, v): as in `solve_qp`; `h` (K,): as in `solve_qp`;
-    `lower` (v,): as in `solve_qp`; `upper` (v,): as in `solve_qp`; `xi` (v,): ξ, near the optimum.
+    `lower` (v,): as in `solve_qp`; `upper` (v,): as in `solve_qp`; `xi` (v,): ξ, near the optimum; `active`: as of
+    `Answer`; without it what has next to no slack.
     """
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
 
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))  # as in `solve_qp`
-    rows, limits = np.vstack([np.eye(len(f)), -np.eye(len(f)), G]), np.concatenate([lower, -upper, h])
-    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
-    C, limits = rows[near].T, limits[near]
+    C, limits = _active(G, h, lower, upper, xi, active)
     best = -np.inf
     try:
         L = np.linalg.cholesky(H * np.outer(s, s))
@@ -217,7 +218,7 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
     for columns, gradient in attempts:
         unit = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         try:
-            multiplier = nnls(columns / unit, gradient)[0] / unit if len(near) else np.empty(0)
+            multiplier = nnls(columns / unit, gradient)[0] / unit if len(limits) else np.empty(0)
         except RuntimeError:  # too many iterations
             continue
         left = whitened @ multiplier - linear
@@ -225,19 +226,31 @@ def dual_bound(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Arra
     return best
 
 
-def linear_bound(cost: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array) -> float:
+def linear_bound(
+    cost: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None = None
+) -> float:
     """As `dual_bound`, of the linear programme minimise costᵀξ subject to G ξ >= h, lower <= ξ <= upper."""
     from scipy.optimize import nnls
 
-    rows, limits = np.vstack([np.eye(len(cost)), -np.eye(len(cost)), G]), np.concatenate([lower, -upper, h])
-    near = np.flatnonzero(rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0))
-    unit = np.maximum(np.linalg.norm(rows[near], axis=1), 1e-300)
+    C, limits = _active(G, h, lower, upper, xi, active)
+    unit = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
     try:
-        multiplier = nnls(rows[near].T / unit, cost)[0] / unit
+        multiplier = nnls(C / unit, cost)[0] / unit
     except RuntimeError:  # too many iterations
         return -np.inf
-    left = float(np.abs(rows[near].T @ multiplier - cost).sum())
-    return float(limits[near] @ multiplier) if left <= _SLIGHT else -np.inf
+    left = float(np.abs(C @ multiplier - cost).sum())
+    return float(limits @ multiplier) if left <= _SLIGHT else -np.inf
+
+
+def _active(G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None) -> tuple[Array, Array]:
+    """Columns (v, k) and limits (k,) of what is active, as lower bounds; by the slack at ξ where it is not known."""
+    size = len(xi)
+    rows, limits = np.vstack([np.eye(size), -np.eye(size), G]), np.concatenate([lower, -upper, h])
+    if active is None:
+        near = rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0)
+    else:
+        near = np.concatenate([active[:size] == 3, active[:size] == 1, active[size:] > 0])
+    return rows[near].T, limits[near]
 
 
 _ITERATIONS = 50
