@@ -18,6 +18,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -37,6 +38,16 @@ DONE, ALARM, BAD_INPUT, UNKNOWN, FAULT, INTERRUPTED, NOT_READ = 0, 1, 2, 3, 70, 
 known whether there is an alarm.
 """
 
+
+@dataclass(frozen=True)
+class Result:
+    """What a command comes to: `data` for --json, if it has any; else `text`, which --quiet prints as well."""
+
+    status: int = DONE
+    data: Any = None
+    text: str = ""
+
+
 SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
 
 
@@ -48,8 +59,9 @@ class Command:
     takes time to load: every command is declared whenever one is run.
 
     `name`: the word on the command line; `help`: what the command does, for the list of commands; `options`: its
-    arguments and options; `run`: runs the command with the parsed options and returns the exit status;
-    `options.progress` is a `Progress`; `quiet`: what `--quiet` does, for the help; empty if the command has no such
+    arguments and options; `run`: runs the command with the parsed options and returns its result;
+    it prints nothing: `options.say` takes the summary for a person part by part, and `options.progress` is a
+    `Progress`; `quiet`: what `--quiet` does, for the help; empty if the command has no such
     option; `verbose`: what `--verbose` does, likewise; `of_ros`: module of `uncertain_lti_ros` that declares the
     options and runs; not every installation has what it imports.
     """
@@ -57,7 +69,7 @@ class Command:
     name: str
     help: str
     options: tuple[Option, ...] = ()
-    run: Callable[[argparse.Namespace], int] | None = None
+    run: Callable[[argparse.Namespace], Result] | None = None
     quiet: str = ""
     verbose: str = ""
     of_ros: str = ""
@@ -74,7 +86,21 @@ class Command:
                 parser.set_defaults(run=module.run)
 
 
-def print_summary(options: argparse.Namespace, text: str) -> None:
+def run(options: argparse.Namespace) -> int:
+    """Run the command of parsed options and print what came of it; a module of ROS prints by itself."""
+    options.say = partial(_print_summary, options)
+    result = options.run(options)
+    if isinstance(result, int):
+        return result
+    if getattr(options, "json", False):
+        if result.data is not None:
+            print_json(result.data)
+    elif result.text:
+        print(result.text)
+    return int(result.status)
+
+
+def _print_summary(options: argparse.Namespace, text: str) -> None:
     """Print part of the summary for a person, unless JSON is asked for or nothing at all.
 
     What is to be written is written also when `| head` has read enough; only a check has nothing more to do.

@@ -14,11 +14,11 @@ from __future__ import annotations
 import argparse
 
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.cli.command import DONE, Command, load_model, print_json, print_summary
+from uncertain_lti.cli.command import Command, Result, load_model
 from uncertain_lti.cli.options import PUBLISHED, helped
 
 
-def run_info(options: argparse.Namespace) -> int:
+def run_info(options: argparse.Namespace) -> Result:
     """Print the model."""
     from uncertain_lti.reports.model_text import block_facts, model_text
     from uncertain_lti.reports.tables import finite_data
@@ -26,47 +26,38 @@ def run_info(options: argparse.Namespace) -> int:
     model = load_model(options.model)
     if options.json:
         regimes = finite_data(block_facts(model))
-        print_json(model.to_dict() | ({"regimes": regimes} if regimes else {}))
-    else:
-        try:
-            text = model_text(model)
-        except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-            raise ModelError(
-                f"{options.model}: what it says of its own fit is odd ({type(error).__name__}: {error}); fit it again, "
-                f"or print it with --json"
-            ) from None
-        print(text)
-    return DONE
+        return Result(data=model.to_dict() | ({"regimes": regimes} if regimes else {}))
+    try:
+        return Result(text=model_text(model))
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
+        raise ModelError(
+            f"{options.model}: what it says of its own fit is odd ({type(error).__name__}: {error}); fit it again, "
+            f"or print it with --json"
+        ) from None
 
 
-def run_layout(options: argparse.Namespace) -> int:
+def run_layout(options: argparse.Namespace) -> Result:
     """Write the layouts that are asked for."""
     from uncertain_lti.reports.layouts import write_layouts
 
     written = write_layouts(load_model(options.model), options.foxglove, options.plotjuggler, options.topics)
-    if options.json:
-        print_json({"model": options.model, "layouts": [str(path) for path in written]})
-        return DONE
-    for path in written:
-        print(f"layout written to {path}")
-    return DONE
+    data = {"model": options.model, "layouts": [str(path) for path in written]}
+    return Result(data=data, text="\n".join(f"layout written to {path}" for path in written))
 
 
-def run_reproduce(options: argparse.Namespace) -> int:
+def run_reproduce(options: argparse.Namespace) -> Result:
     """Run the experiment into a folder."""
     from uncertain_lti.plants.reproduce import reproduce
 
     try:
         with options.progress.stage("reproducing") as step:
-            data = reproduce(options.output, lambda text: print_summary(options, text), step)
+            data = reproduce(options.output, options.say, step)
     except OSError as error:
         raise BagError(f"{options.output}: cannot be written: {error.strerror}; choose another folder") from None
-    if options.json:
-        print_json({"output": options.output, **data})
-    return DONE
+    return Result(data={"output": options.output, **data})
 
 
-def run_completion(options: argparse.Namespace) -> int:
+def run_completion(options: argparse.Namespace) -> Result:
     """Print the script of a shell."""
     import shtab  # type: ignore[import-not-found, import-untyped, unused-ignore]
 
@@ -79,8 +70,7 @@ def run_completion(options: argparse.Namespace) -> int:
                 action.complete = shtab.DIRECTORY
             elif kind in ("BAG", "MODEL", "FILE") or "." in str(action.metavar or ""):
                 action.complete = shtab.FILE
-    print(shtab.complete(parser, shell=options.shell))
-    return DONE
+    return Result(text=shtab.complete(parser, shell=options.shell))
 
 
 INFO = Command(

@@ -23,13 +23,11 @@ from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.command import (
-    DONE,
     SILENT,
     Command,
+    Result,
     model_target,
-    print_json,
     print_notes,
-    print_summary,
     read_labelled,
 )
 from uncertain_lti.cli.options import RECORDINGS, helped
@@ -41,7 +39,7 @@ if TYPE_CHECKING:
 # --- fit -------------------------------------------------------------------------------------------------------------
 
 
-def run_fit(options: argparse.Namespace) -> int:
+def run_fit(options: argparse.Namespace) -> Result:
     """Fit a model and write it."""
     from uncertain_lti.reports.model_text import fit_text, next_text
 
@@ -51,13 +49,9 @@ def run_fit(options: argparse.Namespace) -> int:
     archive = options.cache or options.scheduler or options.workers
     model = _fit_archive(options) if archive else _fit_in_memory(options)
     model.save(output)
-    if options.json:
-        data = model.to_dict()
-        print_json({"model": str(output), "fit": data["fit"], "validation": data["validation"]})
-    print_summary(options, fit_text(model))
-    print_summary(options, f"model written to {output}")
-    print_summary(options, next_text(model, shlex.quote(str(output))))
-    return DONE
+    options.say(f"{fit_text(model)}\nmodel written to {output}\n{next_text(model, shlex.quote(str(output)))}")
+    data = model.to_dict()
+    return Result(data={"model": str(output), "fit": data["fit"], "validation": data["validation"]})
 
 
 def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
@@ -70,7 +64,7 @@ def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
     for transient in transients:
         if not options.json:
             print_notes(options, transient.notes)
-        print_summary(options, recording_text(transient))
+        options.say(recording_text(transient))
     resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
     asked = ("additive", "horizons", "widths", "alarm", "false_alarms", "discard", "count")
     given = {name: getattr(options, name) for name in asked} | {"schedule": schedule, "groups": options.group}
@@ -155,7 +149,7 @@ def _with_sources(model: UncertainLTI, sources: Iterable[dict[str, Any]], group:
 # --- tune ------------------------------------------------------------------------------------------------------------
 
 
-def run_tune(options: argparse.Namespace) -> int:
+def run_tune(options: argparse.Namespace) -> Result:
     """Try the ways, print them, and write the model that was chosen."""
     from uncertain_lti import read_transients, tune
     from uncertain_lti.reports.model_text import alarm_text, headline_text
@@ -180,14 +174,11 @@ def run_tune(options: argparse.Namespace) -> int:
         given = {"budget": options.budget, "groups": options.group, "faulty": faulty, "progress": step}
         tuned = tune(transients, options.false_alarms, **given)
     data = tuned.to_dict()
-    if options.json:
-        print_json({"model": options.output, "tune": data})
-    for text in (headline_text(tuned.model), tune_text(data), alarm_text(tuned.model)):
-        print_summary(options, text)
+    options.say("\n".join((headline_text(tuned.model), tune_text(data), alarm_text(tuned.model))))
     if output is not None:
         _with_sources(tuned.model, _files(transients), options.group).save(output)
-        print_summary(options, f"model written to {output}")
-    return DONE
+        options.say(f"model written to {output}")
+    return Result(data={"model": options.output, "tune": data})
 
 
 def _label(text: str) -> str | None:

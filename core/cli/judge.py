@@ -26,11 +26,10 @@ from uncertain_lti.cli.command import (
     SILENT,
     UNKNOWN,
     Command,
+    Result,
     complain,
     load_model,
-    print_json,
     print_notes,
-    print_summary,
 )
 from uncertain_lti.cli.options import DEPLOYED, PUBLISHED, RECORDINGS, helped
 
@@ -120,7 +119,7 @@ def _judged(options: argparse.Namespace) -> Judged:
 # --- check -----------------------------------------------------------------------------------------------------------
 
 
-def run_check(options: argparse.Namespace) -> int:
+def run_check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.reports.check import check_data, check_text, outcome
 
@@ -135,29 +134,27 @@ def run_check(options: argparse.Namespace) -> int:
     for bag, verdicts, decisions in judged:
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
-        print_summary(options, check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
+        options.say(check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
         if (copy := copies.get(bag)) is not None:
             writing = options.progress.iterate("writing")
             made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, deployed.monitor.rule, writing)
             print_notes(options, made.notes)
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             messages = plural(made.messages, "message")
-            print_summary(options, f"{messages} and the verdicts below {made.topics} written to {made.path}")
+            options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
     status = judged.status
     if status == DONE and any(r["outcome"] == "unknown" for r in results):
         status = UNKNOWN
-    if options.json:
-        of_all = "unknown" if status == BAD_INPUT else outcome(results)
-        ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
-        about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **ended}
-        print_json({**about, "recordings": results, "not_checked": judged.refused})
-    return status
+    of_all = "unknown" if status == BAD_INPUT else outcome(results)
+    ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
+    about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **ended}
+    return Result(status, {**about, "recordings": results, "not_checked": judged.refused})
 
 
 # --- report ----------------------------------------------------------------------------------------------------------
 
 
-def run_report(options: argparse.Namespace) -> int:
+def run_report(options: argparse.Namespace) -> Result:
     """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.reports.findings import findings, findings_text
     from uncertain_lti.reports.pages import page_target, write_page
@@ -168,23 +165,21 @@ def run_report(options: argparse.Namespace) -> int:
         page_target(output, options.model, judged.bags)
     checked = [verdicts for _, verdicts, _ in judged]
     if not checked:
-        return BAD_INPUT
+        return Result(BAD_INPUT)
     facts = findings(judged.model, options.model, checked, judged.deployed.monitor.rule, judged.deployed.words())
-    print_summary(options, findings_text(facts))
+    options.say(findings_text(facts))
     if output is not None:
         from uncertain_lti.reports.pages import html_report
 
         write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
-        print_summary(options, f"report written to {output}")
-    if options.json:
-        print_json({**facts, "not_checked": judged.refused})
-    return judged.status
+        options.say(f"report written to {output}")
+    return Result(judged.status, {**facts, "not_checked": judged.refused})
 
 
 # --- plot ------------------------------------------------------------------------------------------------------------
 
 
-def run_plot(options: argparse.Namespace) -> int:
+def run_plot(options: argparse.Namespace) -> Result:
     """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.pages import HOLDS, page_target
@@ -215,11 +210,10 @@ def run_plot(options: argparse.Namespace) -> int:
         from uncertain_lti.reports.figures import matrices_figure, save
 
         save(matrices_figure(model), output, 200)
-    print_summary(options, f"plot written to {output}")
-    if options.json:
-        recordings = [str(bag.path) for bag in bags]
-        print_json({"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status})
-    return status
+    options.say(f"plot written to {output}")
+    recordings = [str(bag.path) for bag in bags]
+    data = {"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status}
+    return Result(status, data)
 
 
 def _names_model(path: str) -> bool:

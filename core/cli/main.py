@@ -27,7 +27,7 @@ from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError, absent
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli import delegated, fit, judge, start, validate
-from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output
+from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output, run
 
 COMMANDS: tuple[Command, ...] = (
     start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, delegated.LAYOUT,
@@ -74,7 +74,7 @@ def _run(command: str, given: Sequence[str]) -> int:
     try:
         options = build_parser(command).parse_args(given)
         with Progress(getattr(options, "quiet", False), getattr(options, "verbose", False)) as options.progress:
-            return int(options.run(options))
+            return run(options)
     except UncertainLTIError as error:
         return _refuse(command, str(error))
     except ModuleNotFoundError as error:

@@ -12,17 +12,14 @@
 from __future__ import annotations
 
 import argparse
-import io
-import json
 import os
 import shlex
-from contextlib import redirect_stdout
 from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.cli.command import DONE, SILENT, Command, model_target, print_json, print_notes, print_summary
+from uncertain_lti.cli.command import SILENT, Command, Result, model_target, print_notes
 from uncertain_lti.cli.options import RECORDINGS, helped
 
 _LONGEST_NAME = 200  # letters
@@ -32,7 +29,7 @@ _LONGEST_LIST = 100_000
 # --- topics ----------------------------------------------------------------------------------------------------------
 
 
-def run_topics(options: argparse.Namespace) -> int:
+def run_topics(options: argparse.Namespace) -> Result:
     """Print the topics of a recording and what each holds."""
     from uncertain_lti.recordings.formats import open_recording
     from uncertain_lti.reports.tables import number, table
@@ -46,8 +43,7 @@ def run_topics(options: argparse.Namespace) -> int:
              "log_minus_header": f.stamp_offset, "fields": list(f.fields)}
             for f in facts
         ]  # fmt: skip
-        print_json({"recording": str(bag.path), "warnings": bag.warnings, "topics": held})
-        return DONE
+        return Result(data={"recording": str(bag.path), "warnings": bag.warnings, "topics": held})
     print_notes(options, bag.warnings)
     rows = []
     for f in facts:
@@ -57,19 +53,20 @@ def run_topics(options: argparse.Namespace) -> int:
         name, kind = printable(f.info.topic, _LONGEST_NAME), printable(f.info.type, _LONGEST_NAME)
         rate = f"{number(f.rate)} in bursts" if f.bursts else number(f.rate)
         rows.append([name, kind, str(f.info.count), rate, number(f.largest_gap), stamps])
-    print(table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows))
+    lines = [table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows)]
     for f in facts:
+        name = printable(f.info.topic, _LONGEST_NAME)
         if not f.info.readable or f.info.reason:
-            print(printable(f"{printable(f.info.topic, _LONGEST_NAME)}: {f.info.reason}"))
+            lines.append(printable(f"{name}: {f.info.reason}"))
         if f.fields:
-            print(printable(f"{printable(f.info.topic, _LONGEST_NAME)}: {', '.join(f.fields)}", _LONGEST_LIST))
-    return DONE
+            lines.append(printable(f"{name}: {', '.join(f.fields)}", _LONGEST_LIST))
+    return Result(text="\n".join(lines))
 
 
 # --- init ------------------------------------------------------------------------------------------------------------
 
 
-def run_init(options: argparse.Namespace) -> int:
+def run_init(options: argparse.Namespace) -> Result:
     """Write or print the proposed signals file."""
     from uncertain_lti.base.english import shortlist
     from uncertain_lti.base.files import whole_file
@@ -82,8 +79,7 @@ def run_init(options: argparse.Namespace) -> int:
     proposal = propose(options.bags, reading, **chosen, like=options.like)
     print_notes(options, proposal.warnings)
     if output is None and not options.json:
-        print(proposal.text, end="")
-        return DONE
+        return Result(text=proposal.text.removesuffix("\n"))
     if output is not None:
         try:
             with whole_file(output) as stream:
@@ -98,22 +94,21 @@ def run_init(options: argparse.Namespace) -> int:
             for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
         }
         more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
-        print_json({"output": output, **proposed, **more})
-        return DONE
+        return Result(data={"output": output, **proposed, **more})
     alike = f"and the same for each of {shortlist(proposal.members, 12)}\n" if proposal.members else ""
-    options.progress.say(
+    options.say(
         f"states: {', '.join(c.name for c in proposal.states)}\n"
         f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n{alike}"
         f"signals file written to {output}: read it and edit it, it says why; then\n"
         f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
     )
-    return DONE
+    return Result()
 
 
 # --- start -----------------------------------------------------------------------------------------------------------
 
 
-def run_start(options: argparse.Namespace) -> int:
+def run_start(options: argparse.Namespace) -> Result:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.reports.findings import findings_text
     from uncertain_lti.reports.pages import page_target
@@ -125,35 +120,28 @@ def run_start(options: argparse.Namespace) -> int:
     page_target(page, model, [])
     parts: dict[str, Any] = {"signals": signals, "model": model, "report": page}
     if os.path.exists(signals):
-        print_summary(options, f"signals: as {signals} has them")
+        options.say(f"signals: as {signals} has them")
     else:
-        parts["init"] = _data(options, ["init", *options.bags, "--output", signals])[1]
+        parts["init"] = _part(options, ["init", *options.bags, "--output", signals]).data
         for kind in ("states", "controls"):
             names = ", ".join(signal["name"] for signal in parts["init"][kind])
-            print_summary(options, f"{kind}: {names or 'none found'}")
-        print_summary(options, f"signals file written to {signals}: it says why; edit it and start again with --force")
+            options.say(f"{kind}: {names or 'none found'}")
+        options.say(f"signals file written to {signals}: it says why; edit it and start again with --force")
     forced = ["--force"] * options.force
-    parts["fit"] = _data(options, ["fit", *options.bags, "--signals", signals, "--output", model, *forced])[1]
-    status, facts = _data(options, ["report", model, *(options.check or options.bags), "--output", page])
-    parts["findings"] = facts
-    if facts is None:  # no recording could be checked, which is said
-        return status
-    print_summary(options, findings_text(facts))
-    print_summary(options, f"what happened and when: {Path(page).resolve().as_uri()}")
-    print_summary(options, _on_the_robot(model))
-    if options.json:
-        print_json({**parts, "exit_status": status})
-    return status
+    parts["fit"] = _part(options, ["fit", *options.bags, "--signals", signals, "--output", model, *forced]).data
+    report = _part(options, ["report", model, *(options.check or options.bags), "--output", page])
+    if report.data is None:  # no recording could be checked, which is said
+        return report
+    options.say(findings_text(report.data))
+    options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{_on_the_robot(model)}")
+    return Result(report.status, {**parts, "findings": report.data, "exit_status": report.status})
 
 
-def _data(options: argparse.Namespace, words: list[str]) -> tuple[int, Any]:
-    """Run a command of this program; its exit status and what it prints with --json, if anything."""
+def _part(options: argparse.Namespace, words: list[str]) -> Result:
+    """Run a command of this program as with --json; what it comes to."""
     command = options.build_parser(words[0]).parse_args([*words, "--json"])
-    command.progress = options.progress
-    with redirect_stdout(io.StringIO()) as printed:
-        status = int(command.run(command))
-    text = printed.getvalue()
-    return status, json.loads(text) if text else None
+    command.progress, command.say = options.progress, lambda text: None
+    return command.run(command)  # type: ignore[no-any-return]
 
 
 def _on_the_robot(model: str) -> str:

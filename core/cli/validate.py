@@ -17,14 +17,12 @@ from dataclasses import replace
 
 from uncertain_lti.base.errors import BagError, ModelError
 from uncertain_lti.cli.command import (
-    DONE,
     SILENT,
     Command,
+    Result,
     load_model,
     model_target,
-    print_json,
     print_notes,
-    print_summary,
     read_labelled,
 )
 from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
@@ -32,7 +30,7 @@ from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
 # --- validate --------------------------------------------------------------------------------------------------------
 
 
-def run_validate(options: argparse.Namespace) -> int:
+def run_validate(options: argparse.Namespace) -> Result:
     """Validate the model and write it with the result, if an output is named."""
     from uncertain_lti import UncertainLTI
     from uncertain_lti.recordings.formats import group_recordings
@@ -75,18 +73,16 @@ def run_validate(options: argparse.Namespace) -> int:
     output = options.output
     if output is not None:
         model.save(output)
-    if options.json:
-        print_json({"model": output or options.model, "validation": model.to_dict()["validation"]})
-    print_summary(options, validation_text(data))
+    options.say(validation_text(data))
     if output is not None:
-        print_summary(options, f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
-    return DONE
+        options.say(f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
+    return Result(data={"model": output or options.model, "validation": model.to_dict()["validation"]})
 
 
 # --- signature -------------------------------------------------------------------------------------------------------
 
 
-def run_signature(options: argparse.Namespace) -> int:
+def run_signature(options: argparse.Namespace) -> Result:
     """Learn the signatures and write the model with them."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.reports.validation_text import signature_text
@@ -103,17 +99,14 @@ def run_signature(options: argparse.Namespace) -> int:
     checked = [(label, monitor.check(transient)) for label, transient in labelled]
     learnt = learn_signatures(model, checked, options.force)
     model.replace(signatures=learnt.signatures).save(output)
-    if options.json:
-        faults = [
-            {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
-            for s in learnt.signatures
-        ]
-        named = [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named]
-        alike = [{"labels": [a, b], "match": match} for a, b, match in learnt.alike]
-        print_json({"model": str(output), "signatures": faults, "named": named, "alike": alike})
-    print_summary(options, signature_text(learnt))
-    print_summary(options, f"model written to {output}")
-    return DONE
+    faults = [
+        {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
+        for s in learnt.signatures
+    ]
+    named = [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named]
+    alike = [{"labels": [a, b], "match": match} for a, b, match in learnt.alike]
+    options.say(f"{signature_text(learnt)}\nmodel written to {output}")
+    return Result(data={"model": str(output), "signatures": faults, "named": named, "alike": alike})
 
 
 VALIDATE = Command(
