@@ -44,7 +44,7 @@ from uncertain_lti.reports.charts import Columns, Panel, Series, Spans
 from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.model_text import model_blocks
-from uncertain_lti.reports.tables import Block, Table, number, numbers_of, share
+from uncertain_lti.reports.tables import Block, Table, list_of, number, share
 from uncertain_lti.reports.validation_text import detectable_data, detectable_words, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 
@@ -167,14 +167,10 @@ def _cards(model: UncertainLTI, facts: Mapping[str, Any]) -> Iterator[dict[str, 
     yield {"title": "What happened?", "tone": look, "answer": what, "list": items}
     faults = detectable_data(facts["validation"] or {})
     alarm = model.fit_summary.get("alarm")
-    learnt = alarm if isinstance(alarm, Mapping) else {}
-    jumps, within = numbers_of(learnt.get("biases"), model.n), numbers_of([learnt.get("within")], 1)
-    if faults is None and jumps and within:
-        seen = f"Jumps within {number(within[0])} s, from these sizes on"
-        each = zip(model.signals.states, jumps, strict=True)
-        items = [{"text": f"{s.name} {number(jump)} {s.unit}".rstrip()} for s, jump in each]
-        items[6:] = [{"text": f"and {plural(len(items) - 6, 'state')} more", "to": "trust"}] if len(items) > 6 else []
-        items.append({"text": "of others: run uncertain-lti validate MODEL --output MODEL"})
+    promises = list_of(alarm.get("promises")) if isinstance(alarm, Mapping) else []
+    if faults is None and promises:
+        others = "of others: run uncertain-lti validate MODEL --output MODEL"
+        seen, items = "Jumps of these sizes", [{"text": _cut(str(text))} for text in (*promises[:6], others)]
     elif faults is None or faults.get("refused"):
         why = faults["refused"] if faults else "run uncertain-lti validate MODEL --output MODEL"
         seen, items = "Unknown", [{"text": why}]
