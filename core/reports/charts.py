@@ -231,28 +231,33 @@ def columns_of(
 
 def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most: int = 6) -> Chart:
     """What happened and when: the alarm's score over its threshold, then the states that did it."""
-    panel, states = score_panel(model, verdicts, columns)
+    panel, states = alarm_panel(model, verdicts, columns)
     below = utilisation_chart(model, verdicts, columns, np.argsort(-states, kind="stable")[:most].tolist())
     keys = (("score", "score, utilisation"), ("bounds", "inside the bounds"), ("violated", "violated"), *ALARMED)
     return Chart(below.heading, columns, (panel, *below.panels), keys)
 
 
-def score_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Panel, Array]:
+def alarm_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Panel, Array]:
     """The alarm's score over its threshold, and what each state had to do with it (n,)."""
     score, states = scores(model, verdicts, columns)
-    greatest = float(np.nanmax(score, initial=0.0))
-    top = float(np.clip(1.1 * greatest, 1.5, 6.0))
-    note = "never over it" if greatest <= 1 else f"greatest {greatest:.3g}"
+    note = ""
     if columns.alarm.any():
         first = int(columns.starts[columns.alarm.argmax()])
         raised = verdicts.raised(first + int(verdicts.alarm[first:].argmax()))
         note = raised[0].words if raised else note
+    return score_panel(columns, score, note), states
+
+
+def score_panel(columns: Columns, score: Array, note: str = "") -> Panel:
+    """A score (P,) over its threshold, which it is never below while the alarm is up."""
+    score = np.where(columns.alarm, np.fmax(score, 1.0), score)
+    greatest = float(np.nanmax(score, initial=0.0))
     capped = np.minimum(score, FARTHEST)
-    panel = Panel(
+    return Panel(
         "alarm score, 1 is the threshold", (Series("score", np.where(np.isnan(capped), np.nan, 0.0), capped),),
-        limits=(0.0, top), levels=(1.0,), note=note,
+        limits=(0.0, float(np.clip(1.1 * greatest, 1.5, 6.0))), levels=(1.0,),
+        note=note or ("never over it" if greatest <= 1 else f"greatest {greatest:.3g}"),
     )  # fmt: skip
-    return panel, states
 
 
 def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Array, Array]:
@@ -287,8 +292,7 @@ def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[A
         for name, size in zip(verdicts.statistic_names, _most(over[where]), strict=True):
             if (i := of.get(name.partition("/")[2])) is not None:
                 states[i] = max(states[i], size)
-    score = _fmax(np.stack(found, axis=1))
-    return np.where(columns.alarm, np.fmax(score, 1.0), score), states
+    return _fmax(np.stack(found, axis=1)), states
 
 
 def _size(low: Array, high: Array) -> Array:
@@ -313,11 +317,11 @@ def envelope_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, ch
     lower, upper = columns.reduced(verdicts.lower, np.fmin), columns.reduced(verdicts.upper, np.fmax)
     panels = []
     for i in chosen:
-        bad = verdicts.flags[:, i] == 1.0
+        bad, signal = verdicts.flags[:, i] == 1.0, model.signals.states[i]
         marks = columns.worst(bad, verdicts.utilisation[:, i], x[:, i])
         sides = np.concatenate([lower[:, i], low[:, i]]), np.concatenate([upper[:, i], high[:, i]])
         series = Series("bounds", lower[:, i], upper[:, i]), _series("recorded", low[:, i], high[:, i], columns)
-        panels.append(_panel(model, columns, i, series, _limits(*sides), marks, bad))
+        panels.append(_panel(columns, signal.name, series, _limits(*sides), marks, bad, signal.unit))
     keys = (("bounds", "one-step bounds"), ("recorded", "recorded"), ("violated", "violated"), *ALARMED)
     return Chart(heading(verdicts), columns, tuple(panels), keys)
 
@@ -327,19 +331,27 @@ def utilisation_chart(
 ) -> Chart:
     """Where between its bounds each state lay, -1 and 1 at the bounds; `row` 0 is one step, others the horizons."""
     values = verdicts.longer_utilisation[:, row - 1] if row else verdicts.utilisation
+    with np.errstate(invalid="ignore"):
+        bad = np.abs(values) > 1.0 if row else verdicts.flags == 1.0
+    panels = utilisation_panels(columns, model.state_names, values, bad, chosen)
+    keys = (("bounds", "inside the bounds"), ("utilisation", "utilisation"), ("violated", "violated"), *ALARMED)
+    return Chart(heading(verdicts), columns, panels, keys)
+
+
+def utilisation_panels(
+    columns: Columns, names: Sequence[str], values: Array, bad: Mask, chosen: Sequence[int]
+) -> tuple[Panel, ...]:
+    """Utilisation (samples, n) of some states over time, those marked that are violated (samples, n)."""
     low, high = columns.extremes(values)
     panels = []
     for i in chosen:
-        with np.errstate(invalid="ignore"):
-            bad = np.abs(values[:, i]) > 1.0 if row else verdicts.flags[:, i] == 1.0
         size = _size(low[:, i], high[:, i])
         limit = float(np.clip(1.1 * size[np.isfinite(size)].max(initial=0.0), 1.25, 4.0))
-        marks = columns.worst(bad, values[:, i], values[:, i])
+        marks = columns.worst(bad[:, i], values[:, i], values[:, i])
         a, b, marks = (np.clip(v, -FARTHEST, FARTHEST) for v in (low[:, i], high[:, i], marks))
         series = (_series("utilisation", a, b, columns),)
-        panels.append(_panel(model, columns, i, series, (-limit, limit), marks, bad, levels=(-1.0, 1.0)))
-    keys = (("bounds", "inside the bounds"), ("utilisation", "utilisation"), ("violated", "violated"), *ALARMED)
-    return Chart(heading(verdicts), columns, tuple(panels), keys)
+        panels.append(_panel(columns, names[i], series, (-limit, limit), marks, bad[:, i], levels=(-1.0, 1.0)))
+    return tuple(panels)
 
 
 def utilisation_map(model: UncertainLTI, verdicts: Verdicts, columns: Columns, chosen: Sequence[int]) -> Chart:
@@ -387,15 +399,13 @@ def _series(role: str, low: Array, high: Array, columns: Columns) -> Series:
 
 
 def _panel(
-    model: UncertainLTI, columns: Columns, i: int, series: tuple[Series, ...], limits: tuple[float, float],
-    marks: Array, bad: Mask, levels: tuple[float, ...] = (),
+    columns: Columns, name: str, series: tuple[Series, ...], limits: tuple[float, float], marks: Array, bad: Mask,
+    unit: str = "", levels: tuple[float, ...] = (),
 ) -> Panel:  # fmt: skip
-    signal = model.signals.states[i]
     first = int(columns.starts[0]) if len(columns.starts) else 0
     count = int(bad[first : columns.stop].sum())
-    unit = "" if levels else signal.unit
     note = f"violated {count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}") if count else ""
-    return Panel(signal.name, series, unit, limits, marks, levels, count, note)
+    return Panel(name, series, unit, limits, marks, levels, count, note)
 
 
 def _limits(lower: Array, upper: Array) -> tuple[float, float]:

@@ -259,7 +259,7 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
     numbers = (6 + 2 * len(model.steps)) * model.n + 2 * model.m + 3
     columns = charts.columns_of(verdicts, _stretches(recordings, numbers), fine=True)
     of, states = (model, verdicts, columns), range(model.n)
-    top, _ = charts.score_panel(*of)
+    top, _ = charts.alarm_panel(*of)
     made = {"utilisation" + ", 1 step" * bool(model.steps): charts.utilisation_chart(*of, states)}
     made["values"] = charts.envelope_chart(*of, states)
     for row, steps in enumerate(model.steps, 1):
@@ -316,20 +316,13 @@ def plotted_live(
     most = _stretches(1, 2 * len(states) + 2)
     columns = Columns.of(t, None, judged, alarm, np.asarray(bad.any(axis=1) | alarm), most)
     score = np.abs(np.column_stack(list(statistics.values())) if statistics else utilisation)
-    score = np.fmax.reduce(columns.reduced(score, np.fmax), axis=1, initial=np.nan)
-    score = np.minimum(np.where(columns.alarm, np.fmax(score, 1.0), score), charts.FARTHEST)
-    top = Panel("alarm score, 1 is the threshold", (Series("score", score, score),), levels=(1.0,))
-    shown = np.clip(utilisation, -charts.FARTHEST, charts.FARTHEST)
-    low, high = columns.extremes(shown)
+    top = charts.score_panel(columns, np.fmax.reduce(columns.reduced(score, np.fmax), axis=1, initial=np.nan))
     blame = dict.fromkeys(states, 0.0)
     for statistic, values in statistics.items():
         state = statistic.partition("/")[2]
         blame[state] = max(blame.get(state, 0.0), float(np.nanmax(np.abs(values[alarm]), initial=0.0)))
-    panels = []
-    for i, state in sorted(enumerate(states), key=lambda at: -blame[at[1]]):
-        marks = columns.worst(bad[:, i], utilisation[:, i], shown[:, i])
-        series = (Series("utilisation", low[:, i], high[:, i] if columns.binned else None),)
-        panels.append((columns, Panel(state, series, marks=marks, levels=(-1.0, 1.0), count=int(bad[:, i].sum()))))
+    order = sorted(range(len(states)), key=lambda i: -blame[states[i]])
+    panels = [(columns, panel) for panel in charts.utilisation_panels(columns, states, utilisation, bad, order)]
     return Plotted(name, note, [("utilisation", panels)], [(columns, top)], columns.alarms, columns.silent)
 
 
