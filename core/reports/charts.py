@@ -320,7 +320,7 @@ def envelope_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, ch
         bad, signal = verdicts.flags[:, i] == 1.0, model.signals.states[i]
         marks = columns.worst(bad, verdicts.utilisation[:, i], x[:, i])
         sides = np.concatenate([lower[:, i], low[:, i]]), np.concatenate([upper[:, i], high[:, i]])
-        series = Series("bounds", lower[:, i], upper[:, i]), _series("recorded", low[:, i], high[:, i], columns)
+        series = Series("bounds", lower[:, i], upper[:, i]), series_of("recorded", low[:, i], high[:, i], columns)
         panels.append(_panel(columns, signal.name, series, _limits(*sides), marks, bad, signal.unit))
     keys = (("bounds", "one-step bounds"), ("recorded", "recorded"), ("violated", "violated"), *ALARMED)
     return Chart(heading(verdicts), columns, tuple(panels), keys)
@@ -349,7 +349,7 @@ def utilisation_panels(
         limit = float(np.clip(1.1 * size[np.isfinite(size)].max(initial=0.0), 1.25, 4.0))
         marks = columns.worst(bad[:, i], values[:, i], values[:, i])
         a, b, marks = (np.clip(v, -FARTHEST, FARTHEST) for v in (low[:, i], high[:, i], marks))
-        series = (_series("utilisation", a, b, columns),)
+        series = (series_of("utilisation", a, b, columns),)
         panels.append(_panel(columns, names[i], series, (-limit, limit), marks, bad[:, i], levels=(-1.0, 1.0)))
     return tuple(panels)
 
@@ -394,7 +394,8 @@ def runs(flags: Mask) -> list[tuple[int, int]]:
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
-def _series(role: str, low: Array, high: Array, columns: Columns) -> Series:
+def series_of(role: str, low: Array, high: Array, columns: Columns) -> Series:
+    """One quantity (P,) from its least and greatest of each column."""
     return Series(role, low, high if columns.binned else None)
 
 

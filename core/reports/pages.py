@@ -40,7 +40,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.reports import charts
-from uncertain_lti.reports.charts import Columns, Panel, Series, Spans
+from uncertain_lti.reports.charts import Columns, Panel, Spans
 from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.model_text import model_blocks
@@ -334,7 +334,7 @@ def _stretches(recordings: int, numbers: int) -> int:
 def _panels(columns: Columns, values: Array, names: Sequence[tuple[str, str]], role: str) -> list[Placed]:
     low, high = columns.extremes(np.where(np.isfinite(values), values, np.nan))
     return [
-        (columns, Panel(name, (Series(role, low[:, i], high[:, i] if columns.binned else None),), unit))
+        (columns, Panel(name, (charts.series_of(role, low[:, i], high[:, i], columns),), unit))
         for i, (name, unit) in enumerate(names)
     ]
 
