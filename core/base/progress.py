@@ -69,9 +69,9 @@ class Progress:
         """Whether bars are drawn."""
         return not self.quiet and self._stream.isatty()
 
-    def note(self, text: str) -> None:
-        """A remark that the reader should know, unless quiet."""
-        if not self.quiet:
+    def note(self, *texts: str) -> None:
+        """Remarks that the reader should know, unless quiet."""
+        for text in texts if not self.quiet else ():
             self.write(f"note: {printable(text)}")
 
     def say(self, text: str) -> None:

@@ -134,12 +134,6 @@ def print_json(data: Any) -> None:
     sys.stdout.write("\n")
 
 
-def print_notes(options: argparse.Namespace, notes: Iterable[str]) -> None:
-    """Print remarks on standard error, unless quiet."""
-    for note in notes:
-        options.progress.note(note)
-
-
 def load_model(name: str) -> UncertainLTI:
     """Load the model of a file, or the published one by its name."""
     from uncertain_lti import UncertainLTI
@@ -164,7 +158,7 @@ def read_labelled(
     for label, name in pairs:
         for bag in group_recordings([name], layout=signals.table):
             transient = read_as_fitted(bag, signals, options.progress.iterate("reading"))
-            print_notes(options, transient.notes)
+            options.progress.note(*transient.notes)
             yield label, transient
 
 

@@ -27,7 +27,6 @@ from uncertain_lti.cli.command import (
     Command,
     Result,
     model_target,
-    print_notes,
     read_labelled,
 )
 from uncertain_lti.cli.options import RECORDINGS, helped
@@ -63,7 +62,7 @@ def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
     transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"), processes=None)
     for transient in transients:
         if not options.json:
-            print_notes(options, transient.notes)
+            options.progress.note(*transient.notes)
         options.say(recording_text(transient))
     resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
     asked = ("additive", "horizons", "widths", "alarm", "false_alarms", "discard", "count")
@@ -162,7 +161,7 @@ def run_tune(options: argparse.Namespace) -> Result:
         raise FitError("no recording of the healthy machine is named; give at least one without a label")
     transients = read_transients(healthy, options.signals, options.progress.iterate("reading"), processes=None)
     for transient in transients:
-        print_notes(options, transient.notes)
+        options.progress.note(*transient.notes)
     resolve_groups(transients, options.group)
     signals = transients[0].signals
     assert signals is not None

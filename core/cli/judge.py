@@ -29,7 +29,6 @@ from uncertain_lti.cli.command import (
     Result,
     complain,
     load_model,
-    print_notes,
 )
 from uncertain_lti.cli.options import DEPLOYED, PUBLISHED, RECORDINGS, helped
 
@@ -95,7 +94,7 @@ class Judged:
                 complain(options.command, str(error))
                 self.refused.append({"recording": str(bag.path), "error": str(error)})
                 continue
-            print_notes(options, verdicts.transient.notes)
+            options.progress.note(*verdicts.transient.notes)
             self.alarm = self.alarm or bool(verdicts.alarm.any())
             yield bag, verdicts, decisions
         if self.refused:
@@ -138,7 +137,7 @@ def run_check(options: argparse.Namespace) -> Result:
         if (copy := copies.get(bag)) is not None:
             writing = options.progress.iterate("writing")
             made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, deployed.monitor.rule, writing)
-            print_notes(options, made.notes)
+            options.progress.note(*made.notes)
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             messages = plural(made.messages, "message")
             options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
@@ -255,14 +254,14 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
         reading = options.progress.iterate("reading")
         runs = read_transients([bag.path for bag in bags], options.signals, progress=reading)
         for transient in runs:
-            print_notes(options, transient.notes)
+            options.progress.note(*transient.notes)
         return [plotted_transient(transient, len(runs)) for transient in runs]
     from uncertain_lti.proposal.reading import moving_numbers
 
     plotted = []
     for bag in bags:
         fields, left = moving_numbers(bag, options.progress.iterate("reading"))
-        print_notes(options, bag.warnings)
+        options.progress.note(*bag.warnings)
         if not fields:
             raise BagError(f"{bag.path}: no number in it moves; `uncertain-lti topics {bag.path}` lists what it holds")
         note = "Every number that moves, over the time of arrival." + f" Left out: {shortlist(left, 8)}." * bool(left)

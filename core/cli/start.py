@@ -19,7 +19,7 @@ from typing import Any
 
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.cli.command import SILENT, Command, Result, model_target, print_notes
+from uncertain_lti.cli.command import SILENT, Command, Result, model_target
 from uncertain_lti.cli.options import RECORDINGS, helped
 
 _LONGEST_NAME = 200  # letters
@@ -44,7 +44,7 @@ def run_topics(options: argparse.Namespace) -> Result:
             for f in facts
         ]  # fmt: skip
         return Result(data={"recording": str(bag.path), "warnings": bag.warnings, "topics": held})
-    print_notes(options, bag.warnings)
+    options.progress.note(*bag.warnings)
     rows = []
     for f in facts:
         stamps: str = f.stamps
@@ -77,7 +77,7 @@ def run_init(options: argparse.Namespace) -> Result:
         raise SignalError(f"{output}: is there already; choose another output, or move it away")
     reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
     proposal = propose(options.bags, reading, **chosen, like=options.like)
-    print_notes(options, proposal.warnings)
+    options.progress.note(*proposal.warnings)
     if output is None and not options.json:
         return Result(text=proposal.text.removesuffix("\n"))
     if output is not None:

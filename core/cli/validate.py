@@ -22,7 +22,6 @@ from uncertain_lti.cli.command import (
     Result,
     load_model,
     model_target,
-    print_notes,
     read_labelled,
 )
 from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
@@ -55,7 +54,7 @@ def run_validate(options: argparse.Namespace) -> Result:
         read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags, layout=model.signals.table)
     ]
     for transient in transients:
-        print_notes(options, transient.notes)
+        options.progress.note(*transient.notes)
     with options.progress.stage("validating") as step:
         given = {name: getattr(options, name) for name in ("blocks", "gap", "confidence")}
         validation = validate_model(model, transients, **given, groups=options.group, progress=step)
