@@ -165,7 +165,9 @@ def _daqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, ac
     H, G = np.ascontiguousarray(H), np.ascontiguousarray(G)
     cold = np.zeros(size + len(h), dtype=np.int32)
     for sense in (cold,) if active is None else (active.copy(), cold):
-        x, _, flag, info = daqp.solve(H, f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000, cycle_tol=100)
+        x, _, flag, info = daqp.solve(
+            H, f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000, cycle_tol=100
+        )
         if flag == 1:
             multiplier = np.asarray(info["lam"])
             found = np.where(multiplier < 0, 3, np.where(multiplier > 0, 1, 0)).astype(np.int32)
