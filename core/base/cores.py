@@ -19,6 +19,8 @@ from functools import cache
 from typing import Any, TypeVar
 
 T = TypeVar("T")
+WORTH_THREADS = 20_000
+"""Transitions, or verdicts, from about which on what is done with all of them takes longer than to begin a thread."""
 
 
 def core_count() -> int:

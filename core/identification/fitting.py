@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import on_cores
+from uncertain_lti.base.cores import WORTH_THREADS, on_cores
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.limits import LARGEST
@@ -52,7 +52,6 @@ from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""
-_WORTH_THREADS = 20_000  # transitions
 
 
 def fit(
@@ -282,7 +281,7 @@ def fit_fleet(
         return rank, messages + _distance(gap)
 
     afterwards = (said, partial(fleet.residuals, model, judged), *(partial(repeats_in, model, t) for t in transients))
-    words, residuals, *found = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > _WORTH_THREADS)
+    words, residuals, *found = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)
     if words is not None:
         facts["rank"], facts["messages"] = words
     if transients:

@@ -156,11 +156,10 @@ class Programmes:
         self._last[kind] = answer
         return answer.xi, answer.solver
 
-    def _active(self, kind: str, count: int, behind: int = 0) -> Sense | None:
-        """What was active in the last programme of a kind, but the last `behind`; None where it has another size."""
+    def _active_sets(self, kind: str, count: int) -> list[Sense | None]:
+        """What to make multipliers of: what was active in the last programme of a kind and size, then the slack."""
         last = self._last.get(kind)
-        known = None if last is None or last.active is None or len(last.active) != count else last.active
-        return known[: count - behind] if known is not None else None
+        return [None] if last is None or last.active is None or len(last.active) != count else [last.active, None]
 
     def quadratic(self) -> str:
         """Solve (10) on the working set."""
@@ -295,10 +294,9 @@ class Programmes:
         xi = np.concatenate([*row.scaled(), [row.limit]])
         cost = np.append(np.zeros(len(xi) - 1), 1.0)
         low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
-        G, h = self.rows(row.pool)
-        active = self._active("regularised", len(xi) + len(h) + len(row.asked), len(row.asked))
-        for known in (active, None) if active is not None else (None,):
-            bound = linear_bound(cost, G, h, low, high, xi, known)
+        G, h = self._with_asked(*self.rows(row.pool))
+        for active in self._active_sets("regularised", len(xi) + len(h)):
+            bound = linear_bound(cost, G, h, low, high, xi, active)
             if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
                 return bound
         inside, room = row.slacks()
@@ -339,11 +337,13 @@ class Programmes:
             theta = np.linalg.lstsq(row.basis, theta, rcond=None)[0].astype(np.float64)
         H, f = row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        programme = H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper, xi
+        G, h = self._with_asked(*row.containment(row.pool))
         objective, value = float(0.5 * xi @ H @ xi + f @ xi), max(row.value(d), row.least_value())
-        above = objective - dual_bound(*programme, self._active("quadratic", len(f) + len(programme[3])))
-        if not above <= GOOD * value:
-            above = min(above, objective - dual_bound(*programme))
+        above = np.inf
+        for active in self._active_sets("quadratic", len(f) + len(h)):
+            above = min(above, objective - dual_bound(H, f, G, h, row.lower, row.upper, xi, active))
+            if above <= GOOD * value:
+                break
         weight = factor * TIE_BREAK * float(np.diagonal(row.gram).min(initial=1.0))
         spread = max(float(d @ row.plain @ d), 0.0)
         smallest = self._least_effect()

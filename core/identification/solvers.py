@@ -209,7 +209,7 @@ def dual_bound(
     from scipy.optimize import nnls
 
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))  # as in `solve_qp`
-    C, limits = _active(G, h, lower, upper, xi, active)
+    C, limits = _binding(G, h, lower, upper, xi, active)
     best = -np.inf
     try:
         L = np.linalg.cholesky(H * np.outer(s, s))
@@ -234,7 +234,7 @@ def linear_bound(
     """As `dual_bound`, of the linear programme minimise costᵀξ subject to G ξ >= h, lower <= ξ <= upper."""
     from scipy.optimize import nnls
 
-    C, limits = _active(G, h, lower, upper, xi, active)
+    C, limits = _binding(G, h, lower, upper, xi, active)
     unit = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
     try:
         multiplier = nnls(C / unit, cost)[0] / unit
@@ -244,7 +244,7 @@ def linear_bound(
     return float(limits @ multiplier) if left <= _SLIGHT else -np.inf
 
 
-def _active(G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None) -> tuple[Array, Array]:
+def _binding(G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None) -> tuple[Array, Array]:
     """Columns (v, k) and limits (k,) of what is active, as lower bounds; by the slack at ξ where it is not known."""
     size = len(xi)
     rows, limits = np.vstack([np.eye(size), -np.eye(size), G]), np.concatenate([lower, -upper, h])

@@ -26,14 +26,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import on_cores
+from uncertain_lti.base.cores import WORTH_THREADS, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.field_path import FieldPath
 
-_WORTH_THREADS = 20_000  # verdicts
 EVERY_STATE = "joint"
 """What stands for the state in the name of a statistic of all of them."""
 
@@ -308,7 +307,7 @@ class Alarm:
         each = np.empty((count, len(self.parts)), dtype=bool) if each is None else each
         values = np.empty((count, len(self.names))) if values is None else values
         parts = list(zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True))
-        together = count >= _WORTH_THREADS
+        together = count >= WORTH_THREADS
         on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), parts, together)
         self.reset()
         return np.asarray(np.logical_or.reduce(list(each.T))), each, values

@@ -97,9 +97,8 @@ def fit_monitored(
     left.pop("transient_weights", None)
     if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
-        seen = fitted_parts(model, transients, _SHOWN)
-        fitted = Validation(model, seen, "transients", 0.0, 0.9)
-        return Monitored(*_armed(fitted, seen, false_alarms), None, why, centred)
+        seen = _seen(model, transients, _SHOWN)
+        return Monitored(*_armed(seen, seen.parts, false_alarms), None, why, centred)
     try:
         validation = leave_out(
             transients,
@@ -111,16 +110,21 @@ def fit_monitored(
             progress=progress,
             **left,
         )
-        seen = fitted_parts(model, transients)
-        return Monitored(*_armed(validation, seen, false_alarms), validation, "", centred)
+        fitted = fitted_parts(model, transients)
+        return Monitored(*_armed(validation, fitted, false_alarms), validation, "", centred)
     except (FitError, ModelError) as error:  # too little is left to fit to: the fit itself is valid
         if false_alarms is not None:
             raise FitError(f"no alarm can be learnt for a rate: {error}") from None
         return Monitored(model, None, None, str(error), centred)
 
 
-def _armed(validation: Validation, seen: Sequence[Part], rate: float | None) -> tuple[UncertainLTI, Panel]:
-    panel = learn(validation, seen, rate)
+def _seen(model: UncertainLTI, transients: Sequence[Transient], most: float) -> Validation:
+    """Some of what was fitted, so many transitions, judged by the fit as if it had been left out."""
+    return Validation(model, fitted_parts(model, transients, most), "transients", 0.0, 0.9)
+
+
+def _armed(validation: Validation, fitted: Sequence[Part], rate: float | None) -> tuple[UncertainLTI, Panel]:
+    panel = learn(validation, fitted, rate)
     return validation.model.replace(alarm=panel.rules), panel
 
 
@@ -136,14 +140,13 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
         return first
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
-    best, least = ways[0], figure(first.model, fitted_parts(first.model, transients, _COMPARED))
+    best, least = ways[0], figure(_seen(first.model, transients, _COMPARED))
     for way in ways[1:]:
         asked = {**shared, **way}
         if asked.pop("centred", False):
             asked["operating_point"] = _medians(transients)
         try:
-            model = fit(transients, describe_data=False, **asked)
-            size = figure(model, fitted_parts(model, transients, _COMPARED))
+            size = figure(_seen(fit(transients, describe_data=False, **asked), transients, _COMPARED))
         except (FitError, ModelError):
             continue
         if size < CLEARLY * least:

@@ -189,9 +189,8 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     )  # fmt: skip
 
 
-def figure(model: UncertainLTI, fitted: Sequence[Part]) -> float:
-    """`Panel.figure` by what was fitted alone, judged by the model. Raises FitError as `learn` does."""
-    seen = Validation(model, tuple(fitted), "transients", 0.0, 0.9)
+def figure(seen: Validation) -> float:
+    """`Panel.figure` of `learn(seen, seen.parts)`, where nothing was left out. Raises FitError as that does."""
     parts, rules, dt = _judged(seen)
     rule = rules[_of_jumps(rules)]
     sizes = [sizes_of([rule], part)[0] for part in parts]

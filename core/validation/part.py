@@ -218,10 +218,11 @@ def _longer(
     """Utilisation, residuals and mean widths over the horizons of the full model, NaN where this one lacks one."""
     places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
     width = np.full((len(model.horizons) + 1, model.n), np.nan)
-    z = model.normalised_columns(steps) if model.horizons else np.zeros((0, 0))
-    for j, (_, _, half) in enumerate(model.envelopes(steps.k, z, steps.dt) if model.horizons else ()):
-        if half.size:
-            width[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
+    if model.horizons:
+        envelopes = model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)
+        for j, half in enumerate(half for _, _, half in envelopes):
+            if half.size:
+                width[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
     with_none = ((0, 0), (0, 1), (0, 0))
     sizes, left = (np.pad(values, with_none, constant_values=np.nan)[:, places] for values in (utilisation, residual))
     return sizes, left, width[places]
