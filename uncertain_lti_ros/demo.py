@@ -35,6 +35,7 @@ from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
 from uncertain_lti.reports.model_text import fit_text
 from uncertain_lti.sampling.reading import read_as_fitted
+from uncertain_lti_ros.messages import stamp_ns
 from uncertain_lti_ros.process import Life, living, say, speed
 
 FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
@@ -161,8 +162,7 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
 
     def take(message: JointState) -> None:
         names[:] = message.name
-        stamp = message.header.stamp
-        flags[stamp.sec * 10**9 + stamp.nanosec] = np.array(message.position)
+        flags[stamp_ns(message)] = np.array(message.position)
 
     subscription = life.node.create_subscription(JointState, _FLAGS, take, QoSProfile(depth=1000))
     monitor = [sys.executable, "-m", "uncertain_lti_ros.envelope_monitor", "--ros-args", "-p", f"model:={model}"]

@@ -80,6 +80,11 @@ def _field_type(text: str) -> FieldType:
     return FieldType(kind, element, array)
 
 
+def stamp_ns(message: Any) -> int:
+    """The header stamp of a message, ns."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
 def full_name(type_name: str) -> str:
     """A type's name in full."""
     parts = type_name.split("/")

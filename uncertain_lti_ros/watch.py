@@ -20,11 +20,12 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
@@ -34,6 +35,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.monitor.outputs import NODE
 from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
+from uncertain_lti_ros.messages import stamp_ns
 from uncertain_lti_ros.process import living, seconds, tell
 
 _EVERY = 1000  # ms between two looks of the page
@@ -42,14 +44,20 @@ _SILENT = 2.0  # s without a message from which on the page says so
 _BEHIND = 200  # samples back at most to that of which a number is
 
 
-@dataclass
 class _Said:
-    """The last samples of one model: `t_ns`, `flags`, `alarm`, `utilisation`, `statistics`, a row each, as a ring."""
+    """The last samples of one model, rings of a row each; `statistics` are there once a message names them."""
 
-    names: list[str]
-    statistic_names: list[str]
-    rows: Any
-    count: int = 0
+    def __init__(self, names: list[str]) -> None:
+        self.names, self.statistic_names = names, list[str]()
+        self.t_ns, self.alarm = np.zeros(_MOST, dtype=np.int64), np.zeros(_MOST, dtype=bool)
+        self.flags, self.utilisation = np.full((2, _MOST, len(names)), np.nan)
+        self.statistics = np.empty((_MOST, 0))
+        self.count = 0
+
+    def rows(self) -> list[NDArray[Any]]:
+        """Copies of all five, the oldest sample first."""
+        order = np.arange(max(0, self.count - _MOST), self.count) % _MOST
+        return [ring[order] for ring in (self.t_ns, self.alarm, self.flags, self.utilisation, self.statistics)]
 
 
 class Watched:
@@ -61,7 +69,7 @@ class Watched:
     def __init__(self, node: Node, name: str, window: float) -> None:
         self.name, self._window = node.resolve_topic_name(name), window
         self._lock = threading.Lock()
-        self._said = _room([], [])
+        self._said = _Said([])
         self._heard, self._reason = 0.0, ""
         many, latched = QoSProfile(depth=1000), QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for kind, topic, take, qos in (
@@ -74,38 +82,38 @@ class Watched:
     def _flags(self, message: JointState) -> None:
         with self._lock:
             if self._said.names != list(message.name):
-                self._said = _room(list(message.name), [])
-            said = self._said
-            row = said.rows[said.count % _MOST]
-            row["alarm"] = said.count and said.rows[(said.count - 1) % _MOST]["alarm"]
-            row["t_ns"], row["flags"] = _t_ns(message), message.position
-            row["utilisation"] = row["statistics"] = np.nan
+                self._said = _Said(list(message.name))
+            said, row = self._said, self._said.count % _MOST
+            said.t_ns[row], said.flags[row] = stamp_ns(message), message.position
+            said.alarm[row] = said.count and said.alarm[row - 1]
+            said.utilisation[row] = said.statistics[row] = np.nan
             said.count += 1
             self._heard = time.monotonic()
 
     def _violation(self, message: Bool) -> None:
         with self._lock:
             if self._said.count:
-                self._said.rows["alarm"][(self._said.count - 1) % _MOST] = message.data
+                self._said.alarm[(self._said.count - 1) % _MOST] = message.data
 
     def _utilisation(self, message: JointState) -> None:
         with self._lock:
             if self._said.names == list(message.name):
-                self._put("utilisation", message)
+                self._put(self._said.utilisation, message)
 
     def _statistics(self, message: JointState) -> None:
         with self._lock:
             if self._said.statistic_names != list(message.name):
-                self._said = _room(self._said.names, list(message.name), self._said)
-            self._put("statistics", message)
+                self._said.statistic_names = list(message.name)
+                self._said.statistics = np.full((_MOST, len(message.name)), np.nan)
+            self._put(self._said.statistics, message)
 
-    def _put(self, field: str, message: JointState) -> None:
+    def _put(self, ring: NDArray[Any], message: JointState) -> None:
         """Numbers of a sample that was flagged lately."""
-        said, t_ns = self._said, _t_ns(message)
-        for back in range(1, min(said.count, _BEHIND, _MOST) + 1):
-            row = said.rows[(said.count - back) % _MOST]
-            if row["t_ns"] == t_ns:
-                row[field] = message.position
+        newest, t_ns = self._said.count - 1, stamp_ns(message)
+        for back in range(min(newest + 1, _BEHIND)):
+            row = (newest - back) % _MOST
+            if self._said.t_ns[row] == t_ns:
+                ring[row] = message.position
                 return
 
     def _why(self, message: String) -> None:
@@ -116,62 +124,35 @@ class Watched:
         """The last `window` seconds."""
         with self._lock:
             said, heard, reason = self._said, self._heard, self._reason
-            order = np.arange(max(0, said.count - _MOST), said.count) % _MOST
-            rows = said.rows[order]
-        if len(rows):
-            rows = rows[rows["t_ns"] > rows["t_ns"][-1] - self._window * 1e9]
-        t = (rows["t_ns"] - rows["t_ns"][-1]) * 1e-9 if len(rows) else np.empty(0)
-        raised = bool(len(rows)) and bool(rows["alarm"][-1])
-        quiet = time.monotonic() - heard
-        if not len(rows):
-            note = f"Waiting for {self.name}: nothing is heard on {self.name}/flags."
-        else:
-            note = f"{plural(len(rows), 'sample')}, 0 s is the newest" + (f"; {reason}." if reason else ".")
+            statistic_names, (t_ns, *rows) = said.statistic_names, said.rows()
+        shown = t_ns > t_ns[-1:] - self._window * 1e9
+        alarm, flags, utilisation, statistics = (row[shown] for row in rows)
+        t = (t_ns[shown] - t_ns[-1:]) * 1e-9
+        note, quiet = f"Waiting for {self.name}: nothing is heard on {self.name}/flags.", time.monotonic() - heard
+        if len(t):
+            note = f"{plural(len(t), 'sample')}, 0 s is the newest" + (f"; {reason}." if reason else ".")
             if quiet > _SILENT:
                 note = f"Nothing has come for {quiet:.0f} s. {note}"
+        raised = bool(alarm[-1:].any())
         if raised:
             note = f"ALARM. {note}"
-        statistics = dict(zip(said.statistic_names, rows["statistics"].T, strict=True))
-        found = plotted_live(
-            self.name, said.names, t, rows["flags"], rows["alarm"], rows["utilisation"], statistics, note
-        )
+        of_each = dict(zip(statistic_names, statistics.T, strict=True))
+        found = plotted_live(self.name, said.names, t, flags, alarm, utilisation, of_each, note)
         return replace(found, title=f"{'ALARM ' if raised else ''}{self.name}")
-
-
-def _room(names: list[str], statistics: list[str], before: _Said | None = None) -> _Said:
-    """Room for the samples of a model; `before`: the same without its statistics."""
-    n, s = len(names), len(statistics)
-    rows = np.zeros(
-        _MOST,
-        dtype=[
-            ("t_ns", "i8"), ("alarm", "?"), ("flags", "f8", (n,)), ("utilisation", "f8", (n,)),
-            ("statistics", "f8", (s,)),
-        ],
-    )  # fmt: skip
-    if before is None:
-        return _Said(names, statistics, rows)
-    for field in ("t_ns", "alarm", "flags", "utilisation"):
-        rows[field] = before.rows[field]
-    rows["statistics"] = np.nan
-    return _Said(names, statistics, rows, before.count)
-
-
-def _t_ns(message: JointState) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 @contextmanager
 def serving(watched: Watched, host: str, port: int) -> Iterator[str]:
     """Serve the page while the block runs; the address. Raises UncertainLTIError where the port is taken."""
-    local = host in ("127.0.0.1", "localhost", "::1")
+    local = host in ("127.0.0.1", "localhost")
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             asked = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-            if local and asked not in ("127.0.0.1", "localhost", "[::1]"):
+            if local and asked not in ("127.0.0.1", "localhost"):
                 self.send_error(403, "this page is for this machine alone")
             elif self.path == "/":
-                page = interactive_page(watched.name, [watched.plotted()], live=_EVERY)
+                page = interactive_page(watched.name, [watched.plotted()], every=_EVERY)
                 self._answer("text/html; charset=utf-8", page)
             elif self.path == "/data":
                 self._answer("application/json", packed_data([watched.plotted()], _EVERY))

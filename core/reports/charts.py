@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -288,11 +288,15 @@ def scores(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[A
     if verdicts.statistic_names:
         over = _size(*columns.extremes(verdicts.statistics))
         found.append(_fmax(over))
-        of = {name: i for i, name in enumerate(model.state_names)}
-        for name, size in zip(verdicts.statistic_names, _most(over[where]), strict=True):
-            if (i := of.get(name.partition("/")[2])) is not None:
-                states[i] = max(states[i], size)
+        of_each = dict(zip(verdicts.statistic_names, _most(over[where]).tolist(), strict=True))
+        states = np.maximum(states, blamed(model.state_names, of_each))
     return _fmax(np.stack(found, axis=1)), states
+
+
+def blamed(states: Sequence[str], statistics: Mapping[str, float]) -> Array:
+    """The greatest statistic over its threshold of each state (n,); 0 of one that has none."""
+    own = [(name.partition("/")[2], size) for name, size in statistics.items()]
+    return np.array([max((size for name, size in own if name == state), default=0.0) for state in states])
 
 
 def _size(low: Array, high: Array) -> Array:

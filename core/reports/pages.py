@@ -82,15 +82,22 @@ def write_page(path: str | os.PathLike[str], page: str) -> None:
         raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
-def interactive_page(title: str, recordings: Sequence[Plotted], **more: Any) -> str:
-    """The page of some recordings; `more`: of a report."""
-    packed = packed_data(recordings, more.get("live", 0)).replace("<", "\\u003c")
+def interactive_page(title: str, recordings: Sequence[Plotted], every: int = 0, **more: Any) -> str:
+    """The page of some recordings; `every`: ms between two looks of a live one; `more`: of a report."""
+    packed = packed_data(recordings, every).replace("<", "\\u003c")
     scripts = [_asset(name).rstrip("\n") for name in ("uPlot.iife.min.js", "plot.js")]
     allowed = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     views = list(dict.fromkeys(view for recording in recordings for view, _ in recording.views))
     style = Markup(f"{_asset('uPlot.min.css')}\n{_asset('page.css')}")
     marked = [Markup(script) for script in scripts]
-    values = {"title": title, "views": views, "allowed": allowed, "style": style, "data": Markup(packed)}
+    values = {
+        "title": title,
+        "every": every,
+        "views": views,
+        "allowed": allowed,
+        "style": style,
+        "data": Markup(packed),
+    }
     return environment().from_string(_asset("page.html")).render(values, scripts=marked, **more)
 
 
@@ -317,11 +324,8 @@ def plotted_live(
     columns = Columns.of(t, None, judged, alarm, np.asarray(bad.any(axis=1) | alarm), most)
     score = np.abs(np.column_stack(list(statistics.values())) if statistics else utilisation)
     top = charts.score_panel(columns, np.fmax.reduce(columns.reduced(score, np.fmax), axis=1, initial=np.nan))
-    blame = dict.fromkeys(states, 0.0)
-    for statistic, values in statistics.items():
-        state = statistic.partition("/")[2]
-        blame[state] = max(blame.get(state, 0.0), float(np.nanmax(np.abs(values[alarm]), initial=0.0)))
-    order = sorted(range(len(states)), key=lambda i: -blame[states[i]])
+    largest = {name: float(np.nanmax(np.abs(values[alarm]), initial=0.0)) for name, values in statistics.items()}
+    order = np.argsort(-charts.blamed(states, largest), kind="stable").tolist()
     panels = [(columns, panel) for panel in charts.utilisation_panels(columns, states, utilisation, bad, order)]
     return Plotted(name, note, [("utilisation", panels)], [(columns, top)], columns.alarms, columns.silent)
 
