@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import pickle
 import platform
 import subprocess
 import sys
@@ -37,7 +38,7 @@ from measure import best, peak_memory, table
 
 from uncertain_lti import EnvelopeMonitor
 from uncertain_lti.identification import fit, formulation
-from uncertain_lti.identification.archive import CacheWriter
+from uncertain_lti.identification.archive import write_cache
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
@@ -361,17 +362,14 @@ def disk(scale):
 def disk_write(folder, N, parts):
     """Fill the cache, a twentieth at a time."""
     began = time.perf_counter()
-    with CacheWriter(Path(folder) / "cache") as writer:
-        for part in range(parts):
-            writer.add(problem_of(*drawn(N // parts, seed=part)))
+    partition = write_cache(Path(folder) / "cache", (problem_of(*drawn(N // parts, seed=k)) for k in range(parts)))
+    (Path(folder) / "partition.pickle").write_bytes(pickle.dumps(partition))
     print(f"wrote {N} transitions in {time.perf_counter() - began:.1f} s, drawing them included")
 
 
 def disk_fit(folder, N, parts):
     """Fit from the cache, then with all of it in memory: the same optimum."""
-    from uncertain_lti.identification.archive import DiskPartition
-
-    partition = DiskPartition(Path(folder) / "cache", N // parts * parts, 5, 9, np.ones(5), Columns.of("none", True))
+    partition = pickle.loads((Path(folder) / "partition.pickle").read_bytes())
     N = partition.N
     rows, models = [], {}
 

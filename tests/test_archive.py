@@ -25,9 +25,8 @@ from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.archive import CacheWriter, fit_archive
+from uncertain_lti.identification.archive import fit_archive, write_cache
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import BLOCK
@@ -109,13 +108,10 @@ def test_scheduled_from_disk_as_in_memory(bags, tmp_path):
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
-    """More samples than are held: screening and passes over blocks that do not end where recordings do."""
+    """More samples than are held: screening and passes over its blocks."""
     parts = [random_problem(seed, count) for seed, count in enumerate((30_001, 5, BLOCK, 12_345))]
     whole = fit([t for t, _ in parts], criterion, additive="noise")
-    with CacheWriter(tmp_path / "c") as writer:
-        for _, problem in parts:
-            writer.add(problem)
-    partition = writer.partition(np.ones(3), Columns.of("noise", True))
+    partition = write_cache(tmp_path / "c", (p for _, p in parts))
     assert partition.N == sum(p.N for _, p in parts)
     stacked = np.hstack([block.z for block in partition.blocks()])
     assert np.array_equal(stacked, np.hstack([p.z_columns for _, p in parts]))
@@ -133,21 +129,15 @@ def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
 
 def test_cut_cache_and_wrong_folders_are_named(tmp_path):
     _, problem = random_problem(0, 9000)
-    with CacheWriter(tmp_path / "c") as writer:
-        writer.add(problem)
-    partition = writer.partition(np.ones(3), Columns.of("noise", True))
+    partition = write_cache(tmp_path / "c", [problem])
     data = tmp_path / "c" / "transitions.f64"
     data.write_bytes(data.read_bytes()[:-8])
     with pytest.raises(FitError, match="cut short"):
         list(partition.blocks())
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("")
-    with pytest.raises(FitError, match=r"thesis\.tex.*no cache"), CacheWriter(tmp_path / "other"):
-        pass
-    with pytest.raises(RuntimeError), CacheWriter(tmp_path / "broken") as writer:
-        writer.add(problem)
-        raise RuntimeError
-    assert not (tmp_path / "broken" / "facts.json").exists()
+    with pytest.raises(FitError, match=r"thesis\.tex.*no cache"):
+        write_cache(tmp_path / "other", [problem])
 
 
 def test_bad_archives_are_refused(bags, tmp_path):

@@ -11,15 +11,14 @@
 
 from __future__ import annotations
 
-import json
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError, FitError, SignalError
@@ -30,7 +29,7 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import DaskFleet, Fleet
-from uncertain_lti.identification.problem import BLOCK, Block, Problem
+from uncertain_lti.identification.problem import Block, Problem
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of, unused
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
@@ -41,163 +40,88 @@ from uncertain_lti.model.repeats import Found, repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.sampling.reading import load_signals, sample, time_source
-from uncertain_lti.sampling.resolve import resolve
+from uncertain_lti.sampling.reading import Times, load_signals, resolved_by, sample, times_of, types_of
 from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.signal_map import SignalMap
 
-_FORMAT = "uncertain-lti-cache/1"
-_DATA, _FACTS = "transitions.f64", "facts.json"
+_DATA = "transitions.f64"
 
 
 @dataclass(frozen=True)
 class DiskPartition:
-    """A `Partition` in a folder: blocks of [z; s; x_next; Δt] as float64, read again by every pass.
+    """A `Partition` in a file: blocks of [z; s; x_next; Δt] as float64, read again by every pass.
 
     Only one block is in memory at a time.
 
-    `folder`: written by `CacheWriter`; `count`: number of transitions, N; `n`: number of states; `p`: number of states
-    and controls; `weights` (n,): constant in time; `columns`: terms that are unknown; `q`: number of further scheduling
-    signals.
+    `path`: written by `write_cache`; `sizes`: number of transitions of each block; `n`: number of states; `p`: number
+    of states and controls; `q`: number of further scheduling signals; `weights` (n,): constant in time; `columns`:
+    terms that are unknown.
     """
 
-    folder: Path
-    count: int
+    path: Path
+    sizes: Sequence[int]
     n: int
     p: int
+    q: int
     weights: Array
     columns: Columns
-    q: int = 0
 
     @property
     def N(self) -> int:
         """Number of transitions."""
-        return self.count
+        return sum(self.sizes)
 
     def blocks(self) -> Iterator[Block]:
         """All transitions, in the blocks they were written in."""
-        first = self.p + self.q
+        first, start = self.p + self.q, 0
         lines = first + self.n + 1
-        with open(self.folder / _DATA, "rb", buffering=0) as stream:
-            for start in range(0, self.count, BLOCK):
-                size = min(BLOCK, self.count - start)
+        with open(self.path, "rb", buffering=0) as stream:
+            for size in self.sizes:
                 data = np.fromfile(stream, dtype="<f8", count=lines * size)
                 if len(data) < lines * size:
-                    raise FitError(f"{self.folder}: the cache is cut short; delete the folder and fit again")
+                    raise FitError(f"{self.path.parent}: the cache is cut short; delete the folder and fit again")
                 table = data.reshape(lines, size)
                 s = table[self.p : first] if self.q else None
                 yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
+                start += size
 
 
-class CacheWriter:
-    """Writes a `DiskPartition` from problems that come one after the other, each of which fits in memory.
-
-    Use it as a context: left without an error, the folder is complete; else what was written is removed.
+def write_cache(folder: str | os.PathLike[str], problems: Iterable[Problem]) -> DiskPartition:
+    """Write problems that come one after the other, each of which fits in memory, with weights of one.
 
     `folder`: made if it does not exist; a cache in it is replaced.
     """
-
-    def __init__(self, folder: str | os.PathLike[str]) -> None:
-        self.folder = Path(folder)
-        self._pending: list[Array] = []
-        self._waiting = 0
-        self._count = 0
-        self._shape: tuple[int, int, int] | None = None
-
-    def __enter__(self) -> CacheWriter:
-        self._made = not self.folder.exists()
-        try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            strangers = {f.name for f in self.folder.iterdir()} - {_DATA, _FACTS}
-            if strangers:
-                raise FitError(
-                    f"{self.folder}: holds {min(strangers)}, so it is no cache; name an empty or a new folder"
-                )
-            (self.folder / _FACTS).unlink(missing_ok=True)
-            self._stream = open(self.folder / _DATA, "wb")  # closed in __exit__
-        except OSError as error:
-            raise FitError(f"{self.folder}: cannot be written: {error.strerror}; choose another folder") from None
-        return self
-
-    def add(self, problem: Problem) -> None:
-        """Append the transitions of a recording."""
-        further = [] if problem.s_columns is None else [problem.s_columns]
-        shape = (problem.n, problem.p, sum(map(len, further)))
-        if self._shape not in (None, shape):
-            raise FitError(f"{self.folder}: recordings differ in their numbers of signals")
-        self._shape = shape
-        table = np.vstack([problem.z_columns, *further, problem.next_columns, problem.dt])
-        self._pending.append(table)
-        self._waiting += table.shape[1]
-        if self._waiting >= BLOCK:
-            self._write(self._waiting - self._waiting % BLOCK)
-
-    def _write(self, size: int) -> None:
-        """Write this many of the first waiting transitions, in blocks."""
-        whole = np.hstack(self._pending)
-        try:
-            for start in range(0, size, BLOCK):
-                stop = min(start + BLOCK, size)
-                np.ascontiguousarray(whole[:, start:stop], dtype="<f8").tofile(self._stream)
-        except OSError as error:
-            raise FitError(f"{self.folder}: cannot be written: {error.strerror}; free some space") from None
-        self._pending = [whole[:, size:].copy()]
-        self._waiting -= size
-        self._count += size
-
-    def __exit__(self, kind: object, *_: Any) -> None:
-        complete = False
-        try:
-            if kind is None and self._waiting:
-                self._write(self._waiting)
-            self._stream.close()
-            if kind is None and self._shape is not None:
-                n, p, q = self._shape
-                facts = {"format": _FORMAT, "transitions": self._count, "n": n, "p": p, "q": q}
-                with whole_file(self.folder / _FACTS) as stream:
-                    stream.write(json.dumps(facts).encode())
-            complete = kind is None
-        finally:
-            if not complete:
-                self._remove()
-
-    def _remove(self) -> None:
-        self._stream.close()
-        for name in (_FACTS, _DATA):
-            (self.folder / name).unlink(missing_ok=True)
-        if self._made:
-            self.folder.rmdir()
-
-    def partition(self, weights: Array, columns: Columns) -> DiskPartition:
-        """What was written; to be asked when the context has ended.
-
-        `weights` (n,): constant in time.
-        """
-        if self._shape is None:
-            raise FitError(f"{self.folder}: no usable transition was written")
-        n, p, q = self._shape
-        return DiskPartition(self.folder, self._count, n, p, weights, columns, q)
+    folder, sizes = Path(folder), list[int]()
+    new = not folder.exists()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if strangers := {f.name for f in folder.iterdir()} - {_DATA}:
+            raise FitError(f"{folder}: holds {min(strangers)}, so it is no cache; name an empty or a new folder")
+        (folder / _DATA).unlink(missing_ok=True)
+        with whole_file(folder / _DATA) as stream:
+            for problem in problems:
+                for block in problem.blocks():
+                    further = [] if block.s is None else [block.s]
+                    table = np.vstack([block.z, *further, block.x_next, block.dt])
+                    stream.write(np.ascontiguousarray(table, dtype="<f8").data)
+                    sizes.append(len(block))
+            if not sizes:
+                raise FitError(f"{folder}: no usable transition was written")
+    except BaseException as error:
+        if new:
+            with suppress(OSError):
+                folder.rmdir()
+        if isinstance(error, OSError):
+            raise FitError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from None
+        raise
+    q = 0 if problem.s_columns is None else len(problem.s_columns)
+    return DiskPartition(folder / _DATA, sizes, problem.n, problem.p, q, np.ones(problem.n), problem.columns)
 
 
 Recording = tuple[str, tuple[str, ...]]
 """Name and files of one recording."""
-
-
-@dataclass(frozen=True)
-class Survey:
-    """What resolving a signal map needs of one recording, by topic.
-
-    `types`: message type; `stamped`: messages with a stamp; `counted`: messages; `header`: stamps of those that have
-    one, ns; state topics only; `log`: log times, ns; state topics only.
-    """
-
-    types: dict[str, str]
-    stamped: dict[str, int]
-    counted: dict[str, int]
-    header: dict[str, NDArray[np.int64]]
-    log: dict[str, NDArray[np.int64]]
 
 
 def fit_archive(
@@ -261,12 +185,12 @@ def fit_archive(
                 f"numbers (a fit to a few of the recordings prints them)"
             )
     say = progress or (lambda text: None)
-    recordings: list[Recording] = [
-        (os.fspath(bag.path), tuple(map(str, bag.parts)))
-        for bag in group_recordings(list(paths), indexed=True, layout=signals.table)
-    ]
-    if not recordings:
+    bags = group_recordings(list(paths), indexed=True, layout=signals.table)
+    if not bags:
         raise BagError("no recording is named; give at least one file or folder")
+    signals = signals.with_types(types_of(bags, signals))
+    recordings: list[Recording] = [(os.fspath(bag.path), tuple(map(str, bag.parts))) for bag in bags]
+    del bags
 
     def counting(what: str) -> Callable[[int], None]:
         total = len(recordings)
@@ -281,7 +205,7 @@ def fit_archive(
             results.append(function(recording, *more))
         return results
 
-    signals = _resolve(visit("looking at", survey, signals), signals, recordings)
+    signals = resolved_by(visit("looking at", survey, signals), signals)
     additive = additive or signals.additive or "none"
     scheduled = scheduled_by(schedule, signals)
     regimes = None if scheduled is None else Regimes.of(scheduled, signals)
@@ -300,17 +224,19 @@ def fit_archive(
     else:
         assert cache is not None
         counts, steps = [], []
-        with CacheWriter(cache) as writer:
+
+        def problems() -> Iterator[Problem]:
             for number, recording in enumerate(recordings, start=1):
                 counting(f"reading {recording[0]}")(number)
                 problem = load(recording, signals, Columns(regimes=regimes))
                 counts.append(problem.N)
                 steps.append(problem.dt)
-                if problem.N:
-                    writer.add(problem)
+                yield problem
+
+        partition = write_cache(cache, problems())
         dt = np.concatenate(steps)
         columns = Columns.of(additive, is_constant(dt), regimes)
-        fleet = Fleet([writer.partition(np.ones(len(signals.states)), columns)])
+        fleet = Fleet([replace(partition, columns=columns)])
     _check(fleet, signals)
     try:
         model = fit_fleet(
@@ -349,43 +275,10 @@ def _sampled(recording: Recording, signals: SignalMap) -> Transient:
     return sample(read_stream(bag, signals), signals)[0]
 
 
-def survey(recording: Recording, signals: SignalMap) -> Survey:
+def survey(recording: Recording, signals: SignalMap) -> Times:
     """First look at one recording."""
-    stream = read_stream(open_recording(recording[0], recording[1], indexed=True, layout=signals.table), signals)
-    states = {s.topic for s in signals.states}
-    types, stamped, counted = {}, {}, {}
-    header, log = {}, {}
-    for position, topic in enumerate(signals.topics):
-        chosen = stream.topic == position
-        if not chosen.any():
-            raise BagError(f"{recording[0]}: {topic} has no message; record it, or choose another topic")
-        stamps = stream.stamp[chosen]
-        types[topic] = stream.bag.topics[topic].type
-        stamped[topic], counted[topic] = int(np.count_nonzero(stamps >= 0)), len(stamps)
-        if topic in states:
-            header[topic], log[topic] = stamps[stamps >= 0], stream.arrival[chosen]
-    return Survey(types, stamped, counted, header, log)
-
-
-def _resolve(surveys: Sequence[Survey], signals: SignalMap, recordings: Sequence[Recording]) -> SignalMap:
-    """As `read_transients` resolves a map, from surveys."""
-    types: dict[str, str] = {}
-    for (name, _), found in zip(recordings, surveys, strict=True):
-        for topic, kind in found.types.items():
-            if types.setdefault(topic, kind) != kind:
-                raise BagError(
-                    f"{name}: {topic} is {kind}, and {types[topic]} in {recordings[0][0]}; "
-                    f"fit recordings of the same types together"
-                )
-    time: dict[str, str] = {}
-    for topic in signals.topics:
-        stamped, counted = sum(s.stamped[topic] for s in surveys), sum(s.counted[topic] for s in surveys)
-        time[topic] = time_source(signals, topic, stamped, counted)
-    instants = {
-        topic: [(s.header if time[topic] == "header" else s.log)[topic] for s in surveys]
-        for topic in dict.fromkeys(s.topic for s in signals.states)
-    }
-    return resolve(signals.with_types(types), instants, time)
+    bag = open_recording(recording[0], recording[1], indexed=True, layout=signals.table)
+    return times_of(read_stream(bag, signals), signals)
 
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
@@ -403,8 +296,7 @@ def repeats(recording: Recording, model: UncertainLTI) -> Found:
 
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:
-    dt = load(recording, signals, Columns()).dt
-    return is_constant(dt)
+    return is_constant(load(recording, signals, Columns()).dt)
 
 
 def _check(fleet: Fleet, signals: SignalMap) -> None:

@@ -35,23 +35,42 @@ from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
 
-def time_sources(streams: Sequence[Stream], signals: SignalMap) -> Mapping[str, str]:
-    """Per topic `header` or `log`: what the map says, else header where most messages carry a stamp."""
+Times = Mapping[str, tuple[int, int, NDArray[np.int64], NDArray[np.int64]]]
+"""Of each topic of a recording how many messages have a stamp and how many there are; and, if states are on it, the
+stamps and the log times, ns."""
+
+
+def times_of(stream: Stream, signals: SignalMap) -> Times:
+    """When the messages of a recording came."""
+    states = {s.topic for s in signals.states}
+    times = {}
+    for position, topic in enumerate(signals.topics):
+        chosen = stream.topic == position
+        if not chosen.any():
+            raise BagError(f"{stream.bag.path}: {topic} has no message; record it, or choose another topic")
+        stamps, arrivals = stream.stamp[chosen], stream.arrival[chosen]
+        stamped = stamps[stamps >= 0]
+        kept = len(stamps) if topic in states else 0
+        times[topic] = len(stamped), len(stamps), stamped[:kept], arrivals[:kept]
+    return times
+
+
+def resolved_by(recordings: Sequence[Times], signals: SignalMap) -> SignalMap:
+    """Resolve clock, max_gap and time sources over all recordings; by default stamps, where most messages have one."""
     sources: dict[str, str] = {}
-    for position, name in enumerate(signals.topics):
-        stamps = np.concatenate([s.stamp[s.topic == position] for s in streams])
-        sources[name] = time_source(signals, name, int(np.count_nonzero(stamps >= 0)), stamps.size)
-    return sources
-
-
-def time_source(signals: SignalMap, topic: str, stamped: int, counted: int) -> str:
-    """What counts as the time of a topic: what the map says, else the stamp where most messages carry one."""
-    chosen = signals.time.get(topic)
-    if chosen == "header" and not stamped:
-        raise SignalError(
-            f"{signals.source}: topics: {topic}: time is header, and no message has a stamp; write log, or leave it out"
-        )
-    return chosen or ("header" if 2 * stamped > counted else "log")
+    instants: dict[str, list[NDArray[np.int64]]] = {}
+    for topic in signals.topics:
+        stamped, counted = (sum(times[topic][k] for times in recordings) for k in (0, 1))
+        chosen = signals.time.get(topic)
+        if chosen == "header" and not stamped:
+            raise SignalError(
+                f"{signals.source}: topics: {topic}: time is header, and no message has a stamp; write log, or leave "
+                f"it out"
+            )
+        sources[topic] = chosen or ("header" if 2 * stamped > counted else "log")
+        stamps = sources[topic] == "header"
+        instants[topic] = [times[topic][2] if stamps else times[topic][3] for times in recordings]
+    return resolve(signals, instants, sources)
 
 
 @dataclass(frozen=True)
@@ -163,21 +182,9 @@ def read_transients(
     bags = group_recordings(of, indexed=True, layout=signals.table)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
-    signals = signals.with_types(_types(bags, signals))
+    signals = signals.with_types(types_of(bags, signals))
     streams = _streams(bags, signals, progress, processes)
-    for stream in streams:
-        for position, topic in enumerate(signals.topics):
-            if not (stream.topic == position).any():
-                raise BagError(f"{stream.bag.path}: {topic} has no message; record it, or choose another topic")
-    sources = time_sources(streams, signals)
-    instants: dict[str, list[NDArray[np.int64]]] = {}
-    for position, topic in enumerate(signals.topics):
-        instants[topic] = []
-        for s in streams:
-            chosen = s.topic == position
-            times = s.stamp[chosen] if sources[topic] == "header" else s.arrival[chosen]
-            instants[topic].append(times[times >= 0] if sources[topic] == "header" else times)
-    resolved = resolve(signals, instants, sources)
+    resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
     transients = [sample(stream, resolved)[0] for stream in streams]
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
@@ -252,7 +259,7 @@ def _stream_for_model(
         if isinstance(recording, (str, os.PathLike))
         else recording
     )
-    for topic, found in _types([bag], signals).items():
+    for topic, found in types_of([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
             raise BagError(
@@ -297,7 +304,8 @@ def no_topic(bag: Recording, topic: str) -> str:
     return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
 
 
-def _types(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
+def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
+    """Message type of each topic, which must be the same in all recordings."""
     types: dict[str, str] = {}
     for bag in bags:
         for topic in signals.topics:
