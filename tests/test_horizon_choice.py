@@ -111,7 +111,6 @@ def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without(
     rules = tuple(rules_for(model, 100, model.sampling.dt_median))
     assert {rule.horizon for rule in rules} == {1, 9} and len(rules) == 8
     for part, run in zip(validate(RUNS, full=model, additive="noise").parts, RUNS, strict=True):
-        assert part.model is not None
         verdicts = EnvelopeMonitor(part.model.replace(alarm=rules)).check(run)
         expected = np.abs(verdicts.statistics[verdicts.judged])
         values = [s if r.kind == "mean" else s**2 for r, s in zip(rules, sizes_of(rules, part), strict=True)]
@@ -135,9 +134,9 @@ def test_horizons_that_lose_are_refused() -> None:
     for number, run in enumerate(RUNS):
         x = run.x + 0.4 * (-1) ** number * run.t[:, None] + rng.normal(0.0, 3e-3, run.x.shape)
         odd.append(type(run)(run.t_ns, x, run.u))
-    choice = choose_horizons(odd, HorizonRule(longest=1.2), [2, 60], additive="noise", criterion="lp")
-    assert 60 not in choice.chosen
-    assert any("left-out windows are outside" in row["why"] for row in choice.rows if row["steps"] == 60)
+    chosen, table = choose_horizons(odd, HorizonRule(longest=1.2), [2, 60], additive="noise", criterion="lp")
+    assert 60 not in chosen
+    assert any("left-out windows are outside" in row["why"] for row in table["candidates"] if row["steps"] == 60)
 
 
 def test_an_empty_list_means_one_step_whatever_the_signals_file_asks_for() -> None:

@@ -261,6 +261,8 @@ def test_sizes_have_the_order_that_they_must_have(validation, found):
     long = detectable(validation.model, validation.parts, 2.4, kinds=("drift",))
     short = detectable(validation.model, validation.parts, 0.8, kinds=("drift",))
     assert all(a.size < b.size for a, b in zip(long.faults, short.faults, strict=True))
+    blind = detectable(validation.model.replace(alarm_rule=AlarmRule(1, 1, 1e6)), validation.parts, kinds=("loss",))
+    assert all(f.size == np.inf and f.share_interval[0] <= f.share <= f.share_interval[1] for f in blind.faults)
     # two violations of three: the jump of a reading is one violation, a spike two
     assert all(found.find("spike", s).size < np.inf for s in ("x1", "x2", "x3"))
 

@@ -142,7 +142,7 @@ def test_it_is_leaving_out_by_hand(runs, validation):
         part = validation.parts[g]
         assert part.name == runs[g].name and part.judged == verdicts.judged.sum()
         assert part.violated == verdicts.violated.sum()
-        assert np.array_equal(part.violations, (verdicts.flags == 1).sum(axis=0))
+        assert np.array_equal(part.outside.sum(axis=0), (verdicts.flags == 1).sum(axis=0))
         edges = np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
         assert rising(raised_on([AlarmRule(2, 3)], part), part.starts) == edges
         width = (verdicts.upper - verdicts.lower)[verdicts.judged]

@@ -177,12 +177,11 @@ def fit(
     messages: list[str] = []
     for name in automatic:
         others = {other: knots for other, knots in chosen.items() if other != name and not _is_auto(knots)}
-        choice = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
-        facts.append(choice.facts())
-        messages.append(f"schedule: {plural(choice.chosen.count, 'knot')} on {name}: {choice.reason}")
-        at = knots_of(choice.chosen.model, name) if choice.chosen.model is not None else []
-        chosen = {**chosen, name: at or 1}
-        resolved = choice.chosen.model.schedule if choice.chosen.model is not None else None
+        best, table = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
+        facts.append(table)
+        messages.append(f"schedule: {plural(best.count, 'knot')} on {name}: {table['reason']}")
+        chosen = {**chosen, name: (knots_of(best.model, name) if best.model is not None else []) or 1}
+        resolved = best.model.schedule if best.model is not None else None
     asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
     further = transients[0].scheduling_names if transients else ()  # none at all is refused below
     on = signals_of(asked, [*transients[0].state_names, *transients[0].control_names, *further] if transients else [])
@@ -200,7 +199,7 @@ def fit(
             )
         else:
             point = operating_point and operating_point.scheduled_on([n in on for n in further])
-            chosen_horizons = choose_horizons(
+            lengths, choice_of_horizons = choose_horizons(
                 [t.scheduled_on(on) for t in transients],
                 rule,
                 steps,
@@ -209,9 +208,8 @@ def fit(
                 schedule=asked,
                 **{**options, "operating_point": point},
             )
-            lengths, choice_of_horizons = chosen_horizons.chosen, chosen_horizons.facts()
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
-            messages.append(f"{listed}: {chosen_horizons.reason}")
+            messages.append(f"{listed}: {choice_of_horizons['reason']}")
     shape: dict[str, Any] = {"schedule": asked, "horizons": list(lengths), "widths": lengths}
     shape["transient_weights"] = transient_weights
     shape["drop_horizons"] = not (rule and (rule.steps or rule.seconds))

@@ -13,22 +13,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.scheduling import EXCESS, PAYS, SLACK, WORSE, fold_of, jackknife
+from uncertain_lti.proposal.search import EXCESS, PAYS, WORSE, Fold, Score, jackknife
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.choices import HorizonRule
-from uncertain_lti.validation.left_out import leave_out
 from uncertain_lti.validation.part import by_unit
+from uncertain_lti.validation.result import Validation
 
 MOST = 64
 """Steps of the longest horizon that is chosen; longer ones are listed one by one."""
@@ -40,68 +39,27 @@ outside is in as many windows as they have steps."""
 
 
 @dataclass(frozen=True, eq=False)
-class HorizonCandidate:
+class HorizonCandidate(Score):
     """One horizon with one kind of half-widths, judged on what was left out of its fits.
 
-    `steps`: number of steps; `widths`: half-widths; `judged` (units,): left-out windows of each recording, group or
-    block; `outside` (units,): those outside the envelope of some state; `log_width`: logarithm of the mean half-width
-    relative to that of one step, the mean over states and left-out parts.
+    `steps`: number of steps; `widths`: half-widths; `log_width`: logarithm of the mean half-width relative to that of
+    one step, the mean over states and left-out parts.
     """
 
-    steps: int
-    widths: Widths
-    judged: Array = field(default_factory=lambda: np.zeros(0))
-    outside: Array = field(default_factory=lambda: np.zeros(0))
-    log_width: float = math.nan
-
-    @property
-    def share(self) -> float:
-        """Share of the left-out windows outside."""
-        return float(self.outside.sum() / self.judged.sum()) if self.judged.sum() else math.nan
+    steps: int = 1
+    widths: Widths = "growing"
+    log_width: float = 0.0
 
     @property
     def per_step(self) -> float:
         """Mean half-width over the steps, relative to that of one step: how slow a change must be to pass unseen."""
         return math.exp(self.log_width) / self.steps
 
-    def excess(self, base: HorizonCandidate) -> float:
-        """Share outside beyond 1 + SLACK times that of another, over the parts in which there is any."""
-        share = np.divide(base.outside, base.judged, out=np.zeros_like(base.judged), where=base.judged > 0)
-        beyond = np.maximum(self.outside - (1.0 + SLACK) * share * self.judged, 0.0)
-        return float(beyond.sum() / max(self.judged.sum(), 1.0))
-
-
-@dataclass(frozen=True, eq=False)
-class HorizonChoice:
-    """The horizons that hold on left-out data.
-
-    `chosen`: half-widths of each number of steps; empty if none is worth having; `rows`: the table: every candidate
-    with its numbers, whether it was taken, and why; `what`: what was left out at a time; `units`: how many times;
-    `reason`: in words.
-    """
-
-    chosen: dict[int, Widths]
-    rows: tuple[dict[str, Any], ...]
-    what: str
-    units: int
-    reason: str
-
-    def facts(self) -> dict[str, Any]:
-        """As plain data for `fit_summary`."""
-        return {
-            "left_out": self.what,
-            "units": self.units,
-            "candidates": list(self.rows),
-            "chosen": {str(steps): widths for steps, widths in self.chosen.items()},
-            "reason": self.reason,
-        }
-
-
-def _admissible(candidate: HorizonCandidate, base: HorizonCandidate) -> bool:
-    """Whether its coverage does not speak against it."""
-    share = base.outside.sum() / max(base.judged.sum(), 1.0)
-    more, error = jackknife(candidate.outside - share * candidate.judged, candidate.judged)
-    return candidate.excess(base) <= ALLOWED or more < min(error, WORSE)
+    def holds(self, base: Score) -> bool:
+        """Whether its coverage does not speak against it."""
+        share = base.outside.sum() / max(base.judged.sum(), 1.0)
+        more, error = jackknife(self.outside - share * self.judged, self.judged)
+        return self.excess(base) <= ALLOWED or more < min(error, WORSE)
 
 
 def lengths_of(rule: HorizonRule, transients: Sequence[Transient]) -> list[int]:
@@ -138,8 +96,8 @@ def choose_horizons(
     groups: Sequence[Any] | str | None = None,
     progress: Callable[[str], None] | None = None,
     **options: Any,
-) -> HorizonChoice:
-    """Which horizons, and which half-widths, hold on what is left out of the fit.
+) -> tuple[dict[int, Widths], dict[str, Any]]:
+    """Which horizons, and which half-widths, hold on what is left out of the fit, and the table.
 
     Each recording, group, or block of a single recording is left out in turn and judged. Of one horizon, half-widths
     that grow are taken if they are narrower by PAYS and no more of the left-out windows are outside than with constant
@@ -151,120 +109,114 @@ def choose_horizons(
     dropped: dict[int, str] = {}
     kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)
     asked = bool(rule.steps or rule.seconds)
-    base: HorizonCandidate | None = None
-    found: dict[int, dict[str, HorizonCandidate]] = {}
-    what, units = "recording", 0
-
-    def refuse_missing(there: Collection[int]) -> None:
-        if missing := [h for h in lengths if h not in there]:
-            if asked:
-                raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
-
+    found: dict[int, list[HorizonCandidate]] = {}
+    facts: dict[str, Any] = {"left_out": "recording", "units": 0, "candidates": [], "chosen": {}}
     for kind in kinds:
         if progress is not None:
             progress(f"{kind} half-widths over {', '.join(map(str, lengths))} steps")
         model = fit(transients, describe_data=False, horizons=lengths, widths=kind, drop_horizons=True, **options)
-        dropped |= _dropped(model, lengths)
+        dropped |= {steps: _why_dropped(model, steps) for steps in lengths if steps not in model.steps}
         try:
-            fold = fold_of(transients, groups, model)
-            left = leave_out(
-                transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap,
-                **{k: v for k, v in options.items() if k not in ("operating_point", "schedule")},
-            )  # fmt: skip
+            fold = Fold.of(transients, groups, model)
+            left = fold.leave_out(transients, model, options)
         except FitError as error:
-            text = f"nothing can be left out: {error}"
-            refuse_missing(model.steps)
+            _refuse_missing(model.steps, lengths if asked else (), dropped)
             chosen: dict[int, Widths] = {h.steps: "constant" for h in model.horizons} if asked else {}
-            return HorizonChoice(chosen, (), what, 0, text)
-        what = fold.what
-        parts = left.parts
-        judged = by_unit(parts, [part.judged for part in parts])
-        units = len(judged)
-        base = base or HorizonCandidate(1, "growing", judged, by_unit(parts, [part.violated for part in parts]), 0.0)
+            facts |= {"chosen": {str(h): w for h, w in chosen.items()}, "reason": f"nothing can be left out: {error}"}
+            return chosen, facts
+        one = Score.of(left)
+        facts |= {"left_out": fold.what, "units": len(one.judged)}
         for j, horizon in enumerate(model.horizons):
-            windows = [np.abs(part.longer[:, j]) for part in parts]
-            logs = [
-                float(np.mean(np.log(np.maximum(part.longer_width[j], 1e-300) / np.maximum(part.mean_width, 1e-300))))
-                for part in parts
-                if np.isfinite(part.longer_width[j]).all()
-            ]
-            found.setdefault(horizon.steps, {})[kind] = HorizonCandidate(
-                horizon.steps,
-                kind,
-                by_unit(parts, [float(np.isfinite(w).all(axis=1).sum()) for w in windows]),
-                by_unit(parts, [float((w > 1.0).any(axis=1).sum()) for w in windows]),
-                float(np.mean(logs)) if logs else math.nan,
-            )
-    assert base is not None
-    refuse_missing(found)
-    return _decided(found, base, asked, what, units, dropped)
+            found.setdefault(horizon.steps, []).append(_judged(left, j, horizon.steps, kind))
+    _refuse_missing(found, lengths if asked else (), dropped)
+    chosen, facts["candidates"] = _decided(found, one, asked)
+    facts |= {
+        "chosen": {str(steps): widths for steps, widths in chosen.items()},
+        "reason": _reason(chosen, found, dropped),
+    }
+    return chosen, facts
 
 
-def _dropped(model: UncertainLTI, lengths: Sequence[int]) -> dict[int, str]:
-    """Of each horizon that was asked for and is not in the model what its fit says."""
-    found = {}
-    for steps in set(lengths) - set(model.steps):
-        begin = f"no horizon of {steps} steps: "
-        said = [text for text in model.fit_summary.get("messages", []) if text.startswith(begin)]
-        found[steps] = said[0].removeprefix(begin) if said else ""
-    return found
+def _judged(left: Validation, j: int, steps: int, kind: Widths) -> HorizonCandidate:
+    windows = [np.abs(part.longer[:, j]) for part in left.parts]
+    logs = [
+        float(np.mean(np.log(np.maximum(part.longer_width[j], 1e-300) / np.maximum(part.mean_width, 1e-300))))
+        for part in left.parts
+        if np.isfinite(part.longer_width[j]).all()
+    ]
+    return HorizonCandidate(
+        by_unit(left.parts, [float(np.isfinite(w).all(axis=1).sum()) for w in windows]),
+        by_unit(left.parts, [float((w > 1.0).any(axis=1).sum()) for w in windows]),
+        steps,
+        kind,
+        float(np.mean(logs)) if logs else math.nan,
+    )
+
+
+def _refuse_missing(there: Collection[int], asked: Sequence[int], dropped: Mapping[int, str]) -> None:
+    if missing := [h for h in asked if h not in there]:
+        raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
+
+
+def _why_dropped(model: UncertainLTI, steps: int) -> str:
+    """What the fit says of a horizon that was asked for and is not in the model."""
+    begin = f"no horizon of {steps} steps: "
+    said = [text for text in model.fit_summary.get("messages", []) if text.startswith(begin)]
+    return said[0].removeprefix(begin) if said else ""
 
 
 def _decided(
-    found: dict[int, dict[str, HorizonCandidate]],
-    base: HorizonCandidate,
-    asked: bool,
-    what: str,
-    units: int,
-    dropped: Mapping[int, str],
-) -> HorizonChoice:
-    """The table and what it says."""
+    found: Mapping[int, Sequence[HorizonCandidate]], base: Score, asked: bool
+) -> tuple[dict[int, Widths], list[dict[str, Any]]]:
+    """Half-widths of each number of steps that is taken, and the table."""
     rows: list[dict[str, Any]] = []
     chosen: dict[int, Widths] = {}
     reached = 1.0
-    for steps, kinds in sorted(found.items()):
-        constant, growing = kinds.get("constant"), kinds.get("growing")
-        best = constant or growing
-        assert best is not None
-        if constant is not None and growing is not None and _admissible(growing, constant):
-            if growing.log_width <= constant.log_width + math.log(PAYS):
-                best = growing
+    for steps, candidates in sorted(found.items()):
+        ordered = sorted(candidates, key=lambda one: one.widths)  # constant ones first
+        best, other = ordered[0], ordered[-1]
+        if other is not best and other.holds(best) and other.log_width <= best.log_width + math.log(PAYS):
+            best = other
         why = "asked for" if asked else ""
         if not asked:
             if not best.judged.sum():
                 why = "no left-out part is so long"
-            elif not _admissible(best, base):
+            elif not best.holds(base):
                 why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
             elif not best.per_step <= PAYS * reached:
                 why = "sees no slower changes than the horizon before it"
         taken = asked or not why
         if taken:
             chosen[steps], reached = best.widths, best.per_step
-        for one in (constant, growing):
-            if one is None:
-                continue
-            other = "growing ones are narrower" if best is growing else "constant ones hold as well"
-            rows.append(
-                {
-                    "steps": steps,
-                    "widths": one.widths,
-                    "outside": one.share,
-                    "width": math.exp(one.log_width),
-                    "per_step": one.per_step,
-                    "taken": taken and one is best,
-                    "why": (why or "holds, and sees slower changes") if one is best else other,
-                }
-            )
+        instead = "growing ones are narrower" if best.widths == "growing" else "constant ones hold as well"
+        rows += [
+            {
+                "steps": steps,
+                "widths": one.widths,
+                "outside": one.share,
+                "width": math.exp(one.log_width),
+                "per_step": one.per_step,
+                "taken": taken and one is best,
+                "why": (why or "holds, and sees slower changes") if one is best else instead,
+            }
+            for one in ordered
+        ]
+    return chosen, rows
+
+
+def _reason(
+    chosen: Mapping[int, Widths], found: Mapping[int, Sequence[HorizonCandidate]], dropped: Mapping[int, str]
+) -> str:
+    """Why these, in words."""
     if not found:
         reason = "none has an envelope that is worth having" if dropped else "no recording is long enough for a horizon"
     elif not chosen:
         reason = "none holds on left-out data as well as one step and sees slower changes"
     else:
         last = max(chosen)
-        row = next(r for r in rows if r["steps"] == last and r["taken"])
+        best = next(one for one in found[last] if one.widths == chosen[last])
         reason = (
-            f"{plural(last, 'step')}, {row['widths']} half-widths: {1 - row['outside']:.2%} of the left-out windows "
-            f"are inside, and the half-width is x {row['width']:.3g} of one step's"
+            f"{plural(last, 'step')}, {best.widths} half-widths: {1 - best.share:.2%} of the left-out windows "
+            f"are inside, and the half-width is x {math.exp(best.log_width):.3g} of one step's"
         )
-    reason += "".join(f"; no horizon of {steps} steps: {why}" for steps, why in sorted(dropped.items()) if why)
-    return HorizonChoice(chosen, tuple(rows), what, units, reason)
+    return reason + "".join(f"; no horizon of {steps} steps: {why}" for steps, why in sorted(dropped.items()) if why)

@@ -31,12 +31,11 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.proposal.fitting import fit
-from uncertain_lti.proposal.scheduling import Fold, fold_of
+from uncertain_lti.proposal.search import PAYS, Fold
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.functions import Memory
-from uncertain_lti.validation.left_out import leave_out
 from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored
 from uncertain_lti.validation.panel import worth
 
@@ -48,8 +47,8 @@ TRANSITIONS = 4000
 """Transitions by which promising signals are found, about; of larger recordings pieces are taken, ..."""
 PIECE = 200
 """... of so many transitions."""
-PAYS, ALLOWED = 0.8, 0.02
-"""Memories pay whose mean width on left-out data is at most this share, with at most so much more outside."""
+ALLOWED = 0.02
+"""Share of left-out data that may be outside beyond what is without memories."""
 FOLDS = 5
 """Times that something is left out to choose memories, at most."""
 FEWEST_STEPS, MOST_STEPS = 3, 0.05
@@ -193,7 +192,7 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
     base = thinned(transients, TRANSITIONS)
     try:
         model = fitting.fit(base, schedule={}, describe_data=False, additive=additive)
-        fold = fold_of(base, None, model, FOLDS)
+        fold = Fold.of(base, None, model, FOLDS)
         before = best = _judged(base, model, fold, additive)
     except FitError:
         return (), 1.0
@@ -219,7 +218,7 @@ def _judged(
     transients: Sequence[Transient], model: UncertainLTI, fold: Fold, additive: Additive
 ) -> tuple[Array, float]:
     """Mean width of each state on left-out data, in recorded units, and the share inside."""
-    left = leave_out(transients, full=model, groups=fold.groups, blocks=fold.blocks, gap=fold.gap, additive=additive)
+    left = fold.leave_out(transients, model, {"additive": additive})
     judged = np.array([part.judged for part in left.parts], dtype=np.float64)
     if not judged.sum():
         raise FitError("nothing that was left out can be judged")

@@ -136,7 +136,6 @@ def rules_for(model: UncertainLTI, steps: int, dt: float) -> list[StatisticRule]
 def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     """Size of each rule over its threshold, (K, n) or (K, 1), on one part by the alarm's own arithmetic."""
     model = part.judged_by
-    assert model is not None
     alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
     values = np.zeros((part.judged, len(alarm.names)))
     for start, stop in part.spans:

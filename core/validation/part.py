@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -76,46 +76,41 @@ USUAL = 0.9
 class Part:
     """A recording, or a block of one, judged by the model that was fitted without it.
 
-    `name`: what was left out; `dt` (K,): step of each judged transition, s; `utilisation` (K, n): (x_next - centre) /
-    half of every judged transition; `starts`: positions at which the alarm restarts: 0, and after every step back in
-    time; `violations` (n,): violated verdicts of each state at margin 1; `violated`: verdicts violated on any state at
-    margin 1; `outside_domain`: verdicts from outside the domain fitted without this part; `unseen`: violated verdicts
-    from inside that domain; `mean_width` (n,): of the left-out model's bounds on this part, recorded units; `max_width`
-    (n,): the largest such width; `relative_width` (n,): the mean over that of the full model on the same samples;
-    `group`: what was left out together with it; "" if it was left out alone; `model`: fitted without it; `transient`:
-    what was left out; `longer` (K, H, n): utilisation by each horizon of the full model; NaN where a window is broken,
-    or the left-out model has none; `longer_width` (H, n): mean width of the left-out model's envelopes over each
-    horizon on this part, recorded units; NaN likewise; `residual` (K, n): x_next - centre of every judged transition,
-    normalised; `longer_residual` (K, H, n): the same of each horizon; NaN as in `longer`; `judged_by`: the full model
-    with the residuals of the left-out one: what a statistic on this part takes; `extrapolated` (K,): `Reach.level` of
-    each judged transition; `usual_width`, `median_width` (n,): width that USUAL of them, and half of them, have at
-    most, recorded units; `outside` (K, n): left its bounds at margin 1, which rounding decides where `utilisation` is
-    about 1.
+    `name`: what was left out; `group`: what was left out together with it; "" if it was left out alone; `model`: fitted
+    without it; `judged_by`: the full model with the residuals of that one: what a statistic on this part takes;
+    `transient`: what was left out; `dt` (K,): step of each judged transition, s; `starts`: positions at which the alarm
+    restarts: 0, and after every step back in time; `utilisation` (K, n): (x_next - centre) / half; `outside` (K, n):
+    left its bounds at margin 1, which rounding decides where `utilisation` is about 1; `residual` (K, n): x_next -
+    centre, normalised; `longer`, `longer_residual` (K, H, n): utilisation and residual by each horizon of the full
+    model; NaN where a window is broken, or the left-out model has none; `longer_width` (H, n): mean width of the
+    left-out model's envelopes over each horizon on this part, recorded units; NaN likewise; `extrapolated` (K,):
+    `Reach.level`; `outside_domain`: verdicts from outside the domain fitted without this part; `unseen`: violated
+    verdicts from inside that domain; `mean_width`, `max_width` (n,): of the left-out model's bounds on this part,
+    recorded units; `relative_width` (n,): the mean over that of the full model on the same samples; `usual_width`,
+    `median_width` (n,): width that USUAL of them, and half of them, have at most, recorded units.
     """
 
     name: str
+    group: str
+    model: UncertainLTI
+    judged_by: UncertainLTI
+    transient: Transient
     dt: Array
-    utilisation: Array
     starts: tuple[int, ...]
-    violations: NDArray[np.intp]
-    violated: int
+    utilisation: Array
+    outside: NDArray[np.bool_]
+    residual: Array
+    longer: Array
+    longer_residual: Array
+    longer_width: Array
+    extrapolated: NDArray[np.intp]
     outside_domain: int
     unseen: int
     mean_width: Array
     max_width: Array
     relative_width: Array
-    group: str = ""
-    model: UncertainLTI | None = None
-    transient: Transient | None = None
-    longer: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    longer_width: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    residual: Array = field(default_factory=lambda: np.zeros((0, 0)))
-    longer_residual: Array = field(default_factory=lambda: np.zeros((0, 0, 0)))
-    judged_by: UncertainLTI | None = None
-    extrapolated: NDArray[np.intp] = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
-    usual_width: Array = field(default_factory=lambda: np.zeros(0))
-    median_width: Array = field(default_factory=lambda: np.zeros(0))
-    outside: NDArray[np.bool_] = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
+    usual_width: Array
+    median_width: Array
 
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
@@ -125,17 +120,20 @@ class Part:
         if not left.any():
             return self
         kept = ~left
-        starts = sorted({int(np.count_nonzero(kept[:s])) for s in self.starts})
-        count = int(np.count_nonzero(kept))
+        starts = sorted({int(np.count_nonzero(kept[:s])) for s in self.starts} - {int(np.count_nonzero(kept))})
         names = ("dt", "utilisation", "outside", "longer", "residual", "longer_residual", "extrapolated")
-        arrays: dict[str, Any] = {name: getattr(self, name) for name in names}
-        changes = {name: a[kept] if len(a) == len(kept) else a for name, a in arrays.items()}
-        return replace(self, starts=tuple(s for s in starts if s < count) or (0,), **changes)
+        arrays: dict[str, Any] = {name: getattr(self, name)[kept] for name in names}
+        return replace(self, starts=tuple(starts) or (0,), **arrays)
 
     @property
     def judged(self) -> int:
         """Number of verdicts."""
         return len(self.dt)
+
+    @property
+    def violated(self) -> int:
+        """Verdicts violated on any state at margin 1."""
+        return int(self.outside.any(axis=1).sum())
 
     @property
     def hours(self) -> float:
@@ -171,61 +169,47 @@ def judge(
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
-    found = verdicts.longer_utilisation[judged], verdicts.longer_residual[judged]
-    longer, longer_residual, longer_width = _longer(model, full, steps, *found)
     width = (verdicts.upper - verdicts.lower)[judged]
-    if full is model:
-        whole = width
-    else:
+    whole, own = width, np.full((len(model.horizons) + 1, model.n), np.nan)  # the last for a horizon that it lacks
+    if full is not model:
         _, half = full.columns_centre_and_half(full.normalised_columns(steps), steps.dt)
         whole = 2.0 * half.T * full.operating_point.X
-    flags = verdicts.flags[judged] == 1.0
+    if not len(width):
+        width = whole = np.full((1, model.n), np.nan)
+    if model.horizons:
+        for j, (*_, half) in enumerate(model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)):
+            if half.size:
+                own[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
+    places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
+    longer, longer_residual = (
+        np.pad(values[judged], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)[:, places]
+        for values in (verdicts.longer_utilisation, verdicts.longer_residual)
+    )
+    outside = verdicts.flags[judged] == 1.0
     resets = np.flatnonzero(back_and_restarts(transient.t_ns)[1])
-    starts = sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})
-    n = model.n
-    empty = not len(width)
-    utilisation = verdicts.utilisation[judged]
     return Part(
         name,
-        steps.dt,
-        utilisation,
-        tuple(starts),
-        flags.sum(axis=0),
-        int(flags.any(axis=1).sum()),
-        int(verdicts.outside_domain.sum()),
-        int((flags.any(axis=1) & ~verdicts.outside_domain[judged]).sum()),
-        np.full(n, np.nan) if empty else width.mean(axis=0),
-        np.full(n, np.nan) if empty else width.max(axis=0),
-        np.full(n, np.nan) if empty else width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
         group,
         model,
+        full.with_residuals_of(model, instead=True),
         transient,
+        steps.dt,
+        tuple(sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})),
+        verdicts.utilisation[judged],
+        outside,
+        verdicts.residual[judged],
         longer,
-        longer_width,
-        residual=verdicts.residual[judged],
-        longer_residual=longer_residual,
-        judged_by=full.with_residuals_of(model, instead=True),
-        extrapolated=np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
-        outside=flags,
-        usual_width=np.full(n, np.nan) if empty else np.quantile(width, USUAL, axis=0),
-        median_width=np.full(n, np.nan) if empty else np.median(width, axis=0),
+        longer_residual,
+        own[places],
+        np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
+        outside_domain=int(verdicts.outside_domain.sum()),
+        unseen=int((outside.any(axis=1) & ~verdicts.outside_domain[judged]).sum()),
+        mean_width=width.mean(axis=0),
+        max_width=width.max(axis=0),
+        relative_width=width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
+        usual_width=np.quantile(width, USUAL, axis=0),
+        median_width=np.median(width, axis=0),
     )
-
-
-def _longer(
-    model: UncertainLTI, full: UncertainLTI, steps: Transitions, utilisation: Array, residual: Array
-) -> tuple[Array, Array, Array]:
-    """Utilisation, residuals and mean widths over the horizons of the full model, NaN where this one lacks one."""
-    places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
-    width = np.full((len(model.horizons) + 1, model.n), np.nan)
-    if model.horizons:
-        envelopes = model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)
-        for j, half in enumerate(half for _, _, half in envelopes):
-            if half.size:
-                width[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
-    with_none = ((0, 0), (0, 1), (0, 0))
-    sizes, left = (np.pad(values, with_none, constant_values=np.nan)[:, places] for values in (utilisation, residual))
-    return sizes, left, width[places]
 
 
 def fitted_parts(model: UncertainLTI, transients: Sequence[Transient], most: float = math.inf) -> tuple[Part, ...]:

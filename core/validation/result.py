@@ -33,7 +33,6 @@ from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 def raised_on(rules: Sequence[Rule], part: Part) -> NDArray[np.bool_]:
     """(K,): whether the rules raise the alarm, after each verdict of a part that was left out."""
     model = part.judged_by
-    assert model is not None
     one_step = containment(rules)
     margin = 1.0 if one_step is None else one_step.margin
     violated = ~(np.nan_to_num(part.severity) <= margin)
@@ -216,10 +215,10 @@ def summary(validation: Validation) -> dict[str, Any]:
     full_mean, full_max = full_widths(model)
     states = {}
     for i, name in enumerate(model.state_names):
-        bad = sum(int(p.violations[i]) for p in parts)
+        bad = sum(int(p.outside[:, i].sum()) for p in parts)
         states[name] = {
             "inside": 1.0 - bad / judged if judged else None,
-            "parts_inside": sum(int(p.violations[i]) == 0 for p in parts),
+            "parts_inside": sum(not p.outside[:, i].any() for p in parts),
             "mean_width_left_out": float(held_width[i]),
             "max_width_left_out": float(np.nanmax([p.max_width[i] for p in parts])),
             "mean_width_full": full_mean[i],
