@@ -36,12 +36,12 @@ from scipy.optimize import golden
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.tables import table
 from uncertain_lti.identification import fit
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.plants import leibov
 from uncertain_lti.plants.turbofan_runs import make_run, simulate
-from uncertain_lti.reports.tables import table
 from uncertain_lti.sampling.transient import Transient
 
 EXPONENTS = (8.0, 32.0, 128.0, 512.0, np.inf)

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from test_pages import by_hand
 
 from uncertain_lti import EnvelopeMonitor, Transient
+from uncertain_lti.base.tables import beyond
 from uncertain_lti.identification import fit
 from uncertain_lti.reports.check import APART
 from uncertain_lti.reports.findings import CARE, NO, YES, findings, findings_text
 from uncertain_lti.reports.pages import html_report
-from uncertain_lti.reports.tables import beyond
 
 
 @given(st.lists(st.sampled_from("....vwnb"), min_size=2, max_size=120))

@@ -19,11 +19,11 @@ from tanks import DT, Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.tables import text_of
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import leibov2006, transient
-from uncertain_lti.reports.tables import text_of
 from uncertain_lti.reports.validation_text import detectable_blocks, detectable_data, detectable_words
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.validation import detectable as module

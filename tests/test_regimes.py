@@ -27,12 +27,12 @@ from test_schedule import scheduled as by_hand
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.domain import Sampling
+from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import check_regimes, unknown_in_words
 from uncertain_lti.reports.figures import matrices_figure, save
 from uncertain_lti.reports.findings import CARE, UNKNOWN
-from uncertain_lti.reports.model_text import block_facts
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

@@ -31,8 +31,8 @@ _LONGEST_LIST = 100_000
 
 def run_topics(options: argparse.Namespace) -> Result:
     """Print the topics of a recording and what each holds."""
+    from uncertain_lti.base.tables import number, table
     from uncertain_lti.recordings.formats import open_recording
-    from uncertain_lti.reports.tables import number, table
 
     bag = open_recording(options.bag)
     facts = bag.facts(options.progress.iterate("reading"))

@@ -24,6 +24,7 @@ from scipy.linalg import expm
 
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.base.tables import number, table
 from uncertain_lti.identification import fit
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -32,7 +33,6 @@ from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.plants.turbofan import engine
 from uncertain_lti.plants.turbofan_runs import DT, LARGE, NOISE, SMALL, make_run, operating_point, simulate, trim
 from uncertain_lti.reports.figures import envelope_figure, save, utilisation_figure
-from uncertain_lti.reports.tables import number, table
 from uncertain_lti.sampling.transient import Transient
 
 SHORT = ("N1", "N2", "P3", "P5", "T5")

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.english import plural, shortlist, times
+from uncertain_lti.base.tables import Block, Table, beyond, named, number, share, shortened, text_of
 from uncertain_lti.model.domain import jump_words, jumps
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -28,7 +29,6 @@ from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
-from uncertain_lti.reports.tables import Block, Table, beyond, named, number, share, shortened, text_of
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient

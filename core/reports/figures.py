@@ -29,11 +29,11 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import whole_file
+from uncertain_lti.base.tables import shortened
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import FEW, Chart, Columns, Map, Panel
-from uncertain_lti.reports.tables import shortened
 
 ENVELOPE, RECORDED, VIOLATED, ALARM, NO_VERDICT = "#56B4E9", "#000000", "#D55E00", "#F0E442", "#999999"
 _WIDTH = 10.0  # of a figure, inches

@@ -19,12 +19,13 @@ from typing import Any
 from uncertain_lti import __version__
 from uncertain_lti.base.english import plural, shortlist, times
 from uncertain_lti.base.files import sha256
+from uncertain_lti.base.tables import finite_data, list_of, number, numbers_of, shortened
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
+from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import UNVOUCHED, check_data
-from uncertain_lti.reports.model_text import block_facts, blocks_in_words
-from uncertain_lti.reports.tables import finite_data, list_of, number, numbers_of, shortened
+from uncertain_lti.reports.model_text import blocks_in_words
 from uncertain_lti.reports.validation_text import readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5

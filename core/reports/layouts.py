@@ -25,10 +25,10 @@ from jinja2 import Environment
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import target
+from uncertain_lti.base.tables import named
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, OUTPUTS, Output
 from uncertain_lti.reports.pages import write_page
-from uncertain_lti.reports.tables import named
 from uncertain_lti.signals.signal_map import Signal
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"

@@ -18,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from uncertain_lti.base.english import plural, shortlist
+from uncertain_lti.base.tables import Block, Table, list_of, named, number, numbers_of, share, text_of
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.overview import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.reports.tables import Block, Table, list_of, named, number, numbers_of, share, text_of
 from uncertain_lti.reports.validation_text import condition_text, detectable_data, detectable_words, left_out_text
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
@@ -88,7 +89,7 @@ def model_blocks(model: UncertainLTI) -> list[Block]:
     ]
     blocks.append(Table(("signal", "topic", "field", "steady", "scale", "unit"), rows, left=(1, 2), most=300))
     if model.schedule is None and model.n + model.m <= MOST_SHOWN:
-        blocks.append(_elements(model))
+        blocks.append(elements_table(model))
     blocks += [*_dynamics(model), *_widths(model)]
     for rule in model.alarm:
         words = rule.words
@@ -208,68 +209,13 @@ def _widths(model: UncertainLTI) -> list[Block]:
     return blocks
 
 
-def _elements(model: UncertainLTI) -> Table:
-    """Elements with their half-widths."""
-    names = [*model.state_names, *model.control_names]
-    nominal, half = np.hstack([model.A, model.B]), np.hstack([model.dA, model.dB])
-    shown = [
-        (term.nominal or f"{term.half} ({term.word})", np.column_stack(pair))
-        for term, *pair in model.additive()
-        if np.any(pair)
-    ]
-    rows = [
-        [name]
-        + [f"{nominal[i, j]:.4g} ± {half[i, j]:.3g}" for j in range(len(names))]
-        + [f"{pair[i, 0]:.4g} ± {pair[i, 1]:.3g}" for _, pair in shown]
-        for i, name in enumerate(model.state_names)
-    ]
-    return Table(("A, B [1/s]", *names, *(name for name, _ in shown)), rows)
-
-
 def _dynamics(model: UncertainLTI) -> list[Block]:
     """How fast a model is: eigenvalues, or what each regime rests on with its time constants."""
     if model.schedule is None:
         values = [v.real if v.imag == 0 else v for v in model.eigenvalues()]
         return [f"eigenvalues of A [1/s]: {', '.join(f'{v:.4g}' for v in values)}"]
-    facts = block_facts(model)
-    widths = any(block["mean_width"] for block in facts)
-    header = ["regime", "transitions", "elements of", "time constants [s]"]
-    header += [f"{name}: mean width" for name in model.state_names] * widths
-    rows = []
-    for block in facts:
-        transitions = "unknown" if block["transitions"] is None else str(block["transitions"])
-        row = [block["regime"], transitions if block["known"] else "0, not visited"]
-        row.append("its own" if block["tied_to"] is None else facts[block["tied_to"]]["regime"])
-        row.append(", ".join("grows" if v is None else number(v) for v in block["time_constants"]))
-        rows.append(row + [number(w) for w in block["mean_width"] or [None] * model.n] * widths)
     title = f"scheduled on {model.schedule.words}, {plural(model.schedule.blocks, 'regime')}"
-    return [title, Table(header, rows), *(f"note: {text}" for text in blocks_in_words(model))]
-
-
-def block_facts(model: UncertainLTI) -> list[dict[str, Any]]:
-    """What each block of a scheduled model rests on, and how fast it is."""
-    if model.schedule is None:
-        return []
-    fitted = list_of(model.fit_summary.get("blocks"))
-    knots = model.schedule.recorded_values(model.signals.signals)
-    facts = []
-    for r, (data, values) in enumerate(zip(model.block_data, model.eigenvalues(), strict=True)):
-        said = fitted[r] if r < len(fitted) and isinstance(fitted[r], Mapping) else {}
-        widths = numbers_of(said.get("mean_width"), model.n)
-        axes = zip(model.schedule.axes, knots, model.schedule.indices[r], strict=True)
-        facts.append(
-            {
-                "regime": model.block_name(r),
-                "at": {axis.signal: float(values_of[k]) for axis, values_of, k in axes},
-                "transitions": data.transitions,
-                "tied_to": data.tied_to,
-                "known": data.known,
-                "mean_width": None if widths is None else (np.array(widths) * model.operating_point.X).tolist(),
-                "eigenvalues": [[float(v.real), float(v.imag)] for v in values],
-                "time_constants": [-1.0 / float(v.real) if v.real < 0 else None for v in values],
-            }
-        )
-    return facts
+    return [title, blocks_table(model), *(f"note: {text}" for text in blocks_in_words(model))]
 
 
 def blocks_in_words(model: UncertainLTI) -> list[str]:

@@ -36,6 +36,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, whole_file
+from uncertain_lti.base.tables import Block, Table, list_of, number, share
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
@@ -44,7 +45,6 @@ from uncertain_lti.reports.charts import Columns, Panel, Spans
 from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.model_text import model_blocks
-from uncertain_lti.reports.tables import Block, Table, list_of, number, share
 from uncertain_lti.reports.validation_text import detectable_data, detectable_words, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from uncertain_lti.base.english import plural
-from uncertain_lti.reports.tables import Block, Table, named, number, share, text_of
+from uncertain_lti.base.tables import Block, Table, named, number, share, text_of
 from uncertain_lti.validation.signatures import Learnt
 
 MOST_PARTS = 20
