@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -93,9 +93,8 @@ def drop_noise(
     families = {c.family for c, known in zip(pool, share, strict=True) if known >= NOISE}
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
-            candidate.reason = (
-                f"noise: one sample predicts {max(0.0, known):.0%} of the variance at the next, controls included"
-            )
+            told = f"{max(0.0, known):.0%}"
+            candidate.reason = f"noise: one sample predicts {told} of the variance at the next, controls included"
             candidate.ready = "state"
     return [c for c in pool if not c.reason], ""
 
@@ -118,57 +117,62 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate]) -> None:
             candidate.reason, candidate.ready = "shows in the next step of none of the states", "control"
 
 
+_BESIDE = (
+    (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist above"),
+    (
+        r"angular_velocity\.|\(orientation\)",
+        r"linear_acceleration\.",
+        "an acceleration answers within a step; add it if it has a memory of its own",
+    ),
+    (
+        r"^(position|velocity)\[",
+        r"^effort\[",
+        "an effort answers within a step; add it if it has a memory of its own",
+    ),
+)
+"""What is left out beside what, and why: of a pose and its twist the pose, of a joint the effort."""
+
+
 def prefer_rates(source: Source) -> None:
-    """Of a pose and its twist the twist; of a joint's position, velocity and effort not the effort."""
-    moves = {c.path for c in source.free}
-    if any("twist." in p for p in moves):
-        for candidate in source.free:
-            if "pose." in candidate.path:
-                candidate.reason = "a place in a fixed frame; its rate of change is the twist above"
-    if any("angular_velocity." in p or "(orientation)" in p for p in moves):
-        for candidate in source.free:
-            if "linear_acceleration." in candidate.path:
-                candidate.reason = "an acceleration answers within a step; add it if it has a memory of its own"
-    if any(p.startswith(("position[", "velocity[")) for p in moves):
-        for candidate in source.free:
-            if candidate.path.startswith("effort["):
-                candidate.reason = "an effort answers within a step; add it if it has a memory of its own"
+    """Leave out what says less than what is beside it in the same topic."""
+    moves = [c.path for c in source.free]
+    for there, left, reason in _BESIDE:
+        if any(re.search(there, path) for path in moves):
+            for candidate in source.free:
+                if re.search(left, candidate.path):
+                    candidate.reason = reason
 
 
-def drop_copies(pool: Sequence[Candidate]) -> None:
-    """Leave out what moves as another candidate of the same topic does."""
+def drop_copies(pool: Sequence[Candidate]) -> list[Candidate]:
+    """Leave out what moves as another candidate of the same topic does; returns the rest."""
     kept: list[Candidate] = []
     for candidate in pool:
-        mine = np.concatenate(candidate.values)
-        for other in kept:
-            theirs = np.concatenate(other.values)
-            if other.topic == candidate.topic and len(mine) == len(theirs):
-                both = np.isfinite(mine) & np.isfinite(theirs)
-                if both.sum() > 2 and np.ptp(mine[both]) > 0 and np.ptp(theirs[both]) > 0:
-                    if abs(np.corrcoef(mine[both], theirs[both])[0, 1]) > 0.9999:
-                        candidate.reason = f"moves with {other.path}"
-                        break
+        if twin := next((other for other in kept if _moves_with(candidate, other)), None):
+            candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
+    return [c for c in kept if not c.reason]
+
+
+def _moves_with(one: Candidate, other: Candidate) -> bool:
+    a, b = np.concatenate(one.values), np.concatenate(other.values)
+    if one.topic != other.topic or len(a) != len(b):
+        return False
+    both = np.isfinite(a) & np.isfinite(b)
+    a, b = a[both], b[both]
+    return bool(len(a) > 2 and np.ptp(a) > 0 and np.ptp(b) > 0 and abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
 
 
 ALIKE = 0.8
 """Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
-
-
 STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
-
-
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
-
-
 MOST_STATES, MOST_CONTROLS = 8, 6
 
 
-@dataclass(frozen=True)
-class _Room:
+class _Room(NamedTuple):
     """How many signals of a kind are proposed at most, and the reason for leaving out more."""
 
     most: int
@@ -176,10 +180,9 @@ class _Room:
 
     @classmethod
     def of(cls, carried: int, most: int, what: str) -> _Room:
-        if carried < most:
-            most = max(1, carried)
-            return cls(most, f"the recording is too short for more than {most} {what}")
-        return cls(most, f"others show more, and at most {most} {what} are proposed; exchange one if this matters")
+        if carried >= most:
+            return cls(most, f"others show more, and at most {most} {what} are proposed; exchange one if this matters")
+        return cls(max(1, carried), f"the recording is too short for more than {max(1, carried)} {what}")
 
 
 def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
@@ -193,26 +196,18 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
     for source in states:
-        if source is main:
-            continue
         at_its_rate = ALIKE * fastest <= source.rate <= fastest / ALIKE
-        if source in shown and at_its_rate:
-            pool += source.free
-        else:
-            source.reason = (
-                f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}"
-                if source in shown
-                else "the controls do not show in it"
-            )
-            if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
-                for candidate in source.free:
-                    candidate.reason, candidate.ready = source.reason, "state"
-    drop_copies(pool)
-    pool = [c for c in pool if not c.reason]
-    used = [c for s in controls for c in s.free]
-    pool, used = _one_element(pool, used, every, like)
-    drop_copies(used)
-    used = [c for c in used if not c.reason]
+        if source is main or (source in shown and at_its_rate):
+            pool += [] if source is main else source.free
+            continue
+        source.reason = "the controls do not show in it"
+        if source in shown:
+            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}"
+        if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
+            for candidate in source.free:
+                candidate.reason, candidate.ready = source.reason, "state"
+    pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], every, like)
+    used = drop_copies(used)
     steps = steps_of(pool, every, used)
     pool = drop_functions(steps, pool)
     pool, doubt = drop_noise(pool, every, used)
@@ -274,11 +269,10 @@ def _one_element(
 
 def _strongest(steps: Steps, used: list[Candidate], room: _Room) -> list[Candidate]:
     """The controls that show most, up to a number."""
-    order = np.arange(len(used))
+    order = used
     if len(used) > room.most and len(steps.X) >= FEWEST:
-        order = np.argsort(steps.effect_of_each().max(axis=1, initial=0.0))[::-1]
-    for j in order[room.most :]:
-        used[j].reason = room.reason
+        order = [used[j] for j in np.argsort(steps.effect_of_each().max(axis=1, initial=0.0))[::-1]]
+    _first(order, room)
     return [c for c in used if not c.reason]
 
 
@@ -325,11 +319,7 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
         return _first(pool, room)
     while rest := [j for j in order if j not in kept and j not in full]:
         strength = [
-            max(
-                float(steps.effect(kept, of=[j], given=kept).max()),
-                float(steps.effect([j], of=kept, given=[j]).max()),
-            )
-            for j in rest
+            max(steps.effect(kept, of=[j], given=kept).max(), steps.effect([j], of=kept, given=[j]).max()) for j in rest
         ]
         if max(strength) <= SHOWS:
             break
@@ -337,16 +327,13 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
     for j, candidate in enumerate(pool):
         if j not in kept:
             candidate.ready = "state"
-            candidate.reason = (
-                room.reason
-                if j in full
-                else "the controls do not show in it, and nothing couples it to the states above"
-            )
+            alone = "the controls do not show in it, and nothing couples it to the states above"
+            candidate.reason = room.reason if j in full else alone
     return [pool[j] for j in sorted(kept)]
 
 
 def _first(pool: list[Candidate], room: _Room) -> list[Candidate]:
-    """The first candidates, where the controls show in none."""
+    """The first candidates; the others have no room."""
     for candidate in pool[room.most :]:
         candidate.reason = room.reason
     return pool[: room.most]

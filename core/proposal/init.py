@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,13 +22,14 @@ from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, TransientError, absent
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.choosing import choose
-from uncertain_lti.proposal.effects import earlier, held
+from uncertain_lti.proposal.effects import earlier
 from uncertain_lti.proposal.plant import is_plant, plant_signals
 from uncertain_lti.proposal.reading import Iterate, read_sources, run_column
 from uncertain_lti.proposal.roles import ask_for, assign_roles, at_rest
 from uncertain_lti.proposal.signals_file import (
+    clock_of,
+    columns_of,
     entry,
-    longest_hold,
     name_signals,
     set_operating_point,
     set_own_scale,
@@ -124,9 +125,8 @@ def propose(
             f"{shortlist(list(there), 20) or 'none'}"
         )
     ready = [c for s in sources for c in s.candidates if c.ready]
-    name_signals(
-        [*chosen, *(c for c in ready if c.ready == "state")], [*used, *(c for c in ready if c.ready == "control")]
-    )
+    further = ([c for c in ready if c.ready == kind] for kind in ("state", "control"))
+    name_signals(*([*some, *more] for some, more in zip((chosen, used), further, strict=True)))
     set_operating_point(chosen, used, sources)
     for candidate in ready:
         set_own_scale(candidate)
@@ -168,42 +168,26 @@ def _members(
 
 def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[str]:
     """Lines of what narrows the envelope of the proposed states on left-out data."""
-    every = {s.topic: s for s in sources}
-    clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
-    group = [*states, *controls]
-    limits = [longest_hold(every[c.topic], clock)[0] if c in controls else None for c in group]
-    transients = []
-    for number, arrival in enumerate(clock.arrival):
-        if len(arrival) < FEWEST:
+    group, clock = [*states, *controls], clock_of(states, sources)
+    names, n, transients = [c.name for c in group], len(states), []
+    for number, z in enumerate(columns_of(states, controls, sources)):
+        if len(z) < FEWEST:
             continue
-        z = np.column_stack(
-            [
-                earlier(held(c, every[c.topic], number, clock, limit), c.delay)
-                for c, limit in zip(group, limits, strict=True)
-            ]
-        )
+        z = np.column_stack([earlier(column, c.delay) for column, c in zip(z.T, group, strict=True)])
         z = (z - [c.steady for c in group]) / [c.scale or 1.0 for c in group]
         t, _ = clock.instants(clock, number)
-        x, u = z[:, : len(states)], z[:, len(states) :]
-        names = [c.name for c in group]
-        try:
-            transients.append(Transient(t, x, u, state_names=names[: x.shape[1]], control_names=names[x.shape[1] :]))
-        except TransientError:
-            continue
+        with suppress(TransientError):
+            transients.append(Transient(t, z[:, :n], z[:, n:], state_names=names[:n], control_names=names[n:]))
     if not transients:
         return []
     chosen, width = choose_memories(transients, "noise")
     gain = f"with it, mean width x {width:.2g} on left-out data"
     lines = ["  # known before the step, so without a row of its own and without a verdict"] if chosen else []
-    by_name = {c.name: c for c in group}
     for one in chosen:
-        of = by_name[one.of]
+        of = group[names.index(one.of)]
         memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
         lag, rate = memory.kind == "lag", memory.kind == "rate"
         recalled = replace(of, name=one.name, path=memory.of(of.path), steady=of.steady if lag else 0.0, delay=0)
         recalled.unit += "/s" if of.unit and rate else ""
         lines.append(entry(recalled, comment=gain))
     return lines
-
-
-__all__: list[Any] = ["Candidate", "Proposal", "propose"]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Sequence
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -153,11 +154,8 @@ def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
     order = ("control", "state", "reference", "")
     left = MOST_VALUES
     for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
-        count = max(1, sum(bag.topics[source.topic].count for bag in bags))
-        for candidate in source.candidates:
-            if candidate.reason:
-                continue
-            left -= count
+        for candidate in source.free:
+            left -= max(1, sum(bag.topics[source.topic].count for bag in bags))
             if left < 0:
                 candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
 
@@ -172,15 +170,10 @@ def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
         if size > LONGEST_ARRAY:
             found.append(Candidate(topic, path, reason=f"an array of {size} numbers"))
             continue
-        every = [path]
-        while any(_SPREAD.search(p) for p in every):
-            every = [
-                p[: match.start()] + f"[{i}]" + p[match.end() :]
-                for p in every
-                if (match := _SPREAD.search(p))
-                for i in range(int(match[1]), int(match[2]) + 1)
-            ]
-        found += [Candidate(topic, p) for p in every]
+        *inner, last = _SPREAD.split(path)  # text, first, last, text, ...
+        starts, firsts, lasts = inner[::3], map(int, inner[1::3]), map(int, inner[2::3])
+        entries = [[f"{text}[{i}]" for i in range(a, b + 1)] for text, a, b in zip(starts, firsts, lasts, strict=True)]
+        found += [Candidate(topic, "".join(parts) + last) for parts in product(*entries)]
     return found
 
 
@@ -223,10 +216,9 @@ def _sift(source: Source) -> None:
             if of_base and candidate.path.endswith(f"({base})") != is_rotation:
                 candidate.reason = "|"  # the other form of the same numbers has its line
     source.candidates = [c for c in source.candidates if c.reason != "|"]
-    for candidate in source.candidates:
-        if not candidate.reason:
-            _ignore(candidate)
-            _judge(candidate, source)
+    for candidate in source.free:
+        _ignore(candidate)
+        _judge(candidate, source)
     _wrapped(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
@@ -277,9 +269,7 @@ def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
 
 def _wrapped(source: Source) -> None:
     """Angles that jump by a turn are unwrapped, those of a quaternion always."""
-    for candidate in source.candidates:
-        if candidate.reason:
-            continue
+    for candidate in source.free:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         jumps = 0
         for values in candidate.values:

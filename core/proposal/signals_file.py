@@ -18,6 +18,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source
@@ -84,17 +85,27 @@ def _split(text: str) -> list[str]:
     return [w.lower() for w in _PARTS.findall(text)]
 
 
-def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
-    """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it."""
-    every = {s.topic: s for s in sources}
-    clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
-    group = [*states, *controls]
-    limits = [longest_hold(every[c.topic], clock)[0] if c in controls else None for c in group]
-    recordings = [
-        np.column_stack([held(c, every[c.topic], number, clock, limit) for c, limit in zip(group, limits, strict=True)])
+def clock_of(states: Sequence[Candidate], sources: Sequence[Source]) -> Source:
+    """The slowest of the topics of the states."""
+    topics = {c.topic for c in states}
+    return min((s for s in sources if s.topic in topics), key=lambda s: s.rate)
+
+
+def columns_of(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[Array]:
+    """Of each recording the values (messages of the clock, signals) of states and controls, as old as they may be."""
+    every, clock = {s.topic: s for s in sources}, clock_of(states, sources)
+    limits = [None] * len(states) + [longest_hold(every[c.topic], clock)[0] for c in controls]
+    each = [(c, every[c.topic], limit) for c, limit in zip([*states, *controls], limits, strict=True)]
+    return [
+        np.column_stack([held(c, source, number, clock, limit) for c, source, limit in each])
         for number in range(len(clock.arrival))
     ]
-    recordings = [r for r in recordings if len(r)]
+
+
+def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
+    """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it."""
+    group = [*states, *controls]
+    recordings = [r for r in columns_of(states, controls, sources) if len(r)]
     signals = [Signal(c.name, c.topic, c.path, "auto", "auto") for c in group]
     steady, scale, _ = resolve_auto(signals, recordings)
     pooled = np.concatenate(recordings)
@@ -148,7 +159,7 @@ def signals_file(
     """Write the text of the file."""
     every = {s.topic: s for s in sources}
     topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
-    clock = min((every[c.topic] for c in states), key=lambda s: s.rate)
+    clock = clock_of(states, sources)
     lines = [
         "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
         *(f"#   {bag.path.name}" for bag in bags),
@@ -184,10 +195,9 @@ def signals_file(
         lines.append(
             "# ignore: numbers that stand for no value, as they lie far from all others; they count as missing."
         )
-    lines.append("states:")
-    lines += [entry(c, comment=c.why) for c in states]
-    lines += memories
-    lines += [entry(c, comment=c.reason, out=True) for s in sources for c in s.candidates if c.ready == "state"]
+    ready = [c for s in sources for c in s.candidates if c.ready]
+    lines += ["states:", *(entry(c, comment=c.why) for c in states), *memories]
+    lines += [entry(c, comment=c.reason, out=True) for c in ready if c.ready == "state"]
     if controls:
         lines += ["", "controls:"]
         if any(every[c.topic].role == "guess" for c in controls):
@@ -197,9 +207,9 @@ def signals_file(
         for candidate in controls:
             limit, why = (None, candidate.why) if plant else longest_hold(every[candidate.topic], clock)
             lines.append(entry(candidate, limit, why))
-        for candidate in (c for s in sources for c in s.candidates if c.ready == "control"):
-            limit, _ = longest_hold(every[candidate.topic], clock)
-            lines.append(entry(candidate, limit, candidate.reason, out=True))
+        lines += [
+            entry(c, longest_hold(every[c.topic], clock)[0], c.reason, out=True) for c in ready if c.ready == "control"
+        ]
     else:
         lines += [
             "",
@@ -265,28 +275,17 @@ def entry(candidate: Candidate, max_hold: float | None = None, comment: str = ""
     parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
     parts.append('field: "' + re.sub(r'(["\\])', r"\\\1", candidate.path) + '"')
     parts += [f"steady: {_number(candidate.steady)}", f"scale: {_number(candidate.scale)}"]
-    if candidate.unit:
-        parts.append(f"unit: {candidate.unit}")
-    if max_hold is not None:
-        parts.append(f"max_hold: {_number(max_hold)}")
-    if candidate.judged:
-        parts.append("judged: true")
-    if candidate.delay:
-        parts.append(f"delay: {candidate.delay}")
-    if candidate.ignore:
-        parts.append(f"ignore: [{', '.join(_exact(v) for v in candidate.ignore)}]")
+    parts += [f"unit: {candidate.unit}"] * bool(candidate.unit)
+    parts += [] if max_hold is None else [f"max_hold: {_number(max_hold)}"]
+    parts += ["judged: true"] * candidate.judged
+    parts += [f"delay: {candidate.delay}"] * bool(candidate.delay)
+    parts += [f"ignore: [{', '.join(_number(v, exact=True) for v in candidate.ignore)}]"] * bool(candidate.ignore)
     return f"  {'# ' * out}- {{{', '.join(parts)}}}" + (f" # {comment}" if comment else "")
 
 
-def _number(value: float) -> str:
-    """Six digits, as YAML reads a number (1e-05 would be a text)."""
-    text = f"{value:.6g}"
-    return text.replace("e", ".0e") if "e" in text and "." not in text else text
-
-
-def _exact(value: float) -> str:
-    """Every digit, as YAML reads a number."""
-    text = repr(value)
+def _number(value: float, exact: bool = False) -> str:
+    """Six digits, or every digit, as YAML reads a number (1e-05 would be a text)."""
+    text = repr(value) if exact else f"{value:.6g}"
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
