@@ -520,7 +520,7 @@ def control(entry: str) -> str:
         (state("valid: 3"), "valid is 3; write \\[least, greatest\\]"),
         (state("valid: [1, 1]"), "signal 'x': valid is \\[1.0, 1.0\\]; write \\[least, greatest\\]"),
         (state("valid: [a, 1]"), "valid\\[0\\] is 'a'; write a number"),
-        (state("ignore: [1, null]"), "ignore has an empty entry"),
+        (state("ignore: [1, null]"), "ignore\\[1\\] is None; write a number"),
         (state("ignore: {a: 1}"), "ignore is {'a': 1}; write a list of numbers"),
         (control("field: 'lag(data, 0)'").replace("field: data, ", ""), "a lag is 1 to 1000000 samples, not 0"),
         (control("field: 'lag(data, 1)', delay: 2").replace("field: data, ", ""), "'u': lag\\(data, 1\\) has a delay"),

@@ -17,7 +17,7 @@ from typing import Any, Literal, get_args
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.signals.file_values import checked_mapping, checked_number
+from uncertain_lti.signals.file_values import checked_mapping, checked_number, wrong
 
 WidthChoice = Literal["auto", "growing", "constant"]
 """Half-widths that grow with |x| and |u|, are the same everywhere, or what holds better on left-out data."""
@@ -67,20 +67,19 @@ class HorizonRule:
         if isinstance(data, (list, tuple)):
             data = {"steps": list(data)}
         if not isinstance(data, dict):
-            raise SignalError(f"{where} is {reprlib.repr(data)}; write auto, or longest, steps or seconds with widths")
-        entry = checked_mapping(data, where, {*_KEYS, "widths"})
-        lists: dict[str, tuple[Any, ...]] = {}
+            raise wrong(where, data, "auto, or longest, steps or seconds with widths")
+        entry = {k: v for k, v in checked_mapping(data, where, {*_KEYS, "widths"}).items() if v is not None}
         for key in ("steps", "seconds"):
-            values = entry.get(key)
-            if values is None:
-                continue
-            if not isinstance(values, (list, tuple)) or not values:
-                raise SignalError(f"{where}: {key} is {reprlib.repr(values)}; write a list of numbers")
-            lists[key] = tuple(values)
-        longest = entry.get("longest")
-        longest = None if longest in (None, "auto") else checked_number(longest, f"{where}: longest")
+            if key in entry:
+                if not isinstance(entry[key], (list, tuple)) or not entry[key]:
+                    raise wrong(f"{where}: {key}", entry[key], "a list of numbers")
+                entry[key] = tuple(entry[key])
+        if entry.get("longest") == "auto":
+            del entry["longest"]
+        elif "longest" in entry:
+            entry["longest"] = checked_number(entry["longest"], f"{where}: longest")
         try:
-            return cls(longest, **lists, widths=entry.get("widths", "auto"))
+            return cls(**entry)
         except SignalError as error:
             raise SignalError(f"{where}: {str(error).removeprefix('horizons: ')}") from None
 
@@ -113,18 +112,15 @@ class TableLayout:
     @classmethod
     def from_dict(cls, data: Any, where: str) -> TableLayout:
         """Build from the structure of a signals file or a model file."""
-        given = checked_mapping(data, where, {"time", "unit", "runs"})
-        for key in ("time", "runs"):
-            value = given.get(key)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, (str, int, float)) or not value):
-                raise SignalError(f"{where}: {key} is {reprlib.repr(value)}; write the name of a column, in quotes")
-        unit = given.get("unit")
-        if unit not in (None, *UNITS):  # which may be no text
-            raise SignalError(
-                f"{where}: unit is {reprlib.repr(unit)}{meant(str(unit), UNITS)}; write one of {', '.join(UNITS)}"
-            )
-        names = {key: None if given.get(key) is None else str(given[key]) for key in ("time", "runs")}
-        return cls(names["time"], unit, names["runs"])
+        given = {k: v for k, v in checked_mapping(data, where, {"time", "unit", "runs"}).items() if v is not None}
+        for key in {"time", "runs"} & given.keys():
+            if isinstance(given[key], bool) or not isinstance(given[key], (str, int, float)) or not given[key]:
+                raise wrong(f"{where}: {key}", given[key], "the name of a column, in quotes")
+            given[key] = str(given[key])
+        if (unit := given.get("unit", "s")) not in tuple(UNITS):  # which may be no text
+            near = meant(str(unit), UNITS)
+            raise SignalError(f"{where}: unit is {reprlib.repr(unit)}{near}; write one of {', '.join(UNITS)}")
+        return cls(**given)
 
     def to_dict(self) -> dict[str, str]:
         """Return what `from_dict` takes, without what is left open."""

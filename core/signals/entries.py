@@ -11,190 +11,180 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any, Literal
+from functools import partial
+from typing import Any
 
 from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.signals.choices import CHOICES, CHOICES_TEXT, HorizonRule, TableLayout
-from uncertain_lti.signals.file_values import checked_mapping, checked_number, kind_in_yaml
-from uncertain_lti.signals.functions import parse_memory
+from uncertain_lti.signals.file_values import (
+    checked_list,
+    checked_mapping,
+    checked_number,
+    checked_numbers,
+    wrong,
+)
+from uncertain_lti.signals.functions import Memory, parse_memory
 from uncertain_lti.signals.signal import ScheduleRule, Signal
 
 STEP_CHOICES = "recorded, constant, or the period in seconds"
 """What `step` may be."""
 LISTS = ("states", "controls", "scheduling")
 """Keys of lists of signals."""
-_NUMBERS = ("max_gap", "min_step", "max_skew")
-_KEYS = {*LISTS, *_NUMBERS, "clock", "step", "additive", "schedule", "horizons", "structure", "table", "topics"}
+Reader = Callable[[Any, str], Any]
+"""Takes a value and where it stands, and returns what the map or the signal has of it."""
 
 
 def map_arguments(data: Any, source: str, need_topics: bool) -> dict[str, Any]:
-    """Arguments of a `SignalMap` from the structure of a signals file; the sentence of an error names the key."""
-    top = checked_mapping(data, source, _KEYS)
-    time = {}
-    for topic, options in checked_mapping(top.get("topics") or {}, f"{source}: topics", None).items():
-        time[topic] = checked_mapping(options, f"{source}: topics: {topic}", {"time"}).get("time")
-        if time[topic] not in ("header", "log"):
-            raise SignalError(f"{source}: topics: {topic}: time is {reprlib.repr(time[topic])}; write header or log")
-    top = expand(top, source)
-    top = top | _with_memories(top)
-    found: dict[str, Any] = {key: top.get(key) for key in ("additive", "clock", "structure")}
-    if found["additive"] not in (None, *CHOICES):
-        raise SignalError(f"{source}: additive is {reprlib.repr(found['additive'])}; write {CHOICES_TEXT}")
-    if found["clock"] is not None and not isinstance(found["clock"], str):
-        raise SignalError(f"{source}: clock is {reprlib.repr(found['clock'])}; write the name of a state topic")
-    found |= {key: _signals(top.get(key), f"{source}: {key}", need_topics) for key in LISTS}
-    found |= {key: checked_number(top.get(key), f"{source}: {key}") for key in _NUMBERS}
-    horizons, table = top.get("horizons"), top.get("table")
-    return {
-        **found,
-        "min_step": found["min_step"] or 0.0,
-        "step": _step(top.get("step"), f"{source}: step"),
-        "time": time,
-        "schedule": _schedule(top.get("schedule"), f"{source}: schedule"),
-        "horizons": None if horizons is None else HorizonRule.of(horizons, f"{source}: horizons"),
-        "table": None if table is None else TableLayout.from_dict(table, f"{source}: table"),
-        "source": source,
-    }
+    """Arguments of a `SignalMap` from the structure of a signals file; the sentence of an error names the key.
+
+    What is null is as if it were left out.
+    """
+    readers: dict[str, Reader] = _OF_THE_MAP | dict.fromkeys(LISTS, partial(_signals, need_topics))
+    top = expand(checked_mapping(data, source, {*readers}), source)
+    top |= _with_memories(top)
+    found = {key: readers[key](value, f"{source}: {key}") for key, value in top.items() if value is not None}
+    return {"states": (), "time": found.pop("topics", {}), "source": source, **found}
+
+
+def _signals(need_topics: bool, data: Any, where: str) -> tuple[Signal, ...]:
+    return checked_list(data, where, partial(_signal, need_topics))
+
+
+def _signal(need_topics: bool, data: Any, where: str) -> Signal:
+    known = {f.name for f in fields(Signal)}
+    entry = {key: value for key, value in checked_mapping(data, where, known).items() if value is not None}
+    for key in ("name", "topic", "field"):
+        if key not in entry:
+            raise SignalError(f"{where}: '{key}' is missing; every signal has a name, a topic and a field")
+        if not isinstance(entry[key], str) or not (entry[key] or (key == "topic" and not need_topics)):
+            raise wrong(f"{where}: '{key}'", entry[key], "a text, in quotes")
+    for key, reader in _OF_A_SIGNAL.items():
+        if key in entry:
+            entry[key] = reader(entry[key], f"{where}: {key}")
+    return Signal(**entry)
+
+
+def _one_of(write: str, *values: str) -> Reader:
+    def reader(value: Any, where: str) -> Any:
+        if value not in values:
+            raise wrong(where, value, write)
+        return value
+
+    return reader
+
+
+def _of_type(write: str, *kinds: type) -> Reader:
+    def reader(value: Any, where: str) -> Any:
+        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+            raise wrong(where, value, write)
+        return value
+
+    return reader
+
+
+def _number_or_auto(value: Any, where: str) -> Any:
+    return "auto" if value == "auto" else checked_number(value, where)
+
+
+def _text(value: Any, where: str) -> str:
+    return str(_of_type("a text, in quotes", str, int, float)(value, where))  # a unit of 1 is read as a number
+
+
+def _range(value: Any, where: str) -> tuple[float, ...]:
+    """Least and greatest value; null is no limit."""
+    if not isinstance(value, list) or len(value) != 2:
+        raise wrong(where, value, "[least, greatest]")
+    ends = enumerate(zip(value, (-math.inf, math.inf), strict=True))
+    return tuple(none if end is None else checked_number(end, f"{where}[{i}]") for i, (end, none) in ends)
+
+
+def _ignored(value: Any, where: str) -> tuple[float, ...]:
+    return () if value == [] else checked_numbers(value if isinstance(value, (list, dict)) else [value], where)
+
+
+def _step(value: Any, where: str) -> Any:
+    if value in ("recorded", "constant"):
+        return value
+    try:
+        return checked_number(value, where)
+    except SignalError:
+        raise wrong(where, value, STEP_CHOICES) from None
+
+
+def _times(data: Any, where: str) -> dict[str, Any]:
+    time = _one_of("header or log", "header", "log")
+    topics = checked_mapping(data, where, None)
+    options = {topic: checked_mapping(of, f"{where}: {topic}", {"time"}) for topic, of in topics.items()}
+    return {topic: time(of.get("time"), f"{where}: {topic}: time") for topic, of in options.items()}
+
+
+def _rule(data: Any, where: str) -> ScheduleRule:
+    entry = checked_mapping(data, where, {"signal", "knots", "modes"})
+    signal, knots, modes = entry.get("signal"), entry.get("knots"), entry.get("modes")
+    if not isinstance(signal, str):
+        raise wrong(f"{where}: 'signal'", signal, "the name of a signal")
+    if (knots is None) == (modes is None):
+        raise SignalError(f"{where}: write knots (auto, a number, or a list) or modes (a list), one of the two")
+    if modes is not None:  # those of a flag, as its field is read
+        values = [int(v) if isinstance(v, bool) else v for v in modes] if isinstance(modes, list) else modes
+        return ScheduleRule(signal, None, checked_numbers(values, f"{where}: modes"))
+    if isinstance(knots, list):
+        return ScheduleRule(signal, checked_numbers(knots, f"{where}: knots"))
+    if knots != "auto" and (isinstance(knots, bool) or not isinstance(knots, int) or knots < 1):
+        raise wrong(f"{where}: knots", knots, "auto, a number, or a list of knots")
+    return ScheduleRule(signal, knots)
+
+
+_OF_A_SIGNAL: Mapping[str, Reader] = {
+    "steady": _number_or_auto, "scale": _number_or_auto, "unit": _text, "type": _text, "max_hold": checked_number,
+    "delay": _of_type("a whole number of samples", int), "valid": _range, "ignore": _ignored,
+    "judged": _of_type("true or false", bool),
+}  # fmt: skip
+_OF_THE_MAP: dict[str, Reader] = {
+    "topics": _times,
+    "additive": _one_of(CHOICES_TEXT, *CHOICES),
+    "clock": _of_type("the name of a state topic", str),
+    "max_gap": checked_number,
+    "min_step": checked_number,
+    "max_skew": checked_number,
+    "step": _step,
+    "schedule": lambda data, where: checked_list(data, where, _rule),
+    "horizons": lambda data, where: HorizonRule.of(data, where),
+    "table": TableLayout.from_dict,
+    "structure": lambda data, where: data,  # which `identification.structure` reads
+}
 
 
 def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
     """Lists of signals in which a memory has the scale, unit and, of a lag, steady state of the listed field."""
-    lists = {key: top[key] for key in ("states", "controls", "scheduling") if isinstance(top.get(key), list)}
-    entries = [
-        e for entries in lists.values() for e in entries if isinstance(e, dict) and isinstance(e.get("field"), str)
-    ]
-    listed = {(str(e.get("topic")), e["field"].strip()): e for e in reversed(entries)}
-    found: dict[str, list[Any]] = {}
-    for key, of_list in lists.items():
-        found[key] = []
-        for entry in of_list:
-            memory = of = None
-            if any(entry is e for e in entries):
-                with contextlib.suppress(SignalError):  # refused later, by the name of the signal
-                    memory, inner = parse_memory(entry["field"])
-                    of = listed.get((str(entry.get("topic")), inner))
-            if memory is not None and of is not None:
-                unit = str(of.get("unit") or "")
-                own = {"scale": of.get("scale", 1.0), "unit": f"{unit}/s" if unit and memory.kind == "rate" else unit}
-                own |= {"steady": of["steady"]} if memory.kind == "lag" and "steady" in of else {}
-                entry = own | entry
-            found[key].append(entry)
-    return found
+    lists = {key: top[key] for key in LISTS if isinstance(top.get(key), list)}
+    entries = [e for of_list in lists.values() for e in of_list if isinstance(e, dict)]
+    listed = {(str(e.get("topic")), str(e.get("field")).strip()): e for e in reversed(entries)}
+
+    def filled(entry: Any) -> Any:
+        memory, inner = _memory(entry) if isinstance(entry, dict) else (None, "")
+        if memory is None or (of := listed.get((str(entry.get("topic")), inner))) is None:
+            return entry
+        unit = str(of.get("unit") or "")
+        own = {"scale": of.get("scale", 1.0), "unit": f"{unit}/s" if unit and memory.kind == "rate" else unit}
+        own |= {"steady": of["steady"]} if memory.kind == "lag" and "steady" in of else {}
+        return own | entry
+
+    return {key: [filled(entry) for entry in of_list] for key, of_list in lists.items()}
 
 
-def _step(value: Any, where: str) -> Literal["recorded", "constant"] | float:
-    if value is None or value == "recorded":
-        return "recorded"
-    if value == "constant":
-        return "constant"
+def _memory(entry: Mapping[str, Any]) -> tuple[Memory | None, str]:
+    """The memory that an entry is, and of what field; what is no field path is refused later, by the signal's name."""
     try:
-        number = checked_number(value, where)
+        return parse_memory(str(entry.get("field")))
     except SignalError:
-        raise SignalError(f"{where} is {reprlib.repr(value)}; write {STEP_CHOICES}") from None
-    assert number is not None
-    return number
-
-
-def _limits(entry: dict[str, Any], where: str) -> None:
-    """Numbers of `valid` and `ignore` in the place of what the file has; null is no limit."""
-    for key in ("valid", "ignore"):
-        if entry.get(key) is None:
-            entry.pop(key, None)
-            continue
-        value = entry[key]
-        if key == "ignore" and not isinstance(value, (list, dict)):
-            value = [value]
-        if not isinstance(value, list) or (key == "valid" and len(value) != 2):
-            wanted = "[least, greatest]" if key == "valid" else "a list of numbers"
-            raise SignalError(f"{where}: {key} is {reprlib.repr(value)}; write {wanted}")
-        numbers = [checked_number(v, f"{where}: {key}[{i}]") for i, v in enumerate(value)]
-        if key == "valid":
-            low, high = numbers
-            entry[key] = (-math.inf if low is None else low, math.inf if high is None else high)
-        elif None in numbers:
-            raise SignalError(f"{where}: ignore has an empty entry; write a number")
-        else:
-            entry[key] = tuple(numbers)
-
-
-def _schedule(data: Any, where: str) -> tuple[ScheduleRule, ...]:
-    if data is None:
-        return ()
-    if not isinstance(data, list):
-        raise SignalError(f"{where}: a list is wanted here, not {kind_in_yaml(data)}; see config/signals/")
-    rules = []
-    for position, entry in enumerate(data):
-        here = f"{where}[{position}]"
-        entry = checked_mapping(entry, here, {"signal", "knots", "modes"})
-        if not isinstance(entry.get("signal"), str):
-            raise SignalError(f"{here}: 'signal' is {reprlib.repr(entry.get('signal'))}; write the name of a signal")
-        knots, modes = entry.get("knots"), entry.get("modes")
-        if (knots is None) == (modes is None):
-            raise SignalError(f"{here}: write knots (auto, a number, or a list) or modes (a list), one of the two")
-        if knots is not None and knots != "auto" and not isinstance(knots, list):
-            if isinstance(knots, bool) or not isinstance(knots, int) or knots < 1:
-                raise SignalError(f"{here}: knots is {reprlib.repr(knots)}; write auto, a number, or a list of knots")
-            rules.append(ScheduleRule(entry["signal"], knots))
-        elif knots == "auto":
-            rules.append(ScheduleRule(entry["signal"], "auto"))
-        else:
-            which, values = ("knots", knots) if modes is None else ("modes", modes)
-            if not isinstance(values, list) or not values:
-                raise SignalError(f"{here}: {which} is {reprlib.repr(values)}; write a list of numbers")
-            if modes is not None:  # those of a flag, as its field is read
-                values = [int(v) if isinstance(v, bool) else v for v in values]
-            numbers = [checked_number(v, f"{here}: {which}[{i}]") for i, v in enumerate(values)]
-            if None in numbers:
-                raise SignalError(f"{here}: {which} has an empty entry; write a number")
-            listed = tuple(v for v in numbers if v is not None)
-            rules.append(ScheduleRule(entry["signal"], *((listed,) if modes is None else (None, listed))))
-    return tuple(rules)
-
-
-def _signals(data: Any, where: str, need_topics: bool) -> tuple[Signal, ...]:
-    if data is None:
-        return ()
-    if not isinstance(data, list):
-        raise SignalError(f"{where}: a list is wanted here, not {kind_in_yaml(data)}; see config/signals/")
-    known = {f.name for f in fields(Signal)}
-    signals = []
-    for position, entry in enumerate(data):
-        here = f"{where}[{position}]"
-        entry = dict(checked_mapping(entry, here, known))
-        for key in ("name", "topic", "field"):
-            if not isinstance(entry.get(key), str) or not (entry[key] or (key == "topic" and not need_topics)):
-                if entry.get(key) is None:
-                    raise SignalError(f"{here}: '{key}' is missing; every signal has a name, a topic and a field")
-                raise SignalError(f"{here}: '{key}' is {reprlib.repr(entry.get(key))}; write a text, in quotes")
-        for key in ("steady", "scale"):
-            if key in entry and entry[key] != "auto":
-                number = checked_number(entry[key], f"{here}: {key}")
-                entry[key] = number if number is not None else {"steady": 0.0, "scale": 1.0}[key]
-        _limits(entry, here)
-        for key in ("at", "judged"):
-            if entry.get(key) is None:
-                entry.pop(key, None)
-        if not isinstance(entry.get("judged", False), bool):
-            raise SignalError(f"{here}: judged is {reprlib.repr(entry['judged'])}; write true or false")
-        if "max_hold" in entry:
-            entry["max_hold"] = checked_number(entry["max_hold"], f"{here}: max_hold")
-        delay = entry.get("delay", 0)
-        if isinstance(delay, bool) or not isinstance(delay, int):
-            raise SignalError(f"{here}: delay is {reprlib.repr(delay)}; write a whole number of samples")
-        for key in ("unit", "type"):
-            text = entry.get(key)
-            if isinstance(text, bool) or not isinstance(text, (str, int, float, type(None))):
-                raise SignalError(f"{here}: {key} is {reprlib.repr(text)}; write a text, in quotes")
-            entry[key] = "" if text is None else str(text)  # a unit of 1 is read as a number
-        signals.append(Signal(**entry))
-    return tuple(signals)
+        return None, ""
 
 
 PLACE = "{}"
@@ -215,7 +205,7 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
     """
     found = dict(top)
     member: dict[str, str] = {}
-    for key in ("states", "controls", "scheduling", "structure"):
+    for key in (*LISTS, "structure"):
         if not isinstance(found.get(key), list):
             continue
         entries: list[Any] = []
@@ -250,9 +240,9 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
 def members_of(value: Any, where: str) -> list[str]:
     """Members of a `for` list; `...` between two that are counted stands for those between."""
     if not isinstance(value, list) or not value:
-        raise SignalError(f"{where} is {reprlib.repr(value)}; write a list, such as [j0, ..., j11]")
+        raise wrong(where, value, "a list, such as [j0, ..., j11]")
     if any(isinstance(v, bool) or not isinstance(v, (str, int)) or v == "" for v in value):
-        raise SignalError(f"{where} is {reprlib.repr(value)}; write names or whole numbers")
+        raise wrong(where, value, "names or whole numbers")
     members: list[str] = []
     texts = [str(v) for v in value]
     for i, text in enumerate(texts):
@@ -273,22 +263,13 @@ def members_of(value: Any, where: str) -> list[str]:
 
 def _own(top: Mapping[str, Any], member: Mapping[str, str]) -> list[dict[str, Any]]:
     """Rules that leave each state the signals of its own member, and those of none."""
-    lists: Sequence[Any] = [e for key in ("states", "controls") for e in top.get(key) or [] if isinstance(e, dict)]
-    names = [str(e.get("name")) for e in lists]
-    judged = [e for e in top.get("controls") or [] if isinstance(e, dict) and e.get("judged") is True]
-    rows = [e for e in [*(top.get("states") or []), *judged] if isinstance(e, dict) and not _remembers(e)]
-    states = [str(e.get("name")) for e in rows]
+    states, controls = ([e for e in top.get(key) or [] if isinstance(e, dict)] for key in ("states", "controls"))
+    names = [str(e.get("name")) for e in (*states, *controls)]
+    judged = [e for e in controls if e.get("judged") is True]
+    rows = [str(e.get("name")) for e in (*states, *judged) if _memory(e)[0] is None]
     return [
         {"state": state, "from": other, "nominal": 0, "half_width": 0}
-        for state in states
+        for state in rows
         for other in names
         if state in member and other in member and member[state] != member[other]
     ]
-
-
-def _remembers(entry: Mapping[str, Any]) -> bool:
-    """Whether it is a lag, diff or rate, which has no row; what is no field path is refused later."""
-    try:
-        return parse_memory(str(entry.get("field")))[0] is not None
-    except SignalError:
-        return False

@@ -15,12 +15,14 @@ import math
 import os
 import re
 import reprlib
-from typing import Any, TextIO
+from collections.abc import Callable
+from typing import Any, TextIO, TypeVar
 
 from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.files import kind_of
 
+T = TypeVar("T")
 _ODD = re.compile(r"[-+]?0[0-7_]+|.*[:_].*")  # octal, sexagesimal, with underscores
 
 
@@ -124,19 +126,31 @@ def _remedy(kind: str) -> str:
     return "name a file in it" if kind == "a folder" else "are the arguments swapped?"
 
 
-def checked_number(value: Any, where: str) -> float | None:
+def wrong(where: str, value: object, write: str) -> SignalError:
+    """The error for a value that cannot stand where it does."""
+    return SignalError(f"{where} is {reprlib.repr(value)}; write {write}")
+
+
+def checked_number(value: Any, where: str) -> float:
     """Check that a value is a number."""
-    if value is None:
-        return None
-    if isinstance(value, str):
-        try:
-            value = float(value)
-        except ValueError:
-            pass
     try:
-        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
-    except OverflowError:
+        number = math.nan if isinstance(value, bool) or not isinstance(value, (str, int, float)) else float(value)
+    except (ValueError, OverflowError):
         number = math.nan
     if math.isnan(number):
-        raise SignalError(f"{where} is {reprlib.repr(value)}; write a number")
+        raise wrong(where, value, "a number")
     return number
+
+
+def checked_numbers(values: Any, where: str) -> tuple[float, ...]:
+    """Check that a value is a list of numbers."""
+    if not isinstance(values, (list, tuple)) or not values:
+        raise wrong(where, values, "a list of numbers")
+    return tuple(checked_number(value, f"{where}[{i}]") for i, value in enumerate(values))
+
+
+def checked_list(data: Any, where: str, entry: Callable[[Any, str], T]) -> tuple[T, ...]:
+    """Check that a value is a list, of entries that `entry` takes with their places."""
+    if not isinstance(data, list):
+        raise SignalError(f"{where}: a list is wanted here, not {kind_in_yaml(data)}; see config/signals/")
+    return tuple(entry(one, f"{where}[{i}]") for i, one in enumerate(data))

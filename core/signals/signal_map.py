@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import math
 import os
-import reprlib
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Any, Literal, NoReturn
 
 from uncertain_lti.base.errors import SignalError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
@@ -25,7 +24,7 @@ from uncertain_lti.signals.choices import Additive, HorizonRule, TableLayout
 from uncertain_lti.signals.entries import LISTS, STEP_CHOICES, map_arguments
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
-from uncertain_lti.signals.file_values import load_yaml
+from uncertain_lti.signals.file_values import load_yaml, wrong
 from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal import Recalled as Recalled
 from uncertain_lti.signals.signal import ScheduleRule as ScheduleRule
@@ -132,79 +131,68 @@ class SignalMap:
         self._place_arrivals()
         self._place_judged()
         if not self.states:
-            raise SignalError(f"{self.source}: 'states' is empty; list at least one state")
+            self._refuse("'states' is empty; list at least one state")
         seen: set[str] = set()
         for signal in self.signals:
-            where = f"{self.source}: signal '{signal.name}'"
             if signal.name in seen:
-                raise SignalError(f"{where} is listed twice; give each signal its own name")
+                self._refuse(f"signal '{signal.name}' is listed twice; give each signal its own name")
             seen.add(signal.name)
-            signal.check(where)
+            signal.check(f"{self.source}: signal '{signal.name}'")
         self._check_kinds()
         self._check_topics()
         self._check_numbers()
 
+    def _refuse(self, text: str) -> NoReturn:
+        raise SignalError(f"{self.source}: {text}")
+
     def _check_kinds(self) -> None:
         """Refuse what is for controls, said of another signal, and a schedule on no signal."""
         of_states = {(s.topic, s.field) for s in self.states}
-        for signal in self.states:
-            if (signal.max_hold is not None and not signal.judged) or signal.delay:
-                raise SignalError(
-                    f"{self.source}: state '{signal.name}' has max_hold or delay; both are for controls "
-                    f"(the age of a state is limited by max_skew)"
+        for s in self.states:
+            if (s.max_hold is not None and not s.judged) or s.delay:
+                self._refuse(
+                    f"state '{s.name}' has max_hold or delay; both are for controls (the age of a state is limited by "
+                    f"max_skew)"
                 )
-        for signal in self.scheduling:
-            if signal.delay:
-                raise SignalError(f"{self.source}: scheduling signal '{signal.name}' has a delay; that is for controls")
-        for signal in self.states + self.scheduling:
-            if signal.at != "departure":
-                raise SignalError(f"{self.source}: '{signal.name}' is at {signal.at}; that is for controls")
-        for signal in self.controls:
-            if signal.at == "arrival" and (signal.topic, signal.field) in of_states:
-                raise SignalError(
-                    f"{self.source}: control '{signal.name}' is a state, which is judged at the arrival; leave `at` out"
-                )
+        for s in self.scheduling:
+            if s.delay:
+                self._refuse(f"scheduling signal '{s.name}' has a delay; that is for controls")
+        for s in self.states + self.scheduling:
+            if s.at != "departure":
+                self._refuse(f"'{s.name}' is at {s.at}; that is for controls")
+        for s in self.controls:
+            if s.at == "arrival" and (s.topic, s.field) in of_states:
+                self._refuse(f"control '{s.name}' is a state, which is judged at the arrival; leave `at` out")
         names = [s.name for s in self.signals]
         for rule in self.schedule:
             if rule.signal not in names:
-                raise SignalError(
-                    f"{self.source}: schedule: '{rule.signal}' is no state, control or scheduling signal; there are "
-                    f"{', '.join(names)}"
-                )
+                there = ", ".join(names)
+                self._refuse(f"schedule: '{rule.signal}' is no state, control or scheduling signal; there are {there}")
 
     def _check_topics(self) -> None:
         """Refuse a clock that carries no state, and a time of a topic that carries no signal."""
-        if self.clock is not None and self.clock not in {s.topic for s in self.states}:
-            raise UncarriedTopicError(
-                f"{self.source}: clock is {self.clock}, which carries no state; choose one of "
-                f"{', '.join(dict.fromkeys(s.topic for s in self.states))}",
-                self.topics,
-            )
-        for topic in self.time:
-            if topic not in self.topics:
-                raise UncarriedTopicError(
-                    f"{self.source}: 'topics' names {topic}, which carries no signal; "
-                    f"signals come from {', '.join(self.topics)}",
-                    self.topics,
-                )
+        of_states = dict.fromkeys(s.topic for s in self.states)
+        text = ""
+        if self.clock is not None and self.clock not in of_states:
+            text = f"clock is {self.clock}, which carries no state; choose one of {', '.join(of_states)}"
+        elif topic := next((topic for topic in self.time if topic not in self.topics), ""):
+            text = f"'topics' names {topic}, which carries no signal; signals come from {', '.join(self.topics)}"
+        if text:
+            raise UncarriedTopicError(f"{self.source}: {text}", self.topics)
 
     def _check_numbers(self) -> None:
         """Refuse steps and ages out of range."""
         if isinstance(self.step, str):
             if self.step not in ("recorded", "constant"):
-                raise SignalError(f"{self.source}: step is {reprlib.repr(self.step)}; write {STEP_CHOICES}")
+                raise wrong(f"{self.source}: step", self.step, STEP_CHOICES)
         elif not 1e-9 <= self.step <= LONGEST_S:
-            raise SignalError(f"{self.source}: step is {self.step}; it must be 1e-9 to {LONGEST_S:g} s")
+            self._refuse(f"step is {self.step}; it must be 1e-9 to {LONGEST_S:g} s")
         for name in ("max_gap", "max_skew"):
             value = getattr(self, name)
             if value is not None and not 0 < value <= LONGEST_S:
-                raise SignalError(
-                    f"{self.source}: {name} is {value}; it must be a positive number of seconds, at most {LONGEST_S:g}"
-                )
+                self._refuse(f"{name} is {value}; it must be a positive number of seconds, at most {LONGEST_S:g}")
         if not 0 <= self.min_step <= LONGEST_S:
-            raise SignalError(
-                f"{self.source}: min_step is {self.min_step}; it must be 0 s or more, up to {LONGEST_S:g}"
-            )
+            self._refuse(f"min_step is {self.min_step}; it must be 0 s or more, up to {LONGEST_S:g}")
 
     def _place_memories(self) -> None:
         """Put memories among the states after the controls; what is valid of a listed field is so of its memories."""
@@ -213,9 +201,9 @@ class SignalMap:
             object.__setattr__(self, "states", tuple(s for s in self.states if not s.recalls))
             object.__setattr__(self, "controls", (*self.controls, *memories))
             if not self.states:
-                raise SignalError(
-                    f"{self.source}: every state is a lag, diff or rate, which has no row of its own; list the field "
-                    f"itself as a state, too"
+                self._refuse(
+                    "every state is a lag, diff or rate, which has no row of its own; list the field itself as a state,"
+                    " too"
                 )
         known = {(s.topic, s.field): s for s in reversed(self.signals)}
         for group in ("controls", "scheduling"):
