@@ -55,6 +55,7 @@ if not any("uncertain_lti" in str(p) for p in sys.path):
     sys.path.insert(0, str(ROOT / "tests" / "checkout"))
 
 from bag_writer import Layout, Message, Topic, cdr, float64, header, message, places, write  # noqa: E402
+from by_message import read_stream_by_message  # noqa: E402
 from hostile_writer import hostile_file  # noqa: E402
 from perturbed import CASES, difference  # noqa: E402
 
@@ -271,7 +272,7 @@ def read_every_way(path: Path, checked: bool) -> str:
     from uncertain_lti import SignalMap
     from uncertain_lti.base.errors import UncertainLTIError
     from uncertain_lti.recordings.bag import Bag
-    from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
+    from uncertain_lti.sampling.streams import read_stream
 
     folder = path.parent
     signals = SignalMap.load(folder / "signals.yaml")

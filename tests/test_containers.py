@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from by_message import read_stream_by_message
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
@@ -30,7 +31,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_files import survey
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
+from uncertain_lti.sampling.streams import read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 
 ROOT = Path(__file__).resolve().parents[1]

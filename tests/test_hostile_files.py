@@ -35,6 +35,7 @@ from bag_writer import (
     statistics_record,
     write,
 )
+from by_message import read_stream_by_message
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import Writer
 from test_annotate import held
@@ -49,7 +50,7 @@ from uncertain_lti.recordings.mcap_scan import outline
 from uncertain_lti.recordings.message_types import define
 from uncertain_lti.reports.annotate import annotate
 from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
-from uncertain_lti.sampling.streams import read_stream, read_stream_by_message
+from uncertain_lti.sampling.streams import read_stream
 
 TOPIC = Topic("/a")
 DEFINED = schema_record(1, TOPIC) + channel_record(1, TOPIC, 1)

@@ -21,12 +21,13 @@ import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
 from bag_writer import Layout, float64
+from by_message import read_stream_by_message
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.recordings.bag_arrays
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.sampling.streams import Stream, read_stream, read_stream_by_message
+from uncertain_lti.sampling.streams import Stream, read_stream
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -22,12 +23,12 @@ from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.sampling.reading_processes import processes_for, read_streams
+from uncertain_lti.sampling.reading_processes import read_streams
 from uncertain_lti.sampling.resolve import resolve
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.status import INVALID, LATE, TOO_OLD, Status
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
+from uncertain_lti.sampling.streams import Stream, read_stream
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
@@ -46,8 +47,6 @@ def times_of(stream: Stream, signals: SignalMap) -> Times:
     times = {}
     for position, topic in enumerate(signals.topics):
         chosen = stream.topic == position
-        if not chosen.any():
-            raise BagError(f"{stream.bag.path}: {topic} has no message; record it, or choose another topic")
         stamps, arrivals = stream.stamp[chosen], stream.arrival[chosen]
         stamped = stamps[stamps >= 0]
         kept = len(stamps) if topic in states else 0
@@ -183,7 +182,7 @@ def read_transients(
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
     signals = signals.with_types(types_of(bags, signals))
-    streams = _streams(bags, signals, progress, processes)
+    streams = read_streams(bags, signals, progress, processes)
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
     transients = [sample(stream, resolved)[0] for stream in streams]
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
@@ -194,27 +193,14 @@ def read_transients(
         transients = [sample(stream, resolved)[0] for stream in streams]
     numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
     note = f"operating point from {words}: {numbers}"
-    return [_with_signals(t, resolved, note if t is transients[0] else None) for t in transients]
-
-
-def _streams(
-    bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int | None
-) -> list[Stream]:
-    if processes != 1 and len(bags) > 1:
-        processes = processes_for(bags) if processes is None else processes
-        if processes != 1:
-            for bag in bags:
-                check_paths(bag, signals)  # what is wrong with the map is found before anything is started
-            return read_streams(bags, signals, progress, processes)
-    return [read_stream(bag, signals, progress) for bag in bags]
+    return [t.replace(signals=resolved, notes=(*t.notes, note) if t is transients[0] else t.notes) for t in transients]
 
 
 def read_as_fitted(
     recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> Transient:
     """Read one recording with the signals and sampling that a model was fitted with."""
-    stream = _stream_for_model(recording, signals, progress)
-    return sample(stream, signals)[0]
+    return read_as_fitted_with_decisions(recording, signals, progress)[0]
 
 
 def read_as_fitted_with_decisions(
@@ -272,11 +258,6 @@ def _stream_for_model(
             f"fit the model to recordings"
         )
     stream = read_stream(bag, signals, progress)
-    for position, topic in enumerate(signals.topics):
-        if not (stream.topic == position).any():
-            raise BagError(
-                f"{bag.path}: {topic} has no message, so nothing can be judged; record it, or choose another recording"
-            )
     stamps = stream.stamp[stream.topic == signals.topics.index(signals.clock)]
     if signals.time[signals.clock] == "header" and not (stamps > 0).any():
         raise SignalError(
@@ -330,21 +311,11 @@ def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]
     return signals.replace_signals(filled), words
 
 
-def _with_signals(transient: Transient, signals: SignalMap, note: str | None) -> Transient:
-    return transient.replace(signals=signals, notes=(*transient.notes, *([note] if note else [])))
-
-
 def unused(transient: Transient) -> list[str]:
     """In words, how many transitions of a recording are not used, and why."""
-    counts: dict[str, int] = {}
-    for status in transient.statuses()[1:]:
-        if status is not Status.OK:
-            counts[status.value] = counts.get(status.value, 0) + 1
-    parts = [f"{count} {kind}" for kind, count in counts.items()]
+    counts = Counter(status.value for status in transient.statuses()[1:] if status is not Status.OK)
     counters = transient.counters
+    parts = [f"{count} {kind}" for kind, count in counts.items()]
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
-    return parts + [
-        f"{count} {kind} {name}"
-        for kind in (LATE, TOO_OLD, INVALID)
-        for name, count in sorted(counters.of(kind).items())
-    ]
+    kinds = [(kind, *of) for kind in (LATE, TOO_OLD, INVALID) for of in sorted(counters.of(kind).items())]
+    return parts + [f"{count} {kind} {name}" for kind, name, count in kinds]

@@ -24,7 +24,7 @@ from typing import Any
 from uncertain_lti.base.cores import core_count
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.sampling.streams import Stream, read_stream
+from uncertain_lti.sampling.streams import Stream, check_paths, read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 
 WORTH_IT = 1 << 28
@@ -41,11 +41,16 @@ def processes_for(bags: Sequence[Recording]) -> int:
 
 
 def read_streams(
-    bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int
+    bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int | None
 ) -> list[Stream]:
-    """`read_stream` of every recording, in processes; progress advances by whole recordings."""
+    """`read_stream` of every recording; where processes read them, progress advances by whole recordings."""
+    processes = min(processes_for(bags) if processes is None else processes, len(bags))
+    if processes == 1:
+        return [read_stream(bag, signals, progress) for bag in bags]
+    for bag in bags:
+        check_paths(bag, signals)  # what is wrong with the map is found before anything is started
     counts = [sum(bag.topics[topic].count for topic in signals.topics) for bag in bags]
-    with _pool(min(processes, len(bags))) as pool:
+    with _pool(processes) as pool:
         futures = {pool.submit(_read, bag, signals): number for number, bag in enumerate(bags)}
 
         def messages() -> Iterator[None]:

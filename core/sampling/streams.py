@@ -12,16 +12,13 @@
 from __future__ import annotations
 
 import math
-from array import array
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.errors import SignalError
-from uncertain_lti.recordings.bag_arrays import in_reach
-from uncertain_lti.recordings.message_reader import header_stamp_ns
+from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap
@@ -44,36 +41,11 @@ class Stream:
 
 
 def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
-    """Read the fields of a signals file from one recording.
-
-    Messages are read in blocks (`bag_arrays`), with what `read_stream_by_message` gives to the last bit.
-    """
+    """Read the fields of a signals file from one recording."""
     paths = check_paths(bag, signals)
     columns = bag.columns(signals.topics, paths, progress)
-    _refuse_absent(bag, signals, paths, columns.values)
+    refuse_absent(bag, signals, paths, columns.values)
     return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
-
-
-def read_stream_by_message(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
-    """What `read_stream` gives, message by message."""
-    paths = check_paths(bag, signals)
-    topics = signals.topics
-    messages: Iterable[tuple[str, int, object]] = bag.messages(topics)
-    if progress is not None:
-        total = sum(bag.topics[t].count for t in topics)
-        messages = progress(messages, total)  # type: ignore[assignment]
-    position = {name: i for i, name in enumerate(topics)}
-    order, arrival, stamp = array("q"), array("q"), array("q")
-    values = [array("d") for _ in topics]
-    for name, log_time, message in messages:
-        where = position[name]
-        order.append(where)
-        arrival.append(in_reach(bag.path, log_time))
-        stamp.append(header_stamp_ns(message) or -1)
-        values[where].extend([path.read(message) for path in paths[where]])
-    arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
-    _refuse_absent(bag, signals, paths, arrays)
-    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
 
 
 def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
@@ -102,14 +74,16 @@ def _fits(bag: Recording, signals: SignalMap) -> bool:
     return len(readable) == len(signals.topics)
 
 
-def _refuse_absent(
+def refuse_absent(
     bag: Recording, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
 ) -> None:
-    """What the first message lacks, and what gave no number in any other, is a mistake in the map."""
+    """What no message has: a topic, or what the first lacks and gave no number in any other, a mistake in the map."""
     for name, columns, read in zip(signals.topics, paths, values, strict=True):
+        if not len(read):
+            raise BagError(f"{bag.path}: {name} has no message; record it, or choose another topic or recording")
         for path, column in zip(columns, read.T, strict=True):
             looked_up = any(kind != "attribute" for kind, _ in path.steps)
-            if not looked_up or not len(column) or not math.isnan(column[0]) or not np.isnan(column).all():
+            if not looked_up or not math.isnan(column[0]) or not np.isnan(column).all():
                 continue
             notes = bag.reading_notes
             _, _, first = next(iter(bag.messages([name])))
