@@ -182,33 +182,31 @@ def publish(n: int, rate: float, seconds: float, left: float, stamps: str, await
     rclpy.shutdown()
 
 
-def take(executor: str) -> None:
-    """The bare node: prints its delays when a line comes in."""
+def bare(executor: str, timed: bool = False) -> None:
+    """The bare node: says how many messages came when a line comes in, or with a look at the clock their delays."""
     import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.experimental import EventsExecutor
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
 
     rclpy.init()
-    node = rclpy.create_node("bare")
-    count = [0]
+    node, count, delays = rclpy.create_node("bare"), [0], list[int]()
 
     def nothing(_: JointState) -> None:
         count[0] += 1
 
-    for topic in (STATE, CONTROL):
-        node.create_subscription(JointState, topic, nothing, QoSProfile(depth=QUEUE))
-    spinner = EventsExecutor() if executor == "events" else SingleThreadedExecutor()
-    spinner.add_node(node)
-    listen_for_end(spinner, lambda: {"received": count[0]})
+    def note(message: JointState) -> None:  # its cost is not part of what costs are compared with
+        stamp = message.header.stamp
+        delays.append(time.time_ns() - stamp.sec * 10**9 - stamp.nanosec)
+
+    node.create_subscription(JointState, STATE, note if timed else nothing, QoSProfile(depth=QUEUE))
+    node.create_subscription(JointState, CONTROL, nothing, QoSProfile(depth=QUEUE))
+    listen_for_end(lambda: {"delays": delays} if timed else {"received": count[0]}, node, executor)
 
 
 def relay(n: int, names: list[str]) -> None:
     """Publishes what the monitor would, on each state message, without looking at it."""
     import rclpy
     from rclpy.duration import Duration
-    from rclpy.experimental import EventsExecutor
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Bool
@@ -236,38 +234,12 @@ def relay(n: int, names: list[str]) -> None:
 
     node.create_subscription(JointState, STATE, pass_on, QoSProfile(depth=QUEUE), raw=True)
     node.create_subscription(JointState, CONTROL, nothing, QoSProfile(depth=QUEUE), raw=True)
-    spinner = EventsExecutor()
-    spinner.add_node(node)
-    listen_for_end(spinner, lambda: {"received": count[0]})
-
-
-def bare_delay(executor: str) -> None:
-    """As `take`, with a look at the clock in each callback, which is not part of what costs are compared with."""
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.experimental import EventsExecutor
-    from rclpy.qos import QoSProfile
-    from sensor_msgs.msg import JointState
-
-    rclpy.init()
-    node = rclpy.create_node("bare")
-    delays: list[int] = []
-
-    def note(message: JointState) -> None:
-        stamp = message.header.stamp
-        delays.append(time.time_ns() - stamp.sec * 10**9 - stamp.nanosec)
-
-    node.create_subscription(JointState, STATE, note, QoSProfile(depth=QUEUE))
-    node.create_subscription(JointState, CONTROL, lambda _: None, QoSProfile(depth=QUEUE))
-    spinner = EventsExecutor() if executor == "events" else SingleThreadedExecutor()
-    spinner.add_node(node)
-    listen_for_end(spinner, lambda: {"delays": delays})
+    listen_for_end(lambda: {"received": count[0]}, node)
 
 
 def hear(names: list[str]) -> None:
     """Subscribes to outputs of the monitor; those but the flags are received and dropped by the middleware."""
     import rclpy
-    from rclpy.experimental import EventsExecutor
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Bool
@@ -287,15 +259,12 @@ def hear(names: list[str]) -> None:
         else:
             kind = Bool if name == "violation" else JointState
             idle.create_subscription(kind, topic, lambda _: None, QoSProfile(depth=1))
-    spinner = EventsExecutor()
-    spinner.add_node(node)
-    listen_for_end(spinner, lambda: {"delays": delays})
+    listen_for_end(lambda: {"delays": delays}, node)
 
 
 def digest(file: str) -> None:
     """Subscribes to all outputs of the monitor, and keeps a checksum of each message that depends on verdicts alone."""
     import rclpy
-    from rclpy.experimental import EventsExecutor
     from rclpy.qos import QoSProfile
     from sensor_msgs.msg import JointState
     from std_msgs.msg import Bool
@@ -316,14 +285,12 @@ def digest(file: str) -> None:
             node.create_subscription(kind, topic, note, QoSProfile(depth=QUEUE_ARMED), raw=True)
         else:
             idle.create_subscription(kind, topic, lambda _: None, QoSProfile(depth=1))
-    spinner = EventsExecutor()
-    spinner.add_node(node)
 
     def say() -> dict[str, Any]:
         np.savez(file, **{name: np.array(found, dtype=np.uint32) for name, found in sums.items()})
         return {"delays": sums["flags"].tolist()}
 
-    listen_for_end(spinner, say)
+    listen_for_end(say, node)
 
 
 def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any]:
@@ -359,9 +326,14 @@ def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any
     return {"sums": found, "alarms": int(rises), "verdicts": int(verdicts.judged.sum())}
 
 
-def listen_for_end(spinner: Any, say: Any) -> None:
+def listen_for_end(say: Any, node: Any, executor: str = "events") -> None:
+    """Spin a node until a line comes in, and print what there is to say."""
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.experimental import EventsExecutor
     from rclpy.task import Future
 
+    spinner = EventsExecutor() if executor == "events" else SingleThreadedExecutor()
+    spinner.add_node(node)
     never: Future = Future(executor=spinner)
     print("ready", flush=True)
     while not select.select([sys.stdin], [], [], 0)[0]:
@@ -763,7 +735,7 @@ def main() -> None:
         elif kind == "relay":
             relay(int(rest[0]), rest[1:])
         else:
-            {"take": take, "delay": bare_delay}[kind](rest[0])
+            bare(rest[0], timed=kind == "delay")
     elif args.soak:
         found = soak(args.soak, args.soak_rate, args.sizes[0], args.domain, args.armed)
         if not (found["exact"] and found["growth"] < 1.0):

@@ -9,7 +9,6 @@
 
 """The nonlinear turbofan: balances, plausibility, modes, control, faults, and the recordings made with it."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -430,11 +429,3 @@ def test_recording_anew_gives_identical_payloads(tmp_path):
     made = simulate(make_run("check", noise=1e-4, seed=9))
     assert np.array_equal(read.x, made.x) and np.array_equal(read.t_ns, made.t_ns)
     assert list(read.state_names) == list(STATES)
-
-
-def test_other_rotors_change_the_modes_and_not_the_steady_state(plant):
-    light = Engine(rotors=replace(plant.rotors, low=plant.rotors.low / 2, high=plant.rotors.high / 2))
-    point, t = operating_point(), trim(68.0, light)
-    assert t.x == pytest.approx(trim(68.0).x, rel=1e-9)
-    A = plant.linearise(t.x, t.u, point.X, point.U)[0]
-    assert light.linearise(t.x, t.u, point.X, point.U)[0][:2] == pytest.approx(2.0 * A[:2], rel=1e-6, abs=1e-9)

@@ -165,16 +165,11 @@ def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) ->
             f"W has shape {weights.shape}; it must be ({model.n},), ({len(usable)}, {model.n}) "
             f"or ({len(usable)}, {model.n}, {model.n})"
         )
-    diagonal = np.broadcast_to(np.diagonal(weights, axis1=1, axis2=2) if weights.ndim == 3 else weights, error.shape)[
-        usable
-    ]
+    full = weights.ndim == 3
+    diagonal = np.broadcast_to(np.diagonal(weights, axis1=1, axis2=2) if full else weights, error.shape)[usable]
     error = error[usable]
-    if weights.ndim == 3:
-        total = float(np.einsum("ki,kij,kj->", error, weights[usable], error))
-    else:
-        total = float(np.sum(diagonal * error**2))
-    largest = np.max(np.sqrt(diagonal) * np.abs(error), axis=0, initial=0.0)
-    return total, largest
+    squares = np.einsum("ki,kij,kj->", error, weights[usable], error) if full else np.sum(diagonal * error**2)
+    return float(squares), np.max(np.sqrt(diagonal) * np.abs(error), axis=0, initial=0.0)
 
 
 def recursion(model: Any, dt: float) -> Array:

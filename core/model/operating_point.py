@@ -140,21 +140,14 @@ class OperatingPoint:
             A steady state or a scale is still `auto`, or not what `OperatingPoint` takes.
         """
 
-        def numbers(signals: Sequence[Signal], which: str) -> Array:
-            values = [getattr(s, which) for s in signals]
-            if "auto" in values:
-                name = signals[values.index("auto")].name
-                raise TransientError(f"signal '{name}': {which} is auto and not resolved; give a number")
-            return np.array(values, dtype=np.float64)
-
-        return cls(
-            numbers(states, "steady"),
-            numbers(controls, "steady"),
-            numbers(states, "scale"),
-            numbers(controls, "scale"),
-            numbers(scheduling, "steady"),
-            numbers(scheduling, "scale"),
-        )
+        for signal in (*states, *controls, *scheduling):
+            for which in ("steady", "scale"):
+                if getattr(signal, which) == "auto":
+                    raise TransientError(f"signal '{signal.name}': {which} is auto and not resolved; give a number")
+        groups = states, controls, scheduling
+        x_s, u_s, s_s = (np.array([float(s.steady) for s in group]) for group in groups)
+        X, U, S = (np.array([float(s.scale) for s in group]) for group in groups)
+        return cls(x_s, u_s, X, U, s_s, S)
 
     @property
     def steady(self) -> Array:

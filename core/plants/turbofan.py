@@ -169,12 +169,12 @@ class Engine:
 
     States and controls in recorded units, in the order of STATES and CONTROLS.
 
-    `design`: sizes; default `DesignPoint()`; `rotors`: inertias and sensor lags; default `Rotors()`.
+    `design`: sizes; `rotors`: inertias and sensor lags.
     """
 
-    def __init__(self, design: DesignPoint | None = None, rotors: Rotors | None = None) -> None:
-        d = self.design = design or DesignPoint()
-        self.rotors = rotors or Rotors()
+    def __init__(self) -> None:
+        d = self.design = DesignPoint()
+        self.rotors = Rotors()
         core = d.flow / (1.0 + d.bypass_ratio)
         bypass = d.flow - core
 
@@ -221,11 +221,6 @@ class Engine:
         g = gas.gamma(T5, w4)
         plane = P5 * (1.0 + 0.5 * (g - 1.0) * d.core_mach**2) ** (-g / (g - 1.0))
         P16 = P13 * (1.0 - d.bypass_loss)
-        if plane >= P16:
-            raise UncertainLTIError(
-                f"turbofan: static pressure behind the turbine ({plane:.0f} Pa) is above the bypass's total pressure "
-                f"({P16:.0f} Pa); raise fan_ratio or lower turbine_inlet"
-            )
         self.core_area = W4 / gas.mass_flow(1.0, P5, T5, w4, plane)
         self.bypass_area = bypass / gas.mass_flow(1.0, P16, T13, 0.0, plane)
         self._bypass_loss = d.bypass_loss / (bypass * sqrt(T13) / P13) ** 2
@@ -324,25 +319,14 @@ class Engine:
         `x` (5,): states of the operating point, recorded units; `u` (4,): its controls; `X` (5,): scales of the states;
         `U` (4,): scales of the controls; Returns (5, 5): A, 1/s; Returns (5, 4): B, 1/s.
         """
-        x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
-        X, U = np.asarray(X, dtype=np.float64), np.asarray(U, dtype=np.float64)
-        solver = GasPathSolver(self)
-        columns = []
-        for scale, is_state in ((X, True), (U, False)):
-            for j in range(len(scale)):
-                change = np.zeros(len(scale))
-                change[j] = step * scale[j]
-                ends = [
-                    self.derivative(
-                        (x + s * change if is_state else x).tolist(),
-                        (u if is_state else u + s * change).tolist(),
-                        solver=solver,
-                    )
-                    for s in (1.0, -1.0)
-                ]
-                columns.append((ends[0] - ends[1]) / (2.0 * step) / X)
+        n, at, scales = len(STATES), np.concatenate([x, u]).astype(np.float64), np.concatenate([X, U])
+        solver, columns = GasPathSolver(self), []
+        for change in np.diag(step * scales):
+            ends = (at + change).tolist(), (at - change).tolist()
+            above, below = (self.derivative(z[:n], z[n:], solver=solver) for z in ends)
+            columns.append((above - below) / (2.0 * step) / scales[:n])
         both = np.column_stack(columns)
-        return both[:, : len(X)], both[:, len(X) :]
+        return both[:, :n], both[:, n:]
 
 
 class GasPathSolver:
