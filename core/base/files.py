@@ -23,7 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.errors import BagError, UncertainLTIError
 
 MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of an MCAP recording."""
@@ -62,6 +62,16 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
         with suppress(FileNotFoundError):
             os.unlink(temporary)
         raise
+
+
+@contextmanager
+def written(path: str | os.PathLike[str], refusal: type[UncertainLTIError]) -> Iterator[BinaryIO]:
+    """`whole_file`; what the system refuses is one sentence."""
+    try:
+        with whole_file(path) as stream:
+            yield stream
+    except OSError as error:
+        raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
 def _clear(folder: str, beginning: str) -> None:

@@ -22,13 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli.command import (
-    SILENT,
-    Command,
-    Result,
-    model_target,
-    read_labelled,
-)
+from uncertain_lti.cli.command import SILENT, Command, Result, model_target, read_labelled
 from uncertain_lti.cli.options import RECORDINGS, helped
 
 if TYPE_CHECKING:
@@ -75,16 +69,15 @@ def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
 def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
     from uncertain_lti.identification.archive import fit_archive
 
-    elsewhere = "leave out --cache, --scheduler and --workers"
-    if options.discard:
-        raise FitError(f"--discard goes through all transitions in memory; {elsewhere}")
-    if options.horizons is not None or options.widths is not None:
-        raise FitError(f"--horizons needs all recordings in memory; {elsewhere}, or --horizons")
+    for given, what, also in (
+        (options.discard, "--discard goes through all transitions", ""),
+        (options.horizons or options.widths, "--horizons needs all recordings", ", or --horizons"),
+        (options.group is not None, "--group needs all recordings", ""),
+        (options.count != "sample", "--count transient needs all recordings", ""),
+    ):
+        if given:
+            raise FitError(f"{what} in memory; leave out --cache, --scheduler and --workers{also}")
     schedule = _asked(options)
-    if options.group is not None:
-        raise FitError(f"--group needs all recordings in memory; {elsewhere}")
-    if options.count != "sample":
-        raise FitError(f"--count transient needs all recordings in memory; {elsewhere}")
     if options.cache and (options.scheduler or options.workers):
         raise FitError("--cache keeps the arrays on disk and --scheduler or --workers on a cluster; choose one")
     with ExitStack() as stack:

@@ -69,7 +69,7 @@ def run_topics(options: argparse.Namespace) -> Result:
 def run_init(options: argparse.Namespace) -> Result:
     """Write or print the proposed signals file."""
     from uncertain_lti.base.english import shortlist
-    from uncertain_lti.base.files import whole_file
+    from uncertain_lti.base.files import written
     from uncertain_lti.proposal.init import propose
 
     output = options.output
@@ -81,11 +81,8 @@ def run_init(options: argparse.Namespace) -> Result:
     if output is None and not options.json:
         return Result(text=proposal.text.removesuffix("\n"))
     if output is not None:
-        try:
-            with whole_file(output) as stream:
-                stream.write(proposal.text.encode())
-        except OSError as error:
-            raise SignalError(f"{output}: cannot be written: {error.strerror}; choose another place") from None
+        with written(output, SignalError) as stream:
+            stream.write(proposal.text.encode())
     if options.json:
         proposed = {
             kind: [

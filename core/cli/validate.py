@@ -16,14 +16,7 @@ import os
 from dataclasses import replace
 
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.cli.command import (
-    SILENT,
-    Command,
-    Result,
-    load_model,
-    model_target,
-    read_labelled,
-)
+from uncertain_lti.cli.command import SILENT, Command, Result, load_model, model_target, read_labelled
 from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
 
 # --- validate --------------------------------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, refuse_other
-from uncertain_lti.base.files import kind_of, whole_file
+from uncertain_lti.base.files import kind_of, written
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
@@ -233,11 +233,8 @@ def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
         text = _layout(data).encode()
     except (TypeError, ValueError, RecursionError) as error:
         raise ModelError(f"{path}: the model holds what JSON cannot ({error}); mend its fit or validation") from None
-    try:
-        with whole_file(path) as stream:
-            stream.write(text)
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+    with written(path, ModelError) as stream:
+        stream.write(text)
 
 
 def read(path: str | os.PathLike[str]) -> Any:

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
-from uncertain_lti.base.files import whole_file
+from uncertain_lti.base.files import written
 from uncertain_lti.model.file import FORMATS
 from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, Schedule
@@ -218,11 +218,8 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
         data |= {f"{name}_names": _cells([s.name for s in group]), f"{name}_units": _cells([s.unit for s in group])}
     for name, step in (("dt", sampling.dt_median), ("dt_min", sampling.dt_min), ("dt_max", sampling.dt_max)):
         data[name] = math.nan if step is None else step
-    try:
-        with whole_file(path) as stream:
-            savemat(stream, data, do_compression=True)
-    except OSError as error:
-        raise ModelError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+    with written(path, ModelError) as stream:
+        savemat(stream, data, do_compression=True)
 
 
 def _cells(values: Sequence[Any]) -> NDArray[np.object_]:
@@ -375,10 +372,10 @@ def _schedule(model: Any, kinds: Sequence[str], knots: Sequence[Array]) -> Sched
     axes, point, schedule = [], model.operating_point, model.schedule
     before = schedule.recorded_values(model.signals.signals)
     each = zip(schedule.axes, before, model.scheduling_positions, kinds, knots, strict=True)
-    for axis, written, i, kind, there in each:
+    for axis, had, i, kind, there in each:
         at = normalised(there, point.steady[i], point.scale[i])
-        if len(there) == len(written):
-            at = np.where(there == written, axis.values, at)
+        if len(there) == len(had):
+            at = np.where(there == had, axis.values, at)
         axes.append(Axis(axis.signal, **{kind: tuple(at.tolist())}))
     return Schedule(tuple(axes))
 

@@ -219,9 +219,7 @@ class UncertainLTI(Envelope):
         def chosen(own: Residuals | None, given: Residuals | None) -> Residuals | None:
             if own is None or given is None:
                 return own or given
-            if given.relative != own.relative:
-                return own if instead else given
-            return given if instead else own
+            return own if instead == (given.relative != own.relative) else given
 
         of = {horizon.steps: horizon.residuals for horizon in other.horizons}
         return self.replace(

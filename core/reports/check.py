@@ -251,12 +251,10 @@ def _per_sample(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]
     if model.horizons:
         numbers["horizon_utilisation"] = verdicts.horizon_utilisation
     flags = {"outside_domain": verdicts.outside_domain, "alarm": verdicts.alarm}
-    block = sample_blocks(model, verdicts)
-    if model.schedule is not None:
-        flags["unknown_regime"] = verdicts.unknown_regime
     lists = {key: _nulls(values) for key, values in numbers.items()} | {key: v.tolist() for key, v in flags.items()}
     if model.schedule is not None:
-        lists["regime"] = [r if r >= 0 else None for r in block.tolist()]
+        lists["unknown_regime"] = verdicts.unknown_regime.tolist()
+        lists["regime"] = [r if r >= 0 else None for r in sample_blocks(model, verdicts).tolist()]
     return [
         {"t_ns": t_ns, "status": status.value, **{key: values[k] for key, values in lists.items()}}
         for k, (t_ns, status) in enumerate(zip(verdicts.transient.t_ns.tolist(), verdicts.statuses(), strict=True))

@@ -83,10 +83,11 @@ def findings(
     """
     rule = rule or model.alarm_rule
     rules = model.alarm if rule == model.alarm_rule else with_containment(model.alarm, rule)
-    recordings = []
-    for verdicts in checked:
-        files = [{"file": path, "sha256": sha256(path)} for path in verdicts.transient.sources]
-        recordings.append({**check_data(model, verdicts, samples=False), "files": files})
+    recordings = [
+        check_data(model, verdicts, samples=False)
+        | {"files": [{"file": path, "sha256": sha256(path)} for path in verdicts.transient.sources]}
+        for verdicts in checked
+    ]
     validation = readable_validation(model.validation)
     kinds = (
         _fit_reasons(model),

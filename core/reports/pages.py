@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.files import target, whole_file
+from uncertain_lti.base.files import target, written
 from uncertain_lti.base.tables import Block, Table, list_of, number, share
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
@@ -75,11 +75,8 @@ def page_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[
 
 def write_page(path: str | os.PathLike[str], page: str) -> None:
     """Write a page, whole or not at all."""
-    try:
-        with whole_file(path) as stream:
-            stream.write(page.encode("utf-8", "replace"))
-    except OSError as error:
-        raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+    with written(path, BagError) as stream:
+        stream.write(page.encode("utf-8", "replace"))
 
 
 def interactive_page(title: str, recordings: Sequence[Plotted], every: int = 0, **more: Any) -> str:
