@@ -49,17 +49,6 @@ def refused(capsys, arguments):
     return said.err
 
 
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
-def test_fit_then_check_the_same_recording(folder, capsys, criterion):
-    assert fitted(folder, "--criterion", criterion, "--additive", "noise") == 0
-    printed = capsys.readouterr().out
-    assert "0 outside" in printed and "fan" in printed and "m.model.json" in printed
-    assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap")]) == 0
-    assert "100.000% inside all bounds" in capsys.readouterr().out
-    assert main(["info", str(folder / "m.model.json")]) == 0
-    assert "position[fan_speed]" in capsys.readouterr().out
-
-
 def test_check_tells_when_and_how_long(folder, capsys):
     """A sensor that jumps for three samples: two transitions of the jump and nothing else."""
     assert fitted(folder, "--additive", "noise", "--alarm", "containment") == 0

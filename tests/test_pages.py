@@ -20,8 +20,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.base.files import sha256
@@ -313,36 +311,6 @@ def test_horizons_of_the_model_are_views_of_the_plot():
             marked = marks(panel["values"])
             assert np.array_equal(marked, np.flatnonzero(np.abs(of) > 1.0))
             assert len(marked) and np.isnan(of[: (5, 20)[h]]).all()
-
-
-@settings(max_examples=8)
-@given(count=st.integers(8000, 16_000), at=st.lists(st.integers(1, 7900), max_size=30), gap=st.integers(1, 7000))
-def test_nothing_is_hidden_in_a_long_recording(count, at, gap):
-    """Extremes and violations are there, and each violation is drawn by itself where there is room."""
-    rng = np.random.default_rng(count)
-    x = 0.05 * rng.normal(size=(count, 2))
-    for k in at:
-        x[k, 0] += 10.0
-    t = np.arange(count) * 0.01
-    t[gap:] += 5.0
-    model = by_hand()
-    verdicts = EnvelopeMonitor(model).check(Transient(t, x, np.zeros((count, 1)), max_gap=1.0))
-    (page,) = data_of(interactive_page("p", [plotted_check(model, verdicts, recordings=40)]))
-    panel = next(p for p in page["views"]["values"] if p["title"] == "x1")
-    values, shown = panel["values"], times(page["times"][0])
-    low, high = (array(values[key]) for key in ("least", "greatest"))
-    marked = marks(values)
-    assert len(shown) < 0.7 * count and (np.diff(shown) >= 0).all()
-    assert np.nanmax(high) == pytest.approx(x[:, 0].max(), abs=1e-5) and np.nanmin(low) == pytest.approx(
-        x[:, 0].min(), abs=1e-5
-    )
-    bad = np.flatnonzero(verdicts.flags[:, 0] == 1.0)
-    assert bool(len(bad)) == bool(len(marked))
-    if len(bad):
-        nearest = np.abs(shown[marked][None] - verdicts.transient.t[bad][:, None]).min(axis=1)
-        assert nearest.max() < 0.01 * count / 400
-    if 0 < len(at) < 5:
-        assert len(marked) == len(bad) and nearest.max() < 1e-9
 
 
 def test_a_long_recording_fits_into_a_page_of_two_megabytes():

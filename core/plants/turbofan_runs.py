@@ -294,23 +294,15 @@ class Fault:
         """
         if t < self.at or not self.kind.startswith("sensor"):
             return x
-        x = x.copy()
-        if self.kind == "sensor_bias":
-            i = STATES.index("compressor_exit_total_pressure")
-            x[i] += self.size * BIAS * X[i]
-        else:
-            i = STATES.index("turbine_exit_total_temperature")
-            x[i] += self.size * DRIFT * (t - self.at) * X[i]
+        x, bias = x.copy(), self.kind == "sensor_bias"
+        i = STATES.index("compressor_exit_total_pressure" if bias else "turbine_exit_total_temperature")
+        x[i] += self.size * (BIAS if bias else DRIFT * (t - self.at)) * X[i]
         return x
 
     def stuck(self, t: float) -> int | None:
         """Position of the control that no longer follows its command, if any."""
-        if t < self.at:
-            return None
-        return {
-            "fuel_stuck": CONTROLS.index("main_fuel_flow"),
-            "nozzle_stuck": CONTROLS.index("nozzle_throat_area"),
-        }.get(self.kind)
+        stuck = {"fuel_stuck": "main_fuel_flow", "nozzle_stuck": "nozzle_throat_area"}.get(self.kind)
+        return None if stuck is None or t < self.at else CONTROLS.index(stuck)
 
 
 @dataclass(frozen=True)

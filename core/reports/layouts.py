@@ -66,7 +66,7 @@ def _pages(states: Sequence[Signal]) -> list[tuple[str, list[_Plot], list[_Plot]
     return pages
 
 
-def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any]:
+def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> str:
     """Layout of Foxglove and Lichtblick: bounds and samples of each state, utilisation, flags and alarm."""
     panels: dict[str, Any] = {}
 
@@ -101,18 +101,14 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> dict[str, Any
     alarm = panel("Indicator", "alarm", "alarm", {"path": value, "style": "background", **unknown, "rules": rules})
     paths = {"isSynced": True, "paths": [_change(value, "alarm")]}
     raised = panel("StateTransitions", "alarm", "alarm", paths)
-    return {
+    whole = {
         "configById": panels,
         "globalVariables": {},
         "userNodes": {},
         "playbackConfig": {"speed": 1},
         "layout": _split("column", _split("row", alarm, raised, 25), body, 15),
     }
-
-
-def foxglove_text(states: Sequence[Signal], base: str = NODE) -> str:
-    """`foxglove_layout` as text."""
-    return json.dumps(foxglove_layout(states, base), indent=1, ensure_ascii=False) + "\n"
+    return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 
 def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
@@ -140,7 +136,7 @@ def write_layouts(
     if foxglove is None and plotjuggler is None:
         raise ModelError("no layout is asked for; give --foxglove FILE.json, --plotjuggler FILE.xml or both")
     base = NODE if base is None else f"/{base.strip('/')}"
-    made = [(foxglove, b'"configById"', foxglove_text), (plotjuggler, b"<root", plotjuggler_layout)]
+    made = [(foxglove, b'"configById"', foxglove_layout), (plotjuggler, b"<root", plotjuggler_layout)]
     asked = [(path, holds, make) for path, holds, make in made if path is not None]
     for path, holds, _ in asked:
         target(path, holds=holds, kind="such layout", example="layout.json")
