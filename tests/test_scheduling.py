@@ -31,7 +31,6 @@ from uncertain_lti.proposal.scheduling import EXCESS_FOR_MUCH, Candidate, best_o
 from uncertain_lti.proposal.search import EXCESS
 from uncertain_lti.proposal.tune import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
-from uncertain_lti.validation.left_out import validate_model
 
 DT = 0.05
 
@@ -82,7 +81,7 @@ def test_the_table_is_that_of_validate():
     model = fit(RUNS, schedule={"x1": "auto"}, **options())
     (facts,) = model.fit_summary["schedule"]
     row = next(row for row in facts["candidates"] if row["knots"] == facts["chosen"])
-    left = validate_model(model, RUNS)
+    left = validate(model, RUNS)
     assert row["outside"] == pytest.approx(1 - left.to_dict()["inside"], abs=1e-12)
     assert left.model.schedule == model.schedule
 

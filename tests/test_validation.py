@@ -30,7 +30,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.reports.validation_text import validation_text
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import cut, remaining_spans, validate, validate_model
+from uncertain_lti.validation.left_out import cut, remaining_spans, validate
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import fitted_parts, judge, rising
 from uncertain_lti.validation.result import raised_on
@@ -513,7 +513,7 @@ def test_validate_refuses_what_it_cannot_vouch_for(folder, capsys):
     weighted = UncertainLTI.load(model)
     weighted = weighted.replace(fit_summary={**weighted.fit_summary, "weights": "per state"})
     with pytest.raises(FitError, match="fitted with weights"):
-        validate_model(weighted, [])
+        validate(weighted, [])
 
 
 # --- real recordings ---

@@ -29,7 +29,7 @@ def run_validate(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.validation_text import validation_text
     from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.detectable import check_within, detectable
-    from uncertain_lti.validation.left_out import validate_model
+    from uncertain_lti.validation.left_out import validate
     from uncertain_lti.validation.panel import learn, promises
     from uncertain_lti.validation.part import fitted_parts
 
@@ -50,7 +50,7 @@ def run_validate(options: argparse.Namespace) -> Result:
         options.progress.note(*transient.notes)
     with options.progress.stage("validating") as step:
         given = {name: getattr(options, name) for name in ("blocks", "gap", "confidence")}
-        validation = validate_model(model, transients, **given, groups=options.group, progress=step)
+        validation = validate(model, transients, **given, groups=options.group, progress=step)
     said: list[str] = []
     if options.false_alarms is not None:
         panel = learn(validation, fitted_parts(validation.model, transients), options.false_alarms)

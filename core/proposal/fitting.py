@@ -140,14 +140,18 @@ def fit(
         are given and nothing is left out.
     """
     transients = listed_transients(transients)
+    if not transients:
+        raise FitError("no transients; give at least one recording")
     if criterion not in (None, "qp", "lp"):
         raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
     if isinstance(alarm, str) and alarm not in ("panel", "containment"):
         raise FitError(f"alarm is {alarm!r}; it must be panel, containment, or a list of rules")
     if false_alarms is not None and alarm != "panel":
         raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")
-    if additive is None and transients and transients[0].signals is not None:
-        additive = transients[0].signals.additive
+    first, signals = transients[0], transients[0].signals
+    names = [*first.state_names, *first.control_names, *first.scheduling_names]
+    if additive is None and signals is not None:
+        additive = signals.additive
     options: dict[str, Any] = {
         "criterion": criterion or "lp",
         "weights": weights,
@@ -158,10 +162,14 @@ def fit(
         "discard": discard,
         "method": method,
     }
-    asked = asked_for(transients, schedule)
-    rule = horizons_asked_for(transients, horizons, widths)
+    asked = schedule
+    if asked is None:
+        asked = {} if signals is None else asked_by(signals)
+    if isinstance(asked, Mapping):
+        check_names(asked, names)
+    rule = _horizons_asked_for(signals, horizons, widths)
     chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
-    automatic = [name for name, knots in chosen.items() if _is_auto(knots)]
+    automatic = [name for name, knots in chosen.items() if isinstance(knots, str) and knots == "auto"]
     leaves_out = alarm == "panel" or automatic or (rule is not None and rule.leaves_out)
     if groups is not None and not leaves_out:
         raise FitError("groups are given, and the fit leaves nothing out; leave them out, or take the panel as alarm")
@@ -171,21 +179,20 @@ def fit(
             f"of them; give the knots, or count='transient'"
         )
     if automatic and structure is None:
-        _no_knots_named(transients[0].signals, automatic[0])
+        _no_knots_named(signals, automatic[0])
     resolved: Schedule | None = None
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
-    for name in automatic:
-        others = {other: knots for other, knots in chosen.items() if other != name and not _is_auto(knots)}
+    for number, name in enumerate(automatic):
+        others = {other: knots for other, knots in chosen.items() if other not in automatic[number:]}
         best, table = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
         facts.append(table)
         messages.append(f"schedule: {plural(best.count, 'knot')} on {name}: {table['reason']}")
         chosen = {**chosen, name: (knots_of(best.model, name) if best.model is not None else []) or 1}
         resolved = best.model.schedule if best.model is not None else None
     asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
-    further = transients[0].scheduling_names if transients else ()  # none at all is refused below
-    on = signals_of(asked, [*transients[0].state_names, *transients[0].control_names, *further] if transients else [])
-    messages += unused(further, [*on, *automatic])
+    on = signals_of(asked, names)
+    messages += unused(first.scheduling_names, [*on, *automatic])
     lengths: dict[int, Widths] = {}
     choice_of_horizons: dict[str, Any] = {}
     if rule is not None:
@@ -198,22 +205,14 @@ def fit(
                 "or seconds with widths, or count='transient'"
             )
         else:
-            point = operating_point and operating_point.scheduled_on([n in on for n in further])
-            lengths, choice_of_horizons = choose_horizons(
-                [t.scheduled_on(on) for t in transients],
-                rule,
-                steps,
-                groups=groups,
-                progress=progress,
-                schedule=asked,
-                **{**options, "operating_point": point},
-            )
+            point = operating_point and operating_point.scheduled_on([n in on for n in first.scheduling_names])
+            own = {**options, "operating_point": point, "schedule": asked, "groups": groups, "progress": progress}
+            lengths, choice_of_horizons = choose_horizons([t.scheduled_on(on) for t in transients], rule, steps, **own)
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
             messages.append(f"{listed}: {choice_of_horizons['reason']}")
-    shape: dict[str, Any] = {"schedule": asked, "horizons": list(lengths), "widths": lengths}
-    shape["transient_weights"] = transient_weights
-    shape["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
-    said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
+    options |= {"schedule": asked, "horizons": list(lengths), "widths": lengths, "transient_weights": transient_weights}
+    options["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
+    options |= {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
     if alarm == "panel" and method == "working-set":
         ways: list[dict[str, Any]] = [
             {"criterion": one, "additive": terms}
@@ -222,9 +221,7 @@ def fit(
         ]
         if len(ways) > 2 and operating_point is None:
             ways.append({"criterion": "qp", "additive": "both", "centred": True})
-        taken = choose_monitored(
-            transients, ways, groups=groups, false_alarms=false_alarms, **{**options, **shape}, **said
-        )
+        taken = choose_monitored(transients, ways, groups=groups, false_alarms=false_alarms, **options)
         model = taken.finished()
         if taken.centred:
             messages.append(
@@ -232,7 +229,7 @@ def fit(
                 "jumps; an operating point, criterion or additive term given by hand keeps the steady state"
             )
     else:
-        model = fitting.fit(transients, **options, **shape, **said)
+        model = fitting.fit(transients, **options)
         if not isinstance(alarm, str):
             model = model.replace(alarm=alarm)
     added: dict[str, Any] = {"schedule": facts} if facts else {}
@@ -244,45 +241,23 @@ def fit(
     return model
 
 
-def asked_for(
-    transients: Sequence[Transient], schedule: Schedule | Mapping[str, Knots] | None
-) -> Schedule | Mapping[str, Knots]:
-    """The schedule that a fit is asked for, by its argument or by the signals file."""
-    if not transients:
-        return schedule or {}
-    signals = transients[0].signals
-    if schedule is None:
-        schedule = {} if signals is None else asked_by(signals)
-    if isinstance(schedule, Mapping):
-        first = transients[0]
-        check_names(schedule, [*first.state_names, *first.control_names, *first.scheduling_names])
-    return schedule
-
-
-def horizons_asked_for(
-    transients: Sequence[Transient],
+def _horizons_asked_for(
+    signals: SignalMap | None,
     horizons: HorizonRule | Mapping[str, Any] | Sequence[int] | Literal["auto"] | None,
-    widths: WidthChoice | None = None,
+    widths: WidthChoice | None,
 ) -> HorizonRule | None:
-    """The horizons that a fit is asked for, by its arguments or by the signals file."""
-    signals = transients[0].signals if transients else None
-    if horizons is None:
-        rule = None if signals is None else signals.horizons
-    elif isinstance(horizons, Sequence) and not horizons:
-        rule = None  # even where the signals file asks for some
-    else:
-        try:
-            rule = HorizonRule.of(dict(horizons) if isinstance(horizons, Mapping) else horizons)
-        except SignalError as error:
-            raise FitError(str(error)) from None
-    if widths is None:
-        return rule
-    if rule is None:
-        raise FitError(f"widths are {widths}, and no horizons are asked for; give horizons as well")
+    """The horizons that a fit is asked for, by its arguments or by the signals file; by an empty list none."""
+    rule = signals.horizons if signals is not None and horizons is None else None
     try:
-        return replace(rule, widths=widths)
+        if horizons is not None and not (isinstance(horizons, Sequence) and not horizons):
+            rule = HorizonRule.of(dict(horizons) if isinstance(horizons, Mapping) else horizons)
+        if widths is not None and rule is not None:
+            rule = replace(rule, widths=widths)
     except SignalError as error:
         raise FitError(str(error)) from None
+    if widths is not None and rule is None:
+        raise FitError(f"widths are {widths}, and no horizons are asked for; give horizons as well")
+    return rule
 
 
 def _no_knots_named(signals: SignalMap | None, name: str) -> None:
@@ -295,7 +270,3 @@ def _no_knots_named(signals: SignalMap | None, name: str) -> None:
                 f"{signals.source}: structure[{k}]: knot is {rule['knot']!r}, and the knots of '{name}' are auto, so "
                 f"it is not known which there will be; give the knots, or leave knot out"
             )
-
-
-def _is_auto(knots: Knots) -> bool:
-    return isinstance(knots, str) and knots == "auto"

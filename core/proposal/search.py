@@ -73,8 +73,8 @@ class Fold:
         return cls([joined[name] for name in each], None, None, f"{most}th part of the {what}s")
 
     def leave_out(self, transients: Sequence[Transient], model: UncertainLTI, options: Mapping[str, Any]) -> Validation:
-        """Each part judged by the fit without it; the operating point and the schedule are those of the model."""
-        own = {k: v for k, v in options.items() if k not in ("operating_point", "schedule")}
+        """Each part judged by the fit without it, on the schedule of the model."""
+        own = {k: v for k, v in options.items() if k != "schedule"}
         return leave_out(transients, full=model, groups=self.groups, blocks=self.blocks, gap=self.gap, **own)
 
 

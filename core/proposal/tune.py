@@ -26,7 +26,6 @@ from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.evidence import autocorrelation, late_controls
-from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -36,7 +35,7 @@ from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.functions import Memory
-from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored
+from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
 
 KNOTS = (2, 3, 5)
@@ -68,10 +67,8 @@ class Remembered:
     @property
     def name(self) -> str:
         """Name of the new signal."""
-        lag = f"_{self.memory.samples}" if self.memory.samples > 1 else ""
-        return f"{self.of}_{ {'lag': 'before', 'diff': 'change', 'rate': 'rate'}[self.memory.kind] }{lag}".replace(
-            " ", ""
-        )
+        what = {"lag": "before", "diff": "change", "rate": "rate"}[self.memory.kind]
+        return f"{self.of}_{what}" + (f"_{self.memory.samples}" if self.memory.samples > 1 else "")
 
 
 @dataclass(frozen=True)
@@ -80,7 +77,7 @@ class Setting:
 
     `words`: what it is, in words; `options`: arguments of `fit`; knots of a schedule are stated by their number;
     `memories`: lags and rates that are added to the controls; `delays`: controls that are taken so many samples
-    earlier; `constant`: half-widths do not grow with x and u.
+    earlier.
     """
 
     words: str
@@ -99,7 +96,7 @@ class Setting:
         return replace(self, words=f"{self.words}, {what}", **changes)
 
 
-def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
+def delays(transients: Sequence[Transient], best: Setting) -> Iterator[list[Setting]]:
     """Controls that are taken earlier: those that then explain more, and all of them by one sample."""
     first = transients[0]
     signals = () if first.signals is None else first.signals.controls
@@ -113,7 +110,7 @@ def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
     sets = [moving]
     try:
         few = thinned(transients, 5 * TRANSITIONS)
-        problem = assemble(few, operating_point(first), None, best.options.get("additive", "noise"))
+        problem = assemble(few, point_of(first), None, best.options.get("additive", "noise"))
         late = {names[j]: samples for j, (samples, _) in late_controls(problem).items() if names[j] in moving}
         sets = [late, *(s for s in sets if s != late)] if late else sets
     except FitError:
@@ -121,7 +118,7 @@ def delays(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
     for chosen in sets:
         said = ", ".join(f"{name} {plural(count, 'sample')} earlier" for name, count in chosen.items())
         words = "all controls 1 sample earlier" if len(chosen) > 1 and chosen is moving else said
-        yield best.beside(words, delays=tuple(chosen.items()))
+        yield [best.beside(words, delays=tuple(chosen.items()))]
 
 
 def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[Setting]]:
@@ -135,11 +132,11 @@ def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[S
         ]
 
 
-def memories(transients: Sequence[Transient], best: Setting) -> Iterator[Setting]:
+def memories(transients: Sequence[Transient], best: Setting) -> Iterator[list[Setting]]:
     """Lags and rates of states whose residuals follow from sample to sample, and of controls that seldom change."""
     delayed = replace(best, memories=()).prepared(transients)
     for some in memory_candidates(delayed, best.options.get("additive", "noise")):
-        yield best.beside(f"with {', '.join(one.name for one in some)}", memories=some)
+        yield [best.beside(f"with {', '.join(one.name for one in some)}", memories=some)]
 
 
 def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
@@ -155,9 +152,8 @@ def memory_candidates(transients: Sequence[Transient], additive: Additive = "noi
     values one sample earlier, and their changes.
     """
     first = transients[0]
-    point = operating_point(first)
     try:
-        problem = assemble(transients, point, None, additive)
+        problem = assemble(transients, point_of(first), None, additive)
     except FitError:
         return []
     taken = {*first.state_names, *first.control_names, *first.scheduling_names}
@@ -165,11 +161,9 @@ def memory_candidates(transients: Sequence[Transient], additive: Additive = "noi
     found = autocorrelation(problem)
     follow = [i for i in range(problem.n) if found is not None and found.follows(i) and i not in remembered]
     rate = "rate" if first.step is None else "diff"
-    events = []
-    for j in range(problem.n, problem.p):
-        changes = int(np.count_nonzero(np.diff(problem.z[:, j])))
-        if FEWEST_STEPS <= changes <= MOST_STEPS * problem.N and j not in remembered:
-            events.append(j)
+    changes = np.count_nonzero(np.diff(problem.z, axis=0), axis=0)
+    seldom = (changes >= FEWEST_STEPS) & (changes <= MOST_STEPS * problem.N)
+    events = [j for j in range(problem.n, problem.p) if seldom[j] and j not in remembered]
     names = [*first.state_names, *first.control_names]
     sets = [
         tuple(Remembered(names[i], Memory(kind)) for i in group)  # type: ignore[arg-type]
@@ -196,11 +190,10 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
         before = best = _judged(base, model, fold, additive)
     except FitError:
         return (), 1.0
-    states = {*transients[0].state_names}
     chosen: tuple[Remembered, ...] = ()
-    for kind in (True, False):
+    for names in (transients[0].state_names, transients[0].control_names):
         beside, widths = chosen, best
-        for some in (s for s in sets if (s[0].of in states) is kind):
+        for some in (s for s in sets if s[0].of in names):
             more = thinned(remember(transients, (*beside, *some)), TRANSITIONS)
             try:
                 model = fitting.fit(more, schedule={}, describe_data=False, additive=additive)
@@ -225,16 +218,6 @@ def _judged(
     width = sum(part.judged * part.mean_width for part in left.parts if part.judged) / judged.sum()
     outside = sum(part.violated for part in left.parts) / judged.sum()
     return np.maximum(width, 1e-300), float(1.0 - outside)
-
-
-def operating_point(transient: Transient) -> OperatingPoint:
-    """That of the signals of a recording; of arrays 0, with scales of 1."""
-    signals = transient.signals
-    if signals is not None:
-        return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
-    sizes = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
-    steady, scale = [np.zeros(k) for k in sizes], [np.ones(k) for k in sizes]
-    return OperatingPoint(steady[0], steady[1], scale[0], scale[1], steady[2], scale[2])
 
 
 def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
@@ -417,14 +400,11 @@ def tune(
         return True
 
     try:
-        for setting in delays(transients, best):
-            attempt(setting)
-        for settings in schedules(transients, best):
-            for setting in settings:  # more and more knots, as long as they see more
-                if not attempt(setting):
-                    break
-        for setting in memories(transients, best):
-            attempt(setting)
+        for further in (delays, schedules, memories):
+            for settings in further(transients, best):
+                for setting in settings:  # more and more, as long as they see more
+                    if not attempt(setting):
+                        break
     except (_SpentError, KeyboardInterrupt):
         reason += "; the time ran out before every way was tried"
     tuned = Tuned(model, reason, tuple(trials))

@@ -25,7 +25,6 @@ from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, controls_as, listed_transients
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
@@ -37,8 +36,8 @@ BLOCKS = 10
 
 
 def cut(transient: Transient, start: int, stop: int) -> Transient:
-    """Samples start..stop-1 as a transient of their own."""
-    return transient.replace(slice(start, stop))
+    """Samples start..stop-1 as a transient of their own; all of them are the transient itself."""
+    return transient if (start, stop) == (0, len(transient)) else transient.replace(slice(start, stop))
 
 
 def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
@@ -74,7 +73,6 @@ def remaining_spans(transient: Transient, start: int, stop: int, gap: float) -> 
 def leave_out(
     transients: Sequence[Transient] | Transient,
     *,
-    operating_point: OperatingPoint | None = None,
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
     alarm_rule: AlarmRule | None = None,
     blocks: int | None = None,
@@ -86,83 +84,77 @@ def leave_out(
     progress: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Validation:
-    """Leave out one recording or group at a time, fit to the others, and judge what was left out."""
+    """Leave out one recording or group at a time, fit to the others, and judge what was left out.
+
+    `folds`: how often at most; several are then left out at a time; `full`: the fit to all, whose schedule, horizons
+    and operating point every fit is given.
+    """
     transients = listed_transients(transients)
     if not 0.5 <= confidence < 1.0:
         raise FitError(f"confidence is {confidence:g}; it must be at least 0.5 and below 1")
     if blocks is not None and blocks < 2:
         raise FitError(f"blocks is {blocks}; at least 2 are needed to leave one out")
+    if groups is not None and blocks is not None:
+        raise FitError("groups leave out whole recordings, and blocks cut them; choose one")
+    if gap is not None and not (math.isfinite(gap) and gap >= 0):
+        raise FitError(f"gap is {gap}; it must be 0 s or more")
     if full is not None and options.get("schedule") is not None:
         raise FitError("full has its own schedule, which every fit is given; leave schedule out")
     if full is None:
-        full = fit(transients, weights=weights, operating_point=operating_point, alarm_rule=alarm_rule, **options)
+        full = fit(transients, weights=weights, alarm_rule=alarm_rule, **options)
     elif alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
+    options |= {
+        "operating_point": full.operating_point,
+        "schedule": full.schedule or {},  # none, even where the signals file asks for one
+        "horizons": full.steps,
+        "widths": {horizon.steps: horizon.widths for horizon in full.horizons},
+        "drop_horizons": True,  # where a part is too short for one, the others are judged
+    }
     further = [s.name for s in full.signals.scheduling]
     transients = [controls_as(t.scheduled_on(further), full.signals.controls) for t in transients]
-    options["schedule"] = full.schedule or {}  # none, even where the signals file asks for one
-    options["horizons"] = [horizon.steps for horizon in full.horizons]
-    options["widths"] = {horizon.steps: horizon.widths for horizon in full.horizons}
-    options["drop_horizons"] = True  # where a part is too short for one, the others are judged
-    if groups is not None and blocks is not None:
-        raise FitError("groups leave out whole recordings, and blocks cut them; choose one")
     names, grouping = resolve_groups(transients, groups)
     if blocks is None and len(transients) == 1:
         blocks = BLOCKS
-    if blocks is None:
-        if gap is not None:
-            raise FitError("gap is given and whole recordings are left out; it goes with blocks")
-        cuts = [(t, 0, len(t)) for t in transients]
-        gap = 0.0
-    else:
-        if gap is not None and not (math.isfinite(gap) and gap >= 0):
-            raise FitError(f"gap is {gap}; it must be 0 s or more")
-        cuts = [(t, *span) for t in transients for span in block_spans(t, blocks)]
-        gap = guard_interval(full, cuts) if gap is None else gap
-    parts: dict[int, Part] = {}
-    own = _split_weights(weights, transients, full.n)
+    if blocks is None and gap is not None:
+        raise FitError("gap is given and whole recordings are left out; it goes with blocks")
+    cuts = [(t, *span) for t in transients for span in (block_spans(t, blocks) if blocks else [(0, len(t))])]
+    if gap is None:
+        gap = guard_interval(full, cuts) if blocks else 0.0
+    shown = [f"{t.name} from {t.t[a]:.6g} to {t.t[b - 1]:.6g} s" if blocks else t.name for t, a, b in cuts]
     units: dict[Any, list[int]] = {}
     for i in range(len(cuts)):
         units.setdefault(names[i] if grouping else i, []).append(i)
     together = list(units.values())
-    if folds is not None and blocks is not None:
-        together = [list(range(k, len(cuts), blocks)) for k in range(blocks)]
-    elif folds is not None and folds < len(together):
-        together = [[i for unit in together[k::folds] for i in unit] for k in range(folds)]
+    if folds is not None and (blocks or folds < len(together)):
+        count = blocks or folds
+        together = [[i for unit in together[k::count] for i in unit] for k in range(count)]
+    parts: dict[int, Part] = {}
+    own = _split_weights(weights, transients, full.n)
     for number, out in enumerate(together):
-        left, start, stop = cuts[out[0]]
-        name = left.name if blocks is None else _block_name(left, start, stop)
+        name = shown[out[0]] + (f" and {len(out) - 1} more" if len(out) > 1 else "")
         name = f"group {names[out[0]]}" if grouping else name
-        name += f" and {len(out) - 1} more" if len(out) > 1 and not grouping else ""
         if progress is not None:
             progress(CountedStep(f"fit {number + 1} of {len(together)}: without {name}", number + 1, len(together)))
         absent = {id(cuts[i][0]): cuts[i][1:] for i in out}
         pieces, kept = [], []
         for transient, weight in zip(transients, own, strict=True):
-            whole = (0, len(transient))
             gone = absent.get(id(transient))
-            for a, b in [whole] if gone is None else remaining_spans(transient, *gone, gap):
+            for a, b in [(0, len(transient))] if gone is None else remaining_spans(transient, *gone, gap):
                 if b - a >= 2:
-                    pieces.append(transient if (a, b) == whole else cut(transient, a, b))
+                    pieces.append(cut(transient, a, b))
                     kept.append(None if weight is None else weight[a : b - 1])
         chosen = kept if own[0] is not None else weights
         try:
-            model = fit(pieces, weights=chosen, operating_point=full.operating_point, describe_data=False, **options)  # type: ignore[arg-type]
+            model = fit(pieces, weights=chosen, describe_data=False, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
         model, reach = model.with_residuals_of(full), Reach(model, pieces)
         for i in out:
-            left, start, stop = cuts[i]
-            tested = left if (start, stop) == (0, len(left)) else cut(left, start, stop)
-            shown = left.name if grouping or blocks is None else _block_name(left, start, stop)
-            parts[i] = judge(model, full, tested, shown, names[i] if grouping else "", reach)
-    kind = "transients" if blocks is None else "blocks"
-    hint = "" if grouping or blocks is not None else likely_groups(transients)
+            parts[i] = judge(model, full, cut(*cuts[i]), shown[i], names[i] if grouping else "", reach)
+    kind = "blocks" if blocks else "transients"
+    hint = "" if grouping or blocks else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
-
-
-def _block_name(transient: Transient, start: int, stop: int) -> str:
-    return f"{transient.name} from {transient.t[start]:.6g} to {transient.t[stop - 1]:.6g} s"
 
 
 def _split_weights(
@@ -197,7 +189,8 @@ def validate(
     transients : Transient or sequence of Transient, optional
         With a model, the recordings that it was fitted to.
     **options : object
-        With a model those of `validate_model` (blocks, gap, groups, confidence, progress); else those of
+        With a model blocks, gap, groups, confidence and progress; the key by which its file says that the recordings
+        are grouped, `fit --group`, applies unless groups ("none" for no groups) or blocks are given. Else those of
         `leave_out`, which takes those of `fit` as well (criterion, additive, ...).
 
     Returns
@@ -208,66 +201,38 @@ def validate(
     Raises
     ------
     FitError
-        As of `validate_model` and `leave_out`; or a model is given without recordings, or recordings twice.
+        As of `leave_out`; the recordings do not give the model again, or its file does not say how it was fitted; or a
+        model is given without recordings, or recordings twice.
     """
-    if isinstance(subject, UncertainLTI):
-        if transients is None:
-            raise FitError("a model alone says nothing; give the recordings it was fitted to: validate(model, runs)")
-        runs = listed_transients(transients)
-        if further := sorted(set(options) - {"blocks", "gap", "groups", "confidence", "progress"}):
-            raise FitError(
-                f"{', '.join(further)}: a model is validated with its own settings; leave this out, or give the "
-                f"recordings alone: validate(runs, {further[0]}=...)"
-            )
-        return validate_model(subject, runs, **options)
-    if transients is not None:
-        raise FitError("recordings are given twice; write validate(model, runs) or validate(runs)")
-    return leave_out(subject, **options)
-
-
-def validate_model(
-    model: UncertainLTI,
-    transients: Sequence[Transient],
-    *,
-    blocks: int | None = None,
-    gap: float | None = None,
-    groups: Sequence[Any] | str | None = None,
-    confidence: float = 0.9,
-    progress: Callable[[str], None] | None = None,
-) -> Validation:
-    """Validate a fitted model, or one from a file, with the recordings it was fitted to and the options it names.
-
-    The key by which its file says that the recordings are grouped, `fit --group`, applies unless groups or blocks are
-    given.
-    """
-    if isinstance(groups, str) and groups == "none":
-        groups = None
-    elif groups is None and blocks is None:
-        groups = model.fit_summary.get("group")
-    if progress is not None:
+    if not isinstance(subject, UncertainLTI):
+        if transients is not None:
+            raise FitError("recordings are given twice; write validate(model, runs) or validate(runs)")
+        return leave_out(subject, **options)
+    if transients is None:
+        raise FitError("a model alone says nothing; give the recordings it was fitted to: validate(model, runs)")
+    if further := sorted(set(options) - {"blocks", "gap", "groups", "confidence", "progress"}):
+        raise FitError(
+            f"{', '.join(further)}: a model is validated with its own settings; leave this out, or give the "
+            f"recordings alone: validate(runs, {further[0]}=...)"
+        )
+    own, groups = _options(subject), options.pop("groups", None)
+    if groups is None and options.get("blocks") is None:
+        groups = subject.fit_summary.get("group")
+    if (progress := options.get("progress")) is not None:
         progress("the fit to all recordings")
-    again = fit(transients, operating_point=model.operating_point, schedule=model.schedule or {}, **_options(model))
-    if not _same(again, model):
+    runs = listed_transients(transients)
+    again = fit(runs, operating_point=subject.operating_point, schedule=subject.schedule or {}, **own)
+    if not _same(again, subject):
         raise FitError(
             "these recordings do not give this model again, so what was left out of them would say nothing about it; "
             "name the recordings it was fitted to, or fit it again"
         )
-    return leave_out(
-        transients,
-        operating_point=model.operating_point,
-        alarm_rule=model.alarm_rule,
-        blocks=blocks,
-        gap=gap,
-        groups=groups,
-        confidence=confidence,
-        full=again,
-        progress=progress,
-        **_options(model),
-    )
+    groups = None if isinstance(groups, str) and groups == "none" else groups
+    return leave_out(runs, alarm_rule=subject.alarm_rule, groups=groups, full=again, **options, **own)
 
 
 def _options(model: UncertainLTI) -> Mapping[str, Any]:
-    """Options of `fit` with which a model was fitted; see `validate_model`."""
+    """Options of `fit` with which a model was fitted."""
     facts = model.fit_summary
     for key in ("criterion", "additive"):
         if key not in facts:

@@ -83,18 +83,16 @@ def fit_monitored(
     """
     if centred:
         options["operating_point"] = _medians(transients)
-    model = fit(
-        transients, describe_data=describe_data, seek_carriers=seek_carriers, progress=progress, **options
-    )  # fmt: skip
+    said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers}
+    model = fit(transients, progress=progress, **said, **options)
     names, _ = resolve_groups(transients, groups)
     units = len(set(names)) if names else len(transients)
-    left = {k: v for k, v in options.items() if k not in ("schedule", "horizons", "widths", "operating_point")}
+    left = {k: v for k, v in options.items() if k not in ("schedule", "transient_weights")}
     size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
     if options.get("transient_weights") is not None:
         return Monitored(
             model, None, why="transient_weights are for all recordings, so none can be left out", centred=centred
         )
-    left.pop("transient_weights", None)
     if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
         seen = _seen(model, transients, _SHOWN)
@@ -103,7 +101,6 @@ def fit_monitored(
         validation = leave_out(
             transients,
             full=model,
-            operating_point=model.operating_point,
             groups=groups,
             blocks=None if units > 1 else FOLDS,
             folds=FOLDS,
@@ -157,13 +154,17 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
     return taken if taken.panel is not None and taken.panel.figure < CLEARLY * first.panel.figure else first
 
 
+def point_of(transient: Transient) -> OperatingPoint:
+    """That of the signals of a recording; of arrays values as they are."""
+    if (signals := transient.signals) is not None:
+        return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+    n, m, q = (values.shape[1] for values in (transient.x, transient.u, transient.s))
+    return OperatingPoint(np.zeros(n), np.zeros(m), np.ones(n), np.ones(m), np.zeros(q), np.ones(q))
+
+
 def _medians(transients: Sequence[Transient]) -> OperatingPoint:
     """The medians of all samples, with the scales of the signals."""
     x, u, s = (
         np.nan_to_num(np.nanmedian(np.concatenate([getattr(t, name) for t in transients]), axis=0)) for name in "xus"
     )
-    signals = transients[0].signals
-    if signals is None:
-        return replace(OperatingPoint.identity(len(x), len(u)), x_s=x, u_s=u, s_s=s, S=np.ones(len(s)))
-    point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
-    return replace(point, x_s=x, u_s=u, s_s=s)
+    return replace(point_of(transients[0]), x_s=x, u_s=u, s_s=s)

@@ -199,68 +199,61 @@ class Validation:
         Returns
         -------
         dict
-            As `summary`.
+            The fields are described in docs/validation.md.
         """
-        return summary(self)
-
-
-def summary(validation: Validation) -> dict[str, Any]:
-    """Everything `validate` found as plain data; the fields are described in docs/validation.md."""
-    v, model, parts = validation, validation.model, validation.parts
-    judged = sum(p.judged for p in parts)
-    hours = sum(p.hours for p in parts)
-    violated = [p.violated for p in parts]
-    inside = sum(p.violated == 0 for p in parts)
-    held_width = _average(parts, [p.mean_width for p in parts])
-    full_mean, full_max = full_widths(model)
-    states = {}
-    for i, name in enumerate(model.state_names):
-        bad = sum(int(p.outside[:, i].sum()) for p in parts)
-        states[name] = {
-            "inside": 1.0 - bad / judged if judged else None,
-            "parts_inside": sum(not p.outside[:, i].any() for p in parts),
-            "mean_width_left_out": float(held_width[i]),
-            "max_width_left_out": float(np.nanmax([p.max_width[i] for p in parts])),
-            "mean_width_full": full_mean[i],
-            "max_width_full": full_max[i],
-            "left_out_to_full": float(_average(parts, [p.relative_width for p in parts])[i]),
-            "unit": model.signals.states[i].unit,
-        }
-    units = by_unit(parts, violated)
-    low, high = rate_interval(units, judged, v.confidence) if judged else (0.0, math.inf)
-    outside = (AlarmRule(margin=model.alarm_rule.margin),)
-    alarms = [false_alarms(parts, rules, v.confidence) for rules in dict.fromkeys((model.alarm, outside))]
-    return {
-        "kind": v.kind,
-        "parts": len(parts),
-        "gap": v.gap,
-        "confidence": v.confidence,
-        "verdicts": judged,
-        "hours": hours,
-        "inside": 1.0 - sum(violated) / judged if judged else None,
-        "inside_interval": [max(0.0, 1.0 - high), 1.0 - low],
-        "parts_inside": inside,
-        "parts_inside_share": inside / len(parts),
-        "parts_inside_interval": _whole_interval(v),
-        "groups": None
-        if not v.grouping
-        else {
+        v, model, parts = self, self.model, self.parts
+        judged = sum(p.judged for p in parts)
+        hours = sum(p.hours for p in parts)
+        violated = [p.violated for p in parts]
+        inside = sum(p.violated == 0 for p in parts)
+        held_width = _average(parts, [p.mean_width for p in parts])
+        states = {}
+        for i, name in enumerate(model.state_names):
+            bad = sum(int(p.outside[:, i].sum()) for p in parts)
+            states[name] = {
+                "inside": 1.0 - bad / judged if judged else None,
+                "parts_inside": sum(not p.outside[:, i].any() for p in parts),
+                "mean_width_left_out": float(held_width[i]),
+                "max_width_left_out": float(np.nanmax([p.max_width[i] for p in parts])),
+                "mean_width_full": float(model.fit_summary["mean_width_recorded"][i]),
+                "max_width_full": float(model.fit_summary["max_width_recorded"][i]),
+                "left_out_to_full": float(_average(parts, [p.relative_width for p in parts])[i]),
+                "unit": model.signals.states[i].unit,
+            }
+        units = by_unit(parts, violated)
+        low, high = rate_interval(units, judged, v.confidence) if judged else (0.0, math.inf)
+        groups = {
             "key": v.grouping,
             "count": v.units,
             "inside": int(np.count_nonzero(units == 0)),
             "recordings": {p.group: [q.name for q in parts if q.group == p.group] for p in parts},
-        },
-        "condition": condition(v),
-        "condition_short": short_condition(v),
-        "hint": v.hint,
-        "outside_domain": sum(p.outside_domain for p in parts),
-        "violated_inside_domain": sum(p.unseen for p in parts),
-        "states": states,
-        "false_alarms": alarms,
-        "scenario": scenario(model, parts, v.what, v.confidence),
-        "part": [_part(p, model) for p in parts],
-        "notes": _notes(v),
-    }
+        }
+        outside = (AlarmRule(margin=model.alarm_rule.margin),)
+        alarms = [false_alarms(parts, rules, v.confidence) for rules in dict.fromkeys((model.alarm, outside))]
+        return {
+            "kind": v.kind,
+            "parts": len(parts),
+            "gap": v.gap,
+            "confidence": v.confidence,
+            "verdicts": judged,
+            "hours": hours,
+            "inside": 1.0 - sum(violated) / judged if judged else None,
+            "inside_interval": [max(0.0, 1.0 - high), 1.0 - low],
+            "parts_inside": inside,
+            "parts_inside_share": inside / len(parts),
+            "parts_inside_interval": _whole_interval(v),
+            "groups": groups if v.grouping else None,
+            "condition": condition(v),
+            "condition_short": f"if the {v.what}s are independent and show all that happens",
+            "hint": v.hint,
+            "outside_domain": sum(p.outside_domain for p in parts),
+            "violated_inside_domain": sum(p.unseen for p in parts),
+            "states": states,
+            "false_alarms": alarms,
+            "scenario": scenario(model, parts, v.what, v.confidence),
+            "part": [_part(p, model) for p in parts],
+            "notes": _notes(v),
+        }
 
 
 def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
@@ -281,11 +274,6 @@ def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
         "alarm_share": float(part.dt[raised].sum() / part.dt.sum()) if part.judged else None,
         **farthest,
     }
-
-
-def short_condition(validation: Validation) -> str:
-    """What must be true for the intervals to hold, in a few words."""
-    return f"if the {validation.what}s are independent and show all that happens"
 
 
 def condition(validation: Validation) -> str:
@@ -314,14 +302,6 @@ def _whole_interval(validation: Validation) -> list[float]:
         return list(share_interval(len(parts) - sum(left), len(parts), v.confidence))
     low, high = rate_interval(by_unit(parts, left), len(parts), v.confidence)
     return [max(0.0, 1.0 - high), 1.0 - low]
-
-
-def full_widths(model: UncertainLTI) -> tuple[list[float], list[float]]:
-    """Widths of the full fit on its own samples."""
-    return (
-        [float(w) for w in model.fit_summary["mean_width_recorded"]],
-        [float(w) for w in model.fit_summary["max_width_recorded"]],
-    )
 
 
 def _average(parts: Sequence[Part], values: Sequence[Array]) -> Array:
