@@ -47,7 +47,6 @@ import tempfile
 import time
 import zlib
 from array import array
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -78,14 +77,13 @@ def save_model(path: Path, n: int, rate: float, armed: bool = False) -> None:
         max_gap=100 * dt,
         time={STATE: "header", CONTROL: "header"},
     )
-    sampling = Sampling(dt)
     rng = np.random.default_rng(1)
     matrices = rng.normal(size=(n, n)), rng.normal(size=(n, m)), np.full((n, n), 0.1), np.full((n, m), 0.1)
     if armed:
         parts = arms(rng, matrices, dt)
     else:
         parts = dict(zip(("A", "B", "dA", "dB"), matrices, strict=True)) | {"v": np.full(n, 0.1)}
-    UncertainLTI(**parts, signals=replace(signals), sampling=sampling).save(path)
+    UncertainLTI(**parts, signals=signals, sampling=Sampling(dt)).save(path)
 
 
 def arms(rng: np.random.Generator, matrices: tuple[Any, ...], dt: float) -> dict[str, Any]:
@@ -458,18 +456,15 @@ class Run:
             with tempfile.TemporaryDirectory() as folder:
                 hearer = None
                 if kind in ("monitor", "relay"):
-                    subject = (
-                        self.monitor(folder, executor)
-                        if kind == "monitor"
-                        else self.part("relay", str(self.n), *outputs)
-                    )
+                    relayed = kind == "relay"
+                    subject = self.part(kind, str(self.n), *outputs) if relayed else self.monitor(folder, executor)
                     hearer = self.part("hear", *outputs)
                     hearer.line()
-                    if kind == "monitor":
-                        status(self.domain)
-                    else:
+                    if relayed:
                         subject.line()
                         time.sleep(2.0)  # until the hearer is known
+                    else:
+                        status(self.domain)
                 else:
                     subject = self.part("delay" if delays else "take", executor)
                     subject.line()

@@ -48,9 +48,6 @@ class Result:
     text: str = ""
 
 
-SILENT = "print errors only (and with --json the data): no summary, no notes, no progress"
-
-
 @dataclass(frozen=True)
 class Command:
     """One command of `uncertain-lti`.
@@ -59,18 +56,18 @@ class Command:
     takes time to load: every command is declared whenever one is run.
 
     `name`: the word on the command line; `help`: what the command does, for the list of commands; `options`: its
-    arguments and options; `run`: runs the command with the parsed options and returns its result;
-    it prints nothing: `options.say` takes the summary for a person part by part, and `options.progress` is a
-    `Progress`; `quiet`: what `--quiet` does, for the help; empty if the command has no such
-    option; `verbose`: what `--verbose` does, likewise; `of_ros`: module of `uncertain_lti_ros` that declares the
-    options and runs; not every installation has what it imports.
+    arguments and options; `run`: runs the command with the parsed options and returns its result; it prints nothing:
+    `options.say` takes the summary for a person part by part, and `options.progress` is a `Progress`; `quiet`: what
+    `--quiet` does, for the help; empty if the command has no such option; `verbose`: what `--verbose` does, likewise;
+    `of_ros`: module of `uncertain_lti_ros` that declares every option, `--quiet` too, and runs; not every installation
+    has what it imports.
     """
 
     name: str
     help: str
     options: tuple[Option, ...] = ()
     run: Callable[[argparse.Namespace], Result] | None = None
-    quiet: str = ""
+    quiet: str = "print errors only (and with --json the data): no summary, no notes, no progress"
     verbose: str = ""
     of_ros: str = ""
 

@@ -79,12 +79,14 @@ INFO = Command(
     "show what is in a model file",
     (PUBLISHED, helped("--json", "print the file as JSON; of a scheduled model with `regimes`, what each rests on")),
     run_info,
+    quiet="",
 )
 LAYOUT = Command(
     "layout",
     "write layouts of viewers for what a model's monitor publishes",
     (PUBLISHED, "--foxglove", "--plotjuggler", "--topics", helped("--json", "print the paths as JSON")),
     run_layout,
+    quiet="",
 )
 _FOLDER = {"default": "reproduce-output", "metavar": "FOLDER"}
 REPRODUCE = Command(
@@ -95,7 +97,7 @@ REPRODUCE = Command(
     quiet="print errors only; everything is in the folder",
 )
 _COMPLETION = "print what bash or zsh needs to complete commands, options and files"
-COMPLETION = Command("completion", _COMPLETION, ("shell",), run_completion)
+COMPLETION = Command("completion", _COMPLETION, ("shell",), run_completion, quiet="")
 PLAY = Command("play", "publish a recording through rclpy", of_ros="player")
 RECORD = Command("record", "record topics through rclpy", of_ros="recorder")
 WATCH = Command("watch", "show on a page of this machine what a running monitor says", of_ros="watch")

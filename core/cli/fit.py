@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli.command import SILENT, Command, Result, model_target, read_labelled
+from uncertain_lti.cli.command import Command, Result, model_target, read_labelled
 from uncertain_lti.cli.options import RECORDINGS, helped
 
 if TYPE_CHECKING:
@@ -190,7 +190,6 @@ FIT = Command(
         *("--json", "--discard", "--count", "--group", "--cache", "--scheduler", "--workers"),
     ),
     run_fit,
-    quiet=SILENT,
     verbose="report every scan of the data, and what took how long",
 )
 TUNE = Command(
@@ -203,6 +202,5 @@ TUNE = Command(
         *("--budget", "--group", "--output", "--force", "--json"),
     ),
     run_tune,
-    quiet=SILENT,
     verbose="say every way that is tried, and what took how long",
 )

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, ModelError, SignalError
-from uncertain_lti.cli.command import ALARM, BAD_INPUT, DONE, SILENT, UNKNOWN, Command, Result, complain, load_model
+from uncertain_lti.cli.command import ALARM, BAD_INPUT, DONE, UNKNOWN, Command, Result, complain, load_model
 from uncertain_lti.cli.options import DEPLOYED, PUBLISHED, RECORDINGS, helped
 
 if TYPE_CHECKING:
@@ -271,7 +271,6 @@ CHECK = Command(
     "check a recording against a model",
     (PUBLISHED, "bags", *DEPLOYED, helped("--json", "print JSON with a verdict per sample"), "--write"),
     run_check,
-    quiet=SILENT,
     verbose="say what took how long",
 )
 REPORT = Command(
@@ -285,7 +284,6 @@ REPORT = Command(
         helped("--json", "print the same facts as JSON"),
     ),
     run_report,
-    quiet=SILENT,
     verbose=CHECK.verbose,
 )
 _WHAT = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
@@ -301,6 +299,5 @@ PLOT = Command(
         helped("--json", "print the path, and whether the alarm was raised, as JSON"),
     ),
     run_plot,
-    quiet=SILENT,
     verbose=CHECK.verbose,
 )

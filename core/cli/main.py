@@ -124,7 +124,7 @@ def build_parser(chosen: str = "", every: bool = False) -> argparse.ArgumentPars
     for command in COMMANDS:
         text = command.help
         sub = parsers.add_parser(command.name, help=text, description=text[0].upper() + text[1:] + ".")
-        if command.quiet:
+        if command.run and command.quiet:
             output = sub.add_mutually_exclusive_group()
             output.add_argument("-q", "--quiet", action="store_true", help=command.quiet)
             if command.verbose:

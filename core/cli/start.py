@@ -19,7 +19,7 @@ from typing import Any
 
 from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.cli.command import SILENT, Command, Result, model_target
+from uncertain_lti.cli.command import Command, Result, model_target
 from uncertain_lti.cli.options import RECORDINGS, helped
 
 _LONGEST_NAME = 200  # letters
@@ -182,6 +182,5 @@ START = Command(
         helped("--json", "print what init, fit and report say, as JSON"),
     ),
     run_start,
-    quiet=SILENT,
     verbose="report every scan of the data, and what took how long",
 )

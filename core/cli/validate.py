@@ -16,7 +16,7 @@ import os
 from dataclasses import replace
 
 from uncertain_lti.base.errors import BagError, ModelError
-from uncertain_lti.cli.command import SILENT, Command, Result, load_model, model_target, read_labelled
+from uncertain_lti.cli.command import Command, Result, load_model, model_target, read_labelled
 from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
 
 # --- validate --------------------------------------------------------------------------------------------------------
@@ -121,7 +121,6 @@ VALIDATE = Command(
         *("--force", "--json"),
     ),
     run_validate,
-    quiet=SILENT,
     verbose="say every fit, and what took how long",
 )
 _LABELLED = "a fault, and a recording of it in which the alarm is raised; several recordings may have one label"
@@ -137,5 +136,4 @@ SIGNATURE = Command(
         "--json",
     ),
     run_signature,
-    quiet=SILENT,
 )
