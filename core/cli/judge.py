@@ -217,9 +217,7 @@ def _names_model(path: str) -> bool:
 
 def _plot_judged(options: argparse.Namespace, judged: Judged, output: Path) -> int:
     plotted: list[Plotted] = []
-    checked = False
     for _, verdicts, _ in judged:
-        checked = True
         if output.suffix == ".html":
             from uncertain_lti.reports.pages import plotted_check
 
@@ -228,7 +226,7 @@ def _plot_judged(options: argparse.Namespace, judged: Judged, output: Path) -> i
             from uncertain_lti.reports.figures import alarm_figure, save
 
             save(alarm_figure(judged.model, verdicts), output, 200)
-    if not checked:
+    if len(judged.refused) == len(judged.bags):
         raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
     if plotted:
         _write_page(os.path.basename(options.bags[0]), judged.bags, plotted, output)

@@ -151,17 +151,12 @@ def reproduce(
 
 def trim_text() -> str:
     """Steady states at 68 and 60 deg."""
-    rows = []
-    for pla in (68.0, 60.0):
-        t = trim(pla)
-        p = t.path
-        rows.append(
-            [
-                f"{pla:g} deg", f"{t.x[0]:.0f}", f"{t.x[1]:.0f}", f"{p.thrust / 1e3:.1f}",
-                f"{p.specific_consumption:.3f}", f"{p.W2:.1f}", f"{p.overall_pressure_ratio:.1f}",
-                f"{p.bypass_ratio:.2f}", f"{p.T4:.0f}", f"{p.T5:.0f}", f"{p.fuel:.3f}",
-            ]
-        )  # fmt: skip
+    rows = [
+        [f"{t.pla:g} deg", f"{t.x[0]:.0f}", f"{t.x[1]:.0f}", f"{p.thrust / 1e3:.1f}", f"{p.specific_consumption:.3f}",
+         f"{p.W2:.1f}", f"{p.overall_pressure_ratio:.1f}", f"{p.bypass_ratio:.2f}", f"{p.T4:.0f}", f"{p.T5:.0f}",
+         f"{p.fuel:.3f}"]
+        for t, p in ((t, t.path) for t in map(trim, (68.0, 60.0)))
+    ]  # fmt: skip
     header = ("PLA", "N1 [rpm]", "N2 [rpm]", "thrust [kN]", "kg/(kgf h)", "air [kg/s]", "P3/P2", "bypass", "T4 [K]",
               "T5 [K]", "fuel [kg/s]")  # fmt: skip
     return "Steady states of the nonlinear engine, sea level, at rest\n" + table(header, rows)
