@@ -717,6 +717,8 @@ def test_known_kinematics_leave_only_the_noise():
     for criterion in ("qp", "lp"):
         with pytest.raises(FitError, match="'position' cannot contain the step from sample .* additive"):
             with_structure(noisy, criterion=criterion, fixed=rows)
+        with pytest.raises(FitError, match="'position' cannot contain the step from sample"):
+            fit(noisy, criterion, structure=Structure(2, 1, fixed=rows), discard=3)
         model = with_structure(noisy, "noise", criterion, fixed=rows)
         assert count_outside(model, [noisy]) == 0 and 1e-4 < model.v[0] < 1e-3
 

@@ -187,7 +187,7 @@ def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
         while True:
             answer = simplex.solve()
             trial.store(answer[:-1])
-            trial.bound(float(answer[-1]))
+            trial.limit = float(answer[-1])
             slack = trial.slack()
             slack[trial.pool] = np.inf
             if without >= 0:
@@ -211,5 +211,5 @@ def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
 
 def _solve(engine: WorkingSet, own: Programmes, criterion: str) -> None:
     if criterion == "lp":
-        own.row.bound(None)
+        own.row.limit = None
     engine._settle(own, Programmes.quadratic if criterion == "qp" else Programmes.linear)

@@ -12,7 +12,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal
@@ -137,9 +138,6 @@ def fit(
     )
     check_solvable(problem, transients, [s.name for s in signals.states])
 
-    def name(error: InfeasibleError) -> FitError:
-        return _contradiction(error, problem, transients, signals)
-
     discarded: list[dict[str, Any]] = []
     if budget := _budget(discard, problem.N):
         if (left := problem.N - budget) < (unknowns := problem.columns.unknowns(problem.p)):
@@ -147,21 +145,15 @@ def fit(
                 f"discard is {discard!r}, which leaves {plural(left, 'transition')} for {unknowns} unknowns per row; "
                 f"discard {problem.N - unknowns} at most, or record more"
             )
-        before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure, describe_on=None)
+        with _named_contradiction(problem, transients, signals):
+            before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure)
         chosen = choose_discards(problem, criterion, structure, budget, progress)
         for index, effect in chosen:
-            transient, k = transients[problem.source[index]], int(problem.k[index])
-            discarded.append(
-                {
-                    "file": transient.name,
-                    "k": k,
-                    "t": float(transient.t[k]),
-                    "t_ns": int(transient.t_ns[k]),
-                    "effect": effect,
-                }
-            )
+            of, k = transients[problem.source[index]], int(problem.k[index])
+            when = {"t": float(of.t[k]), "t_ns": int(of.t_ns[k])}
+            discarded.append({"file": of.name, "k": k, **when, "effect": effect})
         problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
-    try:
+    with _named_contradiction(problem, transients, signals):
         model = fit_fleet(
             Fleet.of(problem) if method == "working-set" else Fleet([problem]),
             signals,
@@ -176,8 +168,6 @@ def fit(
             discarded=len(discarded),
             seek_carriers=seek_carriers,
         )
-    except InfeasibleError as error:
-        raise name(error) from None
     facts = {
         **model.fit_summary,
         "additive": additive,
@@ -331,13 +321,14 @@ def _distance(gap: float) -> list[str]:
     return []
 
 
-def _contradiction(
-    error: InfeasibleError, problem: Problem, transients: Sequence[Transient], signals: SignalMap
-) -> FitError:
-    transient, k = transients[problem.source[error.index]], int(problem.k[error.index])
-    return contradiction_in(
-        error, f"the step from sample {k} of {transient.name} (t = {transient.t[k]:.6g} s)", signals
-    )
+@contextmanager
+def _named_contradiction(problem: Problem, transients: Sequence[Transient], signals: SignalMap) -> Iterator[None]:
+    """A transition that the structure cannot contain is named by its recording."""
+    try:
+        yield
+    except InfeasibleError as error:
+        of, k = transients[problem.source[error.index]], int(problem.k[error.index])
+        raise contradiction_in(error, f"the step from sample {k} of {of.name} (t = {of.t[k]:.6g} s)", signals) from None
 
 
 def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:

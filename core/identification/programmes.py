@@ -103,16 +103,12 @@ class Programmes:
         """Those of a copy of the row, which can be solved on its own."""
         return Programmes(self.row.trial(), self)
 
-    def to_simplex(self) -> None:
-        """Solve (11) by the simplex method from now on."""
-        self.exact = True
-
     def allow(self) -> None:
         """Let the ties of (11) be broken a little above the δ that was found."""
         row = self.row
         assert row.limit is not None
         self.allowed = row.limit * (1.0 + WIDTH_SLACK)
-        row.bound(self.allowed)
+        row.limit = self.allowed
 
     def _solve(
         self,

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
 
@@ -33,7 +33,7 @@ TOLERANCE = 1e-11
 JOIN = 48  # samples that join a working set per round, at least; more if there are many unknowns
 
 
-class InfeasibleError(FitError):
+class InfeasibleError(UncertainLTIError):
     """A row cannot contain a transition, whatever its elements within the structure.
 
     `row`: the row of the model; `index`: position of the transition; `distance`: how far it stays outside at best,
@@ -394,10 +394,6 @@ class Row:
         """
         inside, room = self.slacks()
         return inside if room is None else np.minimum(inside, room)
-
-    def bound(self, limit: float | None) -> None:
-        """Let no sample be wider than this, in units of `limit_unit`."""
-        self.limit = limit
 
     def trial(self) -> Row:
         """A row that can be solved on its own, sharing what is only read."""

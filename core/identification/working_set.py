@@ -12,12 +12,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import on_cores, one_by_one
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
@@ -74,20 +75,17 @@ class WorkingSet:
     unknowns change (the size of a sample is linear in |z|), so while they change less than the slack that was
     brought, no other sample can leave its bounds, and the proof of optimality needs no further pass.
 
-    `fleet`: the data; `structure`: as in `fit`; `excluded`: transitions that need not be contained; `progress`: called
-    with one line of text per pass.
+    `fleet`: the data; `structure`: as in `fit`; `progress`: called with one line of text per pass.
     """
 
     def __init__(
         self,
         fleet: Fleet,
         structure: Structure | None = None,
-        excluded: Index | None = None,
         progress: Callable[[str], None] | None = None,
     ) -> None:
         self.fleet = fleet
         self.progress = progress or (lambda text: None)
-        self.excluded = np.empty(0, dtype=np.intp) if excluded is None else excluded
         self.whole = fleet.N <= 2 * SUBSAMPLE
         self._stride = 1 if self.whole else fleet.N // SUBSAMPLE
         self.sums, self._first = fleet.moments(self._stride)
@@ -142,15 +140,12 @@ class WorkingSet:
             theta, d, limit = row.theta.copy(), row.d.copy(), row.limit
             try:
                 settle(row)
-            except InfeasibleError:
-                raise
             except FitError:
                 row.take(theta, d, limit)
 
         for group in self._groups(rows):
             on_cores(self._refine, [(row,) for row in group if not row.refined])
-            self._each(group, improve)
-            self._prove(improve, group)
+            self._settle_and_prove(improve, group)
 
     def _refine(self, row: Row) -> None:
         """Refine a row with the first samples at hand, which it may have released."""
@@ -167,8 +162,6 @@ class WorkingSet:
             try:
                 self._settle(self.programmes[row.i], solve, polish)
                 return
-            except InfeasibleError:
-                raise
             except FitError:
                 self.programmes[row.i].refine()
         self._settle(self.programmes[row.i], solve, polish)
@@ -182,19 +175,14 @@ class WorkingSet:
     def _coupled_quadratic(self) -> Solution:
         """(10) with full weights: one row after the other, in refined coordinates if that is not good."""
         self._together, gap = True, np.inf
-        try:
+        with suppress(FitError):
             self._solve(self._settle_in_turn)
             gap = self.coupled_gap()
-        except InfeasibleError:
-            raise
-        except FitError:
-            pass
         if not gap <= GOOD:
             for own in self.programmes:
                 if not own.row.refined:
                     own.refine()
-            self._settle_in_turn(self.rows[0])
-            self._prove(self._settle_in_turn)
+            self._settle_and_prove(self._settle_in_turn, self.rows)
             gap = self.coupled_gap()
         return replace(self._solution(), gap=gap)
 
@@ -272,22 +260,21 @@ class WorkingSet:
         deltas = np.zeros(self.fleet.n)
 
         def settle(row: Row) -> None:
-            if not self.programmes[row.i].exact:
+            own = self.programmes[row.i]
+            if not own.exact:
                 try:
-                    self._settle(self.programmes[row.i], Programmes.regularised, polish=True)
-                except InfeasibleError:
-                    raise
+                    self._settle(own, Programmes.regularised, polish=True)
                 except FitError:
-                    self.programmes[row.i].to_simplex()
-            if self.programmes[row.i].exact:
-                row.bound(None if row.limit is None else float(deltas[row.i]) / row.limit_unit)
+                    own.exact = True
+            if own.exact:
+                row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
                 self._settle_or_refine(row, Programmes.linear)
             if row.limit is None:  # nothing unknown: the structure fixes the widths
-                row.bound(float((row.width * row.half).max(initial=0.0)))
-            deltas[row.i] = (row.limit or 0.0) * row.limit_unit
-            self.programmes[row.i].allow()
-            if self.programmes[row.i].exact:
-                self._settle(self.programmes[row.i], Programmes.bounded, polish=True)
+                row.limit = float((row.width * row.half).max(initial=0.0))
+            deltas[row.i] = row.limit * row.limit_unit
+            own.allow()
+            if own.exact:
+                self._settle(own, Programmes.bounded, polish=True)
 
         self._solve(settle)
         unknown = [row for row in self.rows if row.unknown]
@@ -295,11 +282,10 @@ class WorkingSet:
         bounds[[row.i for row in unknown]] = on_cores(self._least_width, [(row,) for row in unknown])
         above = deltas > (1.0 + WIDTH_SLACK) * bounds + 1e-13 * np.array([row.scale for row in self.rows])
         again = [row for row in unknown if above[row.i] and not self.programmes[row.i].exact]
-        for row in again:
-            self.programmes[row.i].to_simplex()
-        if again:  # the weight relative to δ was too large for these rows
-            self._each(again, settle)
-            self._prove(settle, again)
+        for row in again:  # the weight relative to δ was too large for these
+            self.programmes[row.i].exact = True
+        for group in self._groups(again):
+            self._settle_and_prove(settle, group)
         again = [
             row
             for row in self.rows
@@ -310,7 +296,7 @@ class WorkingSet:
         if again:
             before = {row.i: (row.answer(), self._largest_width(row)) for row in again}
             for row in again:
-                self.programmes[row.i].to_simplex()
+                self.programmes[row.i].exact = True
             self._again(again, settle)
             for row in again:
                 bounds[row.i] = self._least_width(row)
@@ -383,12 +369,12 @@ class WorkingSet:
         for rows in self._groups(self.rows):
             if done:
                 self._say_left(began, done, len(self.rows))
-            self._start(settle, rows)
-            self._prove(settle, rows)
+            self._start(rows)
+            self._settle_and_prove(settle, rows)
             done += len(rows)
 
-    def _start(self, settle: Settle, rows: list[Row]) -> None:
-        """Solve on the first samples and those furthest from least squares."""
+    def _start(self, rows: list[Row]) -> None:
+        """Begin with the first samples and those furthest from least squares."""
         for row in rows:
             self._hold(row, self._first[row.i])
             row.start()
@@ -402,7 +388,6 @@ class WorkingSet:
                 self._hold(row, Samples.join([self._first[row.i], samples], self.fleet.p))
         for row in rows:
             row.widen_pool(most=4 * (row.r + row.q))
-        self._each(rows, settle)
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
         """Settle rows on all cores, which the solvers do without the lock; with full weights, all at once."""
@@ -434,18 +419,17 @@ class WorkingSet:
         size = max(1, _HELD_BYTES // each)
         return [rows[k : k + size] for k in range(0, len(rows), size)]
 
-    def _prove(self, settle: Settle, rows: list[Row] | None = None) -> None:
-        """Hold the solution against all samples, and solve again, until it contains them all."""
-        if self.whole:
-            return
-        groups = self._groups(self.rows if rows is None else rows)
-        for rows in groups:
-            self._prove_group(settle, rows)
+    def _settle_and_prove(self, settle: Settle, rows: list[Row]) -> None:
+        """Settle rows on what they hold, and, if there are more samples than that, hold the solution against all."""
+        self._each(rows, settle)
+        if not self.whole:
+            self._prove(settle, rows)
             if self._in_groups:
                 for row in rows:
                     row.release()
 
-    def _prove_group(self, settle: Settle, rows: list[Row]) -> None:
+    def _prove(self, settle: Settle, rows: list[Row]) -> None:
+        """Hold the solution against all samples, and solve again, until it contains them all."""
         most = 2 * SUBSAMPLE + self.fleet.N // 500
         share = 0.2 * most / self.fleet.N
         scanned = False
@@ -473,11 +457,8 @@ class WorkingSet:
                 return
             self._each(todo, settle)
             moved = [self._moved(row, *old) for row, old in zip(rows, before, strict=True)]
-            again = [
-                row
-                for row, change, (_, held) in zip(rows, moved, found, strict=True)
-                if not (change == 0.0 or change < held)
-            ]
+            near = zip(rows, moved, found, strict=True)
+            again = [row for row, change, (_, held) in near if not (change == 0.0 or change < held)]
             if not again:
                 return
             rows = self.rows if self._together else again
@@ -516,9 +497,7 @@ class WorkingSet:
             per_column[:, :p] += change[:, :p] * inverse[:, :p]
         nominal, half = columns.nominal, columns.half
         still = [k for k, term in enumerate(half, start=p) if not term.times_dt]
-        for j, term in enumerate(
-            nominal, start=p
-        ):  # |c| <= size x ..., by the term of the size that is constant in time
+        for j, term in enumerate(nominal, start=p):  # |c| <= size x ..., by the term of the size that is constant
             if term in half:
                 k, most = p + half.index(term), 1.0
             elif still:
@@ -529,8 +508,6 @@ class WorkingSet:
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
     def _hold(self, row: Row, samples: Samples) -> None:
-        if len(self.excluded):
-            samples = samples[~np.isin(samples.index, self.excluded)]
         row.hold(samples, self.fleet.columns, self._like)
         self._like = row
 
