@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import ADDITIVE, Term
+from uncertain_lti.model.terms import ADDITIVE, TERMS, Term
 from uncertain_lti.signals.choices import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -51,14 +52,6 @@ class Regimes:
         p = len(z)
         rows = [z[j] if j < p or s is None else s[j - p] for j in self.positions]
         return np.stack(rows)
-
-    def weights(self, z: Array, s: Array | None) -> Array:
-        """Weights of all blocks, w(s).
-
-        `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (R, K): weights,
-        which sum to 1.
-        """
-        return self.schedule.weights(self.vectors(z, s))
 
     def main_block(self, z: Array, s: Array | None) -> NDArray[np.intp]:
         """The block of the largest weight.
@@ -121,14 +114,8 @@ class Columns:
 
         `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (r, K): φ / Δt.
         """
-        return self._weighted(self.plain_phi(z), z, s)
-
-    def plain_phi(self, z: Array) -> Array:
-        """`phi` of one block, without its weight.
-
-        `z` (p, K): [x; u]; Returns (r / R, K): z, and 1 for each additive term.
-        """
-        return np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
+        plain = np.vstack([z, np.ones((len(self.nominal), z.shape[1]))]) if self.nominal else z
+        return self._weighted(plain, z, s)
 
     def psi(self, z: Array, dt: Array, s: Array | None) -> Array:
         """Regressors ψ of the half-width: |z|, and for each additive term 1 or, if Δt does not multiply it, 1/Δt.
@@ -136,26 +123,35 @@ class Columns:
         `z` (p, K): [x; u]; `dt` (K,): Δt, s; `s` (q, K): further scheduling signals; None if there are none; Returns
         (q, K): ψ / Δt; of R blocks, each times its weight.
         """
-        return self._weighted(self.plain_psi(z, dt), z, s)
-
-    def plain_psi(self, z: Array, dt: Array) -> Array:
-        """`psi` of one block, without its weight.
-
-        `z` (p, K): [x; u]; `dt` (K,): Δt, s; Returns (q / R, K): |z|, and 1 or 1 / Δt for each additive term.
-        """
         p = len(z)
         psi = np.empty((p + len(self.half), z.shape[1]))
         np.abs(z, out=psi[:p])
         for row, term in zip(psi[p:], self.half, strict=True):
             row[:] = 1.0 if term.times_dt else 1.0 / dt
-        return psi
+        return self._weighted(psi, z, s)
 
     def _weighted(self, base: Array, z: Array, s: Array | None) -> Array:
         """w(s) ⊗ base."""
         if self.regimes is None:
             return base
-        weights = self.regimes.weights(z, s)
+        weights = self.regimes.schedule.weights(self.regimes.vectors(z, s))
         return (weights[:, None] * base).reshape(-1, z.shape[1])
+
+    def arrays(self, theta: Array, d: Array) -> dict[str, Any]:
+        """The unknowns as arrays by the names of the terms; with a schedule, a first axis of blocks.
+
+        `theta` (r, n): nominal elements, one column per row of the model; `d` (q, n): half-widths of the same shape.
+        """
+        n, found = theta.shape[1], dict[str, Any]()
+        for which, elements, additive in (("nominal", theta, self.nominal), ("half", d, self.half)):
+            rows, start = elements.reshape(self.count, -1, n), 0
+            p = rows.shape[1] - len(additive)
+            for term in (*(term for term in TERMS if term.required), *additive):
+                size = {"x": n, "u": p - n, "1": 1}[term.regressor]
+                values = rows[:, start : start + size].transpose(0, 2, 1)
+                found[getattr(term, which)] = values[:, :, 0] if term.regressor == "1" else values
+                start += size
+        return found if self.regimes is not None else {name: values[0] for name, values in found.items()}
 
     def unknowns(self, p: int) -> int:
         """Number of unknowns per row and block with p states and controls."""

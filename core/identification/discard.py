@@ -119,14 +119,14 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
 
     It is taken out once the next is asked for. It ends when none has an effect.
     """
-    engine.quadratic() if criterion == "qp" else engine.linear()
-    first = np.array([_value(row, criterion, engine.weights) for row in engine.rows])
+    engine.solve(criterion)
+    first = np.array([_value(row, criterion, engine.fleet.weights) for row in engine.rows])
     unit = np.full(len(first), max(float(first.sum()), 1e-300)) if criterion == "qp" else np.maximum(first, 1e-300)
     gains: list[dict[int, float]] = [{} for _ in engine.rows]
-    stale = set(range(len(engine.rows)))
+    stale, find = set(range(len(engine.rows))), _gains if criterion == "qp" else _linear_gains
     while True:
         for i in stale:
-            gains[i] = _gains(engine, engine.rows[i]) if criterion == "qp" else _linear_gains(engine, engine.rows[i])
+            gains[i] = find(engine, engine.rows[i])
         total: dict[int, float] = {}
         for i, row_gains in enumerate(gains):
             for index, gain in row_gains.items():
@@ -155,13 +155,13 @@ def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:
     """Fall of the row's part of (10) without each of the samples that carry it."""
     if not row.unknown:
         return {}
-    value = _value(row, "qp", engine.weights)
+    value = _value(row, "qp", engine.fleet.weights)
     gains = {}
     for index in row.samples.index[np.flatnonzero(row.slack() < _ACTIVE)].tolist():
         own = engine.programmes[row.i].trial()
         own.drop(index)
         _solve(engine, own, "qp")
-        gains[index] = value - _value(own.row, "qp", engine.weights)
+        gains[index] = value - _value(own.row, "qp", engine.fleet.weights)
     return gains
 
 

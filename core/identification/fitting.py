@@ -27,7 +27,7 @@ from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification.assembly import assemble, median_step
-from uncertain_lti.identification.columns import Columns, Regimes
+from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
@@ -111,15 +111,10 @@ def fit(
     signals = _at(signals, operating_point)
     if additive is None:
         additive = signals.additive or "none"
-    scheduled = _regimes(schedule, signals, transients, operating_point, additive)
+    scheduled = scheduled_by(schedule, signals, lambda: assemble(transients, operating_point, None, additive))
     if structure is None and signals.structure:
-        structure = Structure.from_rules(
-            signals.structure,
-            [s.name for s in signals.states],
-            [s.name for s in signals.controls],
-            f"{signals.source}: structure",
-            scheduled.schedule if scheduled else None,
-        )
+        names = ([s.name for s in signals.states], [s.name for s in signals.controls])
+        structure = Structure.from_rules(signals.structure, *names, f"{signals.source}: structure", scheduled)
     if structure is not None:
         if (structure.n, structure.m) != (n, m):
             raise FitError(
@@ -134,7 +129,7 @@ def fit(
         additive,
         transient_weights=transient_weights,
         count=count,
-        regimes=scheduled,
+        regimes=None if scheduled is None else Regimes.of(scheduled, signals),
     )
     check_solvable(problem, transients, [s.name for s in signals.states])
 
@@ -229,24 +224,27 @@ def fit_fleet(
             )
     domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
 
-    def build(theta: Array, d: Array) -> UncertainLTI:
-        return _model(fleet.columns, signals, sums, theta, d, dt_median, domain, alarm_rule, engine.tied)
+    regimes = fleet.columns.regimes
+    scheduled: dict[str, Any] = (
+        {} if regimes is None else {"schedule": regimes.schedule, "block_data": block_data(sums, engine.tied)}
+    )
 
-    names = [s.name for s in signals.states]
-    model, d, judged, objective, gap, solution = optimum(engine, criterion, build, names, method)
-    max_width = judged.largest
-    mean_width = 2.0 * (sums.width_sum @ d) / sums.count
-    X = model.operating_point.X
+    def build(theta: Array, d: Array) -> UncertainLTI:
+        return UncertainLTI(
+            **fleet.columns.arrays(theta, d),
+            **scheduled,
+            signals=signals,
+            sampling=Sampling(dt_median, sums.dt_min, sums.dt_max),
+            domain=domain,
+            alarm_rule=alarm_rule,
+        )
+
+    found = optimum(engine, criterion, build, [s.name for s in signals.states], method)
+    model, judged, solution = found.envelope, found.judged, found.solution
     facts: dict[str, Any] = {
         "criterion": criterion,
-        "objective": float(objective[0]) if criterion == "qp" else objective,
-        "optimality_gap": gap if np.isfinite(gap) else None,
+        **found.facts(model.operating_point.X),
         "transitions": sums.count,
-        "mean_width": mean_width,
-        "max_width": max_width,
-        "mean_width_recorded": mean_width * X,
-        "max_width_recorded": max_width * X,
-        "violations": 0,  # `repair` has counted them, by the verdict's own arithmetic
         "spectral_radius": model.spectral_radius() if dt_median is not None else None,
         "solver": {
             "method": method,
@@ -257,7 +255,7 @@ def fit_fleet(
         },
         "versions": versions(solution.solvers),
     }
-    if fleet.columns.regimes is not None:
+    if regimes is not None:
         facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
 
     def said() -> tuple[int, list[str]] | None:
@@ -266,17 +264,17 @@ def fit_fleet(
         whole = describe_on.N == sums.count and method == "working-set"
         few = carriers(describe_on, structure) if seek_carriers and whole else None
         rank, messages = describe(
-            model, describe_on, sums, mean_width, transients, few, discarded if criterion == "qp" else None
+            model, describe_on, sums, found.mean_width, transients, few, discarded if criterion == "qp" else None
         )
-        return rank, messages + _distance(gap)
+        return rank, messages + _distance(found.gap)
 
     afterwards = (said, partial(fleet.residuals, model, judged), *(partial(repeats_in, model, t) for t in transients))
-    words, residuals, *found = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)
+    words, residuals, *seen = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)
     if words is not None:
         facts["rank"], facts["messages"] = words
     if transients:
-        domain = replace(domain, step_max=largest_steps(model, found))
-        model = model.replace(repeats=together(n, found), domain=domain)
+        domain = replace(domain, step_max=largest_steps(model, seen))
+        model = model.replace(repeats=together(n, seen), domain=domain)
     return model.replace(fit_summary=facts, residuals=residuals)
 
 
@@ -294,18 +292,6 @@ def _block_facts(
         }
         for r, block in enumerate(model.blocks)
     ]
-
-
-def _regimes(
-    schedule: Schedule | Mapping[str, Knots] | None,
-    signals: SignalMap,
-    transients: Sequence[Transient],
-    point: OperatingPoint,
-    additive: Additive,
-) -> Regimes | None:
-    """What a fit is scheduled by; None for one block."""
-    found = scheduled_by(schedule, signals, lambda: assemble(transients, point, None, additive))
-    return None if found is None else Regimes.of(found, signals)
 
 
 def _distance(gap: float) -> list[str]:
@@ -405,36 +391,6 @@ def _at(signals: SignalMap, point: OperatingPoint) -> SignalMap:
     scale = np.concatenate((point.X, point.U, point.S)).tolist()
     return signals.replace_signals(
         [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
-    )
-
-
-def _model(
-    columns: Columns,
-    signals: SignalMap,
-    sums: Moments,
-    theta: Array,
-    d: Array,
-    dt_median: float | None,
-    domain: Domain,
-    alarm_rule: AlarmRule | None,
-    tied: Sequence[int],
-) -> UncertainLTI:
-    n, p = len(signals.states), len(sums.low)
-    nominal, half = theta.reshape(columns.count, -1, n), d.reshape(columns.count, -1, n)
-    arrays: dict[str, Any] = {"A": nominal[:, :n], "B": nominal[:, n:p], "dA": half[:, :n], "dB": half[:, n:p]}
-    arrays = {name: values.transpose(0, 2, 1) for name, values in arrays.items()}
-    arrays |= {term.nominal: nominal[:, k] for k, term in enumerate(columns.nominal, start=p)}
-    arrays |= {term.half: half[:, k] for k, term in enumerate(columns.half, start=p)}
-    if columns.regimes is None:
-        arrays = {name: values[0] for name, values in arrays.items()}
-    return UncertainLTI(
-        **arrays,
-        schedule=None if columns.regimes is None else columns.regimes.schedule,
-        block_data=None if columns.regimes is None else block_data(sums, tied),
-        signals=signals,
-        sampling=Sampling(dt_median, sums.dt_min, sums.dt_max),
-        domain=domain,
-        alarm_rule=alarm_rule,
     )
 
 

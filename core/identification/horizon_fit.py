@@ -46,15 +46,12 @@ the state stays where it is, give or take what it ever moved, says more."""
 
 def run_of(problem: Problem, structure: Structure | None = None) -> Run:
     """The least squares of the elements of a model, one step ahead."""
-    n, p, columns = problem.n, problem.p, problem.columns
     rows = WorkingSet(Fleet.of(problem), structure).rows
     for row in rows:
         row.start()
-    theta = np.column_stack([row.theta for row in rows]).reshape(columns.count, -1, n)
-    names = [term.nominal for term in columns.nominal]
-    drift = theta[:, p + names.index("c")] if "c" in names else np.zeros((columns.count, n))
-    found = theta[:, :n].transpose(0, 2, 1), theta[:, n:p].transpose(0, 2, 1), drift
-    return Run(*(found if columns.regimes is not None else (values[0] for values in found)))
+    theta, d = (np.column_stack([getattr(row, name) for row in rows]) for name in ("theta", "d"))
+    found = problem.columns.arrays(theta, d)
+    return Run(found["A"], found["B"], found.get("c", np.zeros(found["A"].shape[:-1])))
 
 
 def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None) -> Run | None:
@@ -171,44 +168,23 @@ def _fitted(
     largest: Array,
 ) -> tuple[Horizon, dict[str, Any]]:
     """One horizon."""
-    n, p, columns = part.n, part.p, part.columns
     engine = WorkingSet(Fleet.of(part), structure)
-    sums = engine.sums
 
     def build(theta: Array, d: Array) -> Horizon:
-        nominal, half = theta.reshape(columns.count, -1, n), d.reshape(columns.count, -1, n)
-        arrays: dict[str, Any] = {
-            "A": nominal[:, :n].transpose(0, 2, 1),
-            "B": nominal[:, n:p].transpose(0, 2, 1),
-            "c": nominal[:, p],
-            "dA": half[:, :n].transpose(0, 2, 1),
-            "dB": half[:, n:p].transpose(0, 2, 1),
-            "v": half[:, p],
-        }
-        if columns.regimes is None:
-            arrays = {name: values[0] for name, values in arrays.items()}
-        return Horizon(steps, **arrays, widths=widths)
+        return Horizon(steps, **part.columns.arrays(theta, d), widths=widths)
 
     try:
         found = optimum(engine, criterion, build, model.state_names, sizes=largest)
-        envelope, d, judged, objective, gap, solution = found
     except FitError as error:
         raise FitError(f"horizon of {steps} steps: {error}") from None
-    mean_width = 2.0 * (sums.width_sum @ d) / sums.count
-    X = model.operating_point.X
     some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
     fleet = Fleet.of(some)
-    return envelope.with_residuals(fleet.residuals(envelope, fleet.judge(envelope))), {
-        "solvers": solution.solvers,
+    residuals = fleet.residuals(found.envelope, fleet.judge(found.envelope))
+    return found.envelope.with_residuals(residuals), {
+        "solvers": found.solution.solvers,
         "steps": steps,
         "seconds": float(np.median(part.dt)),
         "widths": widths,
-        "windows": sums.count,
-        "mean_width": mean_width,
-        "max_width": judged.largest,
-        "mean_width_recorded": mean_width * X,
-        "max_width_recorded": judged.largest * X,
-        "violations": 0,
-        "objective": float(objective[0]) if criterion == "qp" else objective,
-        "optimality_gap": gap if np.isfinite(gap) else None,
+        "windows": part.N,
+        **found.facts(model.operating_point.X),
     }

@@ -12,7 +12,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -106,6 +107,36 @@ def repair(
     )
 
 
+@dataclass(frozen=True)
+class Optimum(Generic[E]):
+    """What contains every transition, as near to the optimum as was found.
+
+    `envelope`: lifted; `criterion`: as in `fit`; `objective` (1,): of (10), or δ of each row of (11), (n,); `gap`: how
+    far it is above the optimum at most, relative; inf if that is not known; `judged`: of all transitions; `mean_width`
+    (n,): per step, normalised; `solution`: before it was lifted.
+    """
+
+    envelope: E
+    criterion: str
+    objective: Array
+    gap: float
+    judged: Judged
+    mean_width: Array
+    solution: Solution
+
+    def facts(self, X: Array) -> dict[str, Any]:
+        """For the model file; `X` (n,): scales of the states."""
+        return {
+            "objective": float(self.objective[0]) if self.criterion == "qp" else self.objective,
+            "optimality_gap": self.gap if np.isfinite(self.gap) else None,
+            "mean_width": self.mean_width,
+            "max_width": self.judged.largest,
+            "mean_width_recorded": self.mean_width * X,
+            "max_width_recorded": self.judged.largest * X,
+            "violations": 0,  # `repair` has counted them, by the verdict's own arithmetic
+        }
+
+
 def optimum(
     engine: WorkingSet,
     criterion: str,
@@ -113,31 +144,42 @@ def optimum(
     names: Sequence[str],
     method: str = "working-set",
     sizes: Array | None = None,
-) -> tuple[E, Array, Judged, Array, float, Solution]:
+) -> Optimum[E]:
     """The optimum of a criterion, lifted until the verdict's own arithmetic finds nothing outside.
 
-    `sizes` (n,): as in `repair`; Returns (q, n): its half-widths; Returns (1,): of (10), or δ of each row of (11).
+    `sizes` (n,): as in `repair`.
     """
     sums = engine.sums
     if method == "working-set":
         with one_thread_each():
-            solution = engine.quadratic() if criterion == "qp" else engine.linear()
+            solution = engine.solve(criterion)
     else:
         solution = _as_written(engine, criterion)
     envelope, d, judged = repair(build, engine, solution, names, sizes, False)
-    reference = _criterion(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
-    if not _relative(_criterion(engine, criterion, d, judged), reference, criterion, sums, judged) <= GOOD:
+    reference = _objective(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
+    if not _relative(_objective(engine, criterion, d, judged), reference, criterion, sums, judged) <= GOOD:
         gentler = repair(build, engine, solution, names, sizes, True)
-        if (_criterion(engine, criterion, *gentler[1:]) < _criterion(engine, criterion, d, judged)).any():
+        if (_objective(engine, criterion, *gentler[1:]) < _objective(engine, criterion, d, judged)).any():
             envelope, d, judged = gentler
-    objective = _criterion(engine, criterion, d, judged)
+    objective = _objective(engine, criterion, d, judged)
     gap = _relative(objective, reference, criterion, sums, judged) + (solution.gap or 0.0)
-    return envelope, d, judged, objective, gap, solution
+    mean_width = 2.0 * (sums.width_sum @ d) / sums.count
+    return Optimum(envelope, criterion, objective, gap, judged, mean_width, solution)
 
 
-def _criterion(engine: WorkingSet, criterion: str, d: Array, judged: Judged) -> Array:
+def _objective(engine: WorkingSet, criterion: str, d: Array, judged: Judged) -> Array:
     """Value of (10), (1,), or of δ in every row of (11), (n,)."""
-    return np.array([_objective(engine.sums, d, engine.weights)]) if criterion == "qp" else judged.weighted
+    if criterion == "lp":
+        return judged.weighted
+    sums, weights = engine.sums, engine.fleet.weights
+    if sums.coupled is not None:
+        flat = d.T.ravel()
+        return np.array([4.0 * flat @ sums.coupled @ flat])
+    parts = []
+    for i, half in enumerate(d.T):
+        each = sums.plain_gram * (1.0 if weights is None else weights[i]) if sums.gram is None else sums.gram[i]
+        parts.append(4.0 * half @ each @ half)
+    return np.array([sum(parts)])
 
 
 def _relative(objective: Array, reference: Array, criterion: str, sums: Moments, judged: Judged) -> float:
@@ -156,16 +198,3 @@ def _as_written(engine: WorkingSet, criterion: str) -> Solution:
     theta, d, objective = formulation.solve(problem, criterion)
     solver = "cvxpy with OSQP" if criterion == "qp" else "cvxpy with HiGHS"
     return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={solver})
-
-
-def _objective(sums: Moments, d: Array, weights: Array | None) -> float:
-    """Value of (10); weights (n,) where they are constant in time."""
-    if sums.coupled is not None:
-        flat = d.T.ravel()
-        return float(4.0 * flat @ sums.coupled @ flat)
-    n = d.shape[1]
-    grams = [
-        sums.gram[i] if sums.gram is not None else sums.plain_gram * (weights[i] if weights is not None else 1.0)
-        for i in range(n)
-    ]
-    return float(sum(4.0 * d[:, i] @ grams[i] @ d[:, i] for i in range(n)))

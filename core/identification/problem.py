@@ -63,29 +63,6 @@ class Block:
         """What a step is counted from, (n, K)."""
         return self.z[: self.n] if self.base is None else self.base
 
-    def rate(self) -> Array:
-        """(x_next - x) / Δt.
-
-        Returns (n, K): 1/s.
-        """
-        rate = self.x_next - self.origin
-        rate /= self.dt
-        return rate
-
-    def phi(self, columns: Columns) -> Array:
-        """Regressors of the nominal row.
-
-        Returns (r, K): as of `Columns.phi`.
-        """
-        return columns.phi(self.z, self.s)
-
-    def psi(self, columns: Columns) -> Array:
-        """Regressors of the half-width.
-
-        Returns (q, K): as of `Columns.psi`.
-        """
-        return columns.psi(self.z, self.dt, self.s)
-
     def root_weights(self) -> Array:
         """Roots of the diagonal weights.
 
@@ -186,10 +163,9 @@ class Problem:
 
     def block(self, part: slice) -> Block:
         """Transitions of a slice, without a copy."""
-        weights = self.weights if self.weights.ndim == 1 else self.weights[part]
-        s, base = (None if rows is None else rows[:, part] for rows in (self.s_columns, self.base_columns))
-        z, x_next = self.z_columns[:, part], self.next_columns[:, part]
-        return Block(part.start or 0, z, x_next, self.dt[part], weights, s, base)
+        of = self.subset(part)
+        start = part.start or 0
+        return Block(start, of.z_columns, of.next_columns, of.dt, of.weights, of.s_columns, of.base_columns)
 
     def largest_moves(self) -> Array:
         """The largest change of each state in one transition, (n,)."""
@@ -201,33 +177,33 @@ class Problem:
         for start in range(0, self.N, BLOCK):
             yield self.block(slice(start, min(start + BLOCK, self.N)))
 
-    def rate(self, part: slice = slice(None)) -> Array:
+    def rate(self) -> Array:
         """(x_next - x) / Δt with samples in rows.
 
-        Returns (K, n): 1/s.
+        Returns (N, n): 1/s.
         """
-        return self.block(part).rate().T
+        return ((self.next_columns - self.block(slice(None)).origin) / self.dt).T
 
-    def phi(self, part: slice = slice(None)) -> Array:
+    def phi(self) -> Array:
         """Regressors of the nominal row with samples in rows.
 
-        Returns (K, r): as of `Block.phi`.
+        Returns (N, r): as of `Columns.phi`.
         """
-        return self.block(part).phi(self.columns).T
+        return self.columns.phi(self.z_columns, self.s_columns).T
 
-    def psi(self, part: slice = slice(None)) -> Array:
+    def psi(self) -> Array:
         """Regressors of the half-width with samples in rows.
 
-        Returns (K, q): as of `Block.psi`.
+        Returns (N, q): as of `Columns.psi`.
         """
-        return self.block(part).psi(self.columns).T
+        return self.columns.psi(self.z_columns, self.dt, self.s_columns).T
 
-    def row_weights(self, part: slice = slice(None)) -> Array:
+    def row_weights(self) -> Array:
         """Diagonal weights with samples in rows.
 
-        Returns (K, n): w_ii(t_{k+1}).
+        Returns (N, n): w_ii(t_{k+1}).
         """
-        return np.broadcast_to(self.block(part).root_weights().T ** 2, (len(self.dt[part]), self.n))
+        return np.broadcast_to(self.block(slice(None)).root_weights().T ** 2, (self.N, self.n))
 
     def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
         """The same problem on some transitions; a slice is no copy."""

@@ -203,7 +203,7 @@ class Programmes:
         number = kinds * np.tile(row.samples.index[row.pool], kinds) + np.repeat(np.arange(kinds), len(row.pool))
         there = np.zeros((kinds, len(row.samples)), dtype=bool)  # rows that the simplex method has
         if self._simplex is None:  # of each sample the side that it is on, and its width
-            self._simplex = self.minimax() if box is None else self._nearest()
+            self._simplex = self.minimax(nominal_alone=box is not None)
             theta, d = row.scaled()
             away = row.plain_phi[row.pool] @ theta - row.y[row.pool]
             half = row.psi[row.pool] @ d + row.half[row.pool]
@@ -275,14 +275,6 @@ class Programmes:
         sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
         return np.vstack(sides), np.concatenate([y, -y])
 
-    def _nearest(self) -> Simplex:
-        """As `minimax`, of the nominal elements alone."""
-        row = self.row
-        cost = np.append(np.zeros(row.r), 1.0)
-        simplex = Simplex(cost, np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf))
-        simplex.add(*self._with_asked(np.empty((0, len(cost))), np.empty(0)))
-        return simplex
-
     def least_width(self) -> float:
         """A lower bound of δ, in units of scale: by multipliers, or the optimum on the samples that decide it."""
         row = self.row
@@ -310,11 +302,12 @@ class Programmes:
                 break
         return bound
 
-    def minimax(self) -> Simplex:
-        """Minimise δ, the last unknown."""
+    def minimax(self, nominal_alone: bool = False) -> Simplex:
+        """Minimise δ, the last unknown, after all others or the nominal elements alone."""
         row = self.row
-        cost = np.append(np.zeros(row.r + row.q), 1.0)
-        simplex = Simplex(cost, np.append(row.lower, 0.0), np.append(row.upper, np.inf))
+        size = row.r if nominal_alone else row.r + row.q
+        cost = np.append(np.zeros(size), 1.0)
+        simplex = Simplex(cost, np.append(row.lower[:size], 0.0), np.append(row.upper[:size], np.inf))
         simplex.add(*self._with_asked(np.empty((0, len(cost))), np.empty(0)))
         return simplex
 

@@ -259,7 +259,7 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
     stride = max(1, -(-problem.N // LOOKED_AT))
     some = problem.subset(slice(None, None, stride)) if stride > 1 else problem
     values = values_of(some, row)
-    least, most = _range(problem, row)
+    least, most = (float(f(values_of(problem, row))) for f in (np.min, np.max))
     if not least < most:
         raise FitError(
             f"schedule: '{name}' is constant in every transition, so it can have no {count} knots; record it moving, "
@@ -291,12 +291,6 @@ def values_of(problem: Problem, row: int) -> Array:
     p = problem.p
     values: Array = problem.z_columns[row] if row < p or problem.s_columns is None else problem.s_columns[row - p]
     return values
-
-
-def _range(problem: Problem, row: int) -> tuple[float, float]:
-    """Least and greatest value of a row of [x; u; s]."""
-    values = values_of(problem, row)
-    return float(values.min()), float(values.max())
 
 
 def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tuple[int, float]:

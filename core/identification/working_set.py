@@ -112,6 +112,10 @@ class WorkingSet:
         self._least_eigenvalue: float | None = None  # of full weights, once it is needed
         self._like: Row | None = None  # the row that held samples last
 
+    def solve(self, criterion: str) -> Solution:
+        """Solve (10), or (11)."""
+        return self.quadratic() if criterion == "qp" else self.linear()
+
     def quadratic(self) -> Solution:
         """Solve (10)."""
         if self.sums.coupled is not None:
@@ -326,11 +330,6 @@ class WorkingSet:
         inside, _ = row.slacks()
         lift = max(0.0, -float(inside.min(initial=0.0)))
         return float((row.width * (row.psi @ d + row.half + lift)).max(initial=0.0)) * row.limit_unit
-
-    @property
-    def weights(self) -> Array | None:
-        """Weights (n,) that are constant in time; None where they are not."""
-        return self.fleet.weights
 
     def violation(self, theta: Array, d: Array) -> Array:
         """Largest violation of given elements over all transitions: one pass.
