@@ -167,22 +167,10 @@ def test_transitions_furthest_from_least_squares_first_change_no_optimum(criteri
     assert outside[1] < 0.5 * outside[0]
 
 
-def test_rows_that_do_not_fit_in_memory_together_are_counted_among_all(monkeypatch):
-    transient = drawn(small_plant(3, n=3), 3 * SUBSAMPLE, 3, noise=1e-3)
-    usual = fit([transient], additive="noise")
-    monkeypatch.setattr(working_set, "_HELD_BYTES", 1)
-    said = []
-    apart = fit([transient], additive="noise", progress=said.append)
-    assert apart.fit_summary["objective"] == pytest.approx(usual.fit_summary["objective"], rel=2e-7)
-    counted = [text.partition(",")[0] for text in said if text.startswith("row ")]
-    assert counted == ["row 2 of 3", "row 3 of 3"]
-
-
-@pytest.mark.parametrize("method", ["working-set", "cvxpy"])
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
-def test_both_methods_agree_and_contain(method, criterion):
+def test_both_methods_agree_and_contain(criterion):
     transient = drawn(small_plant(11), 200, 11)
-    model = fit(transient, criterion, method=method)
+    model = fit(transient, criterion, method="cvxpy")
     assert count_outside(model, [transient]) == 0
     other = fit(transient, criterion)
     # OSQP stops at its tolerance, and the repair pays for what it left outside
@@ -520,8 +508,19 @@ def test_scan_brings_every_sample_below_the_reach_that_it_reports(weights, limit
         np.testing.assert_allclose(samples.root_weight, root[samples.index, i])
 
 
+def on_the_bounds(model, z, dt, rng, weights, columns):
+    """Transitions inside, on and one ulp beyond the bounds of a model."""
+    centre, half = model.columns_centre_and_half(z, dt)
+    x_next = centre + half * rng.uniform(-1, 1, centre.shape)
+    edge = rng.integers(0, len(dt), 20)
+    x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
+    x_next[:, edge[:10]] = np.nextafter(x_next[:, edge[:10]], rng.choice([-np.inf, np.inf]))
+    nothing = np.zeros(len(dt), dtype=np.intp)
+    return Problem(z, x_next, dt, nothing, nothing, weights, columns)
+
+
 def judged_sample(seed):
-    """A model and transitions of it inside, on and one ulp beyond its bounds, in sizes from 1e-6 to 1e6."""
+    """A model and transitions about its bounds, in sizes from 1e-6 to 1e6."""
     rng = np.random.default_rng(seed)
     n, m, N = rng.integers(1, 6), rng.integers(0, 5), int(rng.integers(300, 6000))
     A = rng.normal(size=(n, n + m)) * 10.0 ** rng.integers(-3, 3)
@@ -530,14 +529,7 @@ def judged_sample(seed):
     model = UncertainLTI(A[:, :n], A[:, n:], D[:, :n], D[:, n:], c=c, dc=np.abs(dc), v=np.abs(v))
     z = rng.normal(size=(n + m, N)) * rng.choice([1e-6, 1.0, 1e6], size=(n + m, 1))
     dt = np.full(N, 0.01) if seed % 2 else rng.uniform(0.005, 0.02, N)
-    centre, half = model.columns_centre_and_half(z, dt)
-    x_next = centre + half * rng.uniform(-1, 1, centre.shape)
-    edge = rng.integers(0, N, 20)
-    x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
-    beyond = edge[:10]
-    x_next[:, beyond] = np.nextafter(x_next[:, beyond], rng.choice([-np.inf, np.inf]))
-    nothing = np.zeros(N, dtype=np.intp)
-    return model, Problem(z, x_next, dt, nothing, nothing, rng.uniform(0.5, 2, n), Columns())
+    return model, on_the_bounds(model, z, dt, rng, rng.uniform(0.5, 2, n), Columns())
 
 
 def scheduled_sample(seed):
@@ -555,17 +547,11 @@ def scheduled_sample(seed):
     if seed % 4 > 1:
         z[n] = rng.choice([0.0, 2.0], size=N)
     dt = np.full(N, 0.01) if seed % 3 else rng.uniform(0.005, 0.02, N)
-    centre, half = model.columns_centre_and_half(z, dt)
-    x_next = centre + half * rng.uniform(-1, 1, centre.shape)
-    edge = rng.integers(0, N, 20)
-    x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
-    x_next[:, edge[:10]] = np.nextafter(x_next[:, edge[:10]], rng.choice([-np.inf, np.inf]))
-    nothing = np.zeros(N, dtype=np.intp)
     names = [*(f"x{i + 1}" for i in range(n)), *(f"u{j + 1}" for j in range(m))]
     regimes = Regimes(schedule, schedule.positions(names))
     columns = Columns.of("both", bool(seed % 3), regimes)
     weights = rng.uniform(0.5, 2, n) if seed % 5 else rng.uniform(0.5, 2, (N, n))
-    return model, Problem(z, x_next, dt, nothing, nothing, weights, columns)
+    return model, on_the_bounds(model, z, dt, rng, weights, columns)
 
 
 def by_bounds(model, problem):
@@ -894,7 +880,10 @@ def test_rows_proven_in_groups_have_the_optimum_of_rows_proven_together(monkeypa
     together = [fit([transient], criterion=c, additive="noise", describe_data=False) for c in ("qp", "lp")]
     monkeypatch.setattr(working_set, "_HELD_BYTES", 1)
     for criterion, model in zip(("qp", "lp"), together, strict=True):
-        alone = fit([transient], criterion=criterion, additive="noise", describe_data=False)
+        said = []
+        alone = fit([transient], criterion, additive="noise", describe_data=False, progress=said.append)
+        counted = [text.partition(",")[0] for text in said if text.startswith("row ")]
+        assert counted == ["row 2 of 3", "row 3 of 3"]
         assert alone.fit_summary["objective"] == pytest.approx(model.fit_summary["objective"], rel=1e-9)
         assert alone.fit_summary["optimality_gap"] < 1e-6
         assert alone.fit_summary["solver"]["passes"] > model.fit_summary["solver"]["passes"]

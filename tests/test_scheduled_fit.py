@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from uncertain_lti import OperatingPoint, Transient, UncertainLTI
+from uncertain_lti import OperatingPoint, Transient
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit, formulation, passes
 from uncertain_lti.identification.assembly import assemble
@@ -87,12 +87,11 @@ def optimum(transient, schedule, additive, criterion, weights=None):
 
 
 def outside(model, transient):
-    """Transitions outside, one after the other, by the bounds of the model."""
-    steps, count = transient.transitions(), 0
-    for k in range(len(steps.dt)):
-        lower, upper = model.bounds(steps.x[k], steps.u[k], steps.dt[k], s=steps.s[k])
-        count += int((~((lower <= steps.x_next[k]) & (steps.x_next[k] <= upper))).any())
-    return count
+    """Transitions outside, by the bounds of the model."""
+    steps = transient.transitions()
+    centre, half = model.columns_centre_and_half(model.normalised_columns(steps), steps.dt)
+    x_next = model.operating_point.normalise_x(steps.x_next).T
+    return int((~((centre - half <= x_next) & (x_next <= centre + half))).any(axis=0).sum())
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
@@ -184,7 +183,7 @@ def test_all_blocks_shared_is_one_block(criterion, N, coupled):
             assert (blocks == blocks[0]).all()
             # full weights meet the optimum in the objective, which is flat there
             assert blocks[0] == pytest.approx(getattr(one, name), abs=1e-4)
-        assert outside_normalised(model, transient) == 0
+        assert outside(model, transient) == 0
 
 
 @settings(max_examples=20, deadline=None)
@@ -204,7 +203,7 @@ def test_large_problem_reaches_the_same_optimum(criterion):
     assert model.fit_summary["optimality_gap"] < 1e-7
     expected = optimum(transient, THREE, "both", criterion)
     assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
-    assert outside_normalised(model, transient) == 0
+    assert outside(model, transient) == 0
 
 
 @pytest.mark.parametrize("seed", [6, 7])
@@ -214,7 +213,7 @@ def test_five_knots_reach_the_least_largest_width_and_its_ties(seed):
     transient = drawn(THREE, 1000, seed, noise=1e-4)
     model = fit(transient, "lp", additive="both", schedule=schedule)
     assert model.fit_summary["optimality_gap"] < 1e-6
-    assert outside_normalised(model, transient) == 0
+    assert outside(model, transient) == 0
     steps = transient.transitions()
     lower, upper = model.bounds(steps.x, steps.u, steps.dt, s=steps.s)
     problem = written(transient, schedule, "both")
@@ -247,8 +246,8 @@ def test_the_least_largest_width_by_the_nominal_elements_alone(monkeypatch, addi
     """Half-widths of one size reach it where the structure lets them: the same as with all half-widths unknown."""
     transient = drawn(THREE, 3000, 8, noise=1e-4)
     taken = []
-    nearest = Programmes._nearest
-    monkeypatch.setattr(Programmes, "_nearest", lambda own: taken.append(own.row.i) or nearest(own))
+    distances = Programmes._distances
+    monkeypatch.setattr(Programmes, "_distances", lambda own, pool: taken.append(own.row.i) or distances(own, pool))
     model = fit(transient, "lp", additive=additive, structure=structure, schedule=THREE)
     assert (0 in taken) == short
     monkeypatch.setattr(Programmes, "box", None)
@@ -259,7 +258,7 @@ def test_the_least_largest_width_by_the_nominal_elements_alone(monkeypatch, addi
         np.square(np.diff(m.bounds(steps.x, steps.u, steps.dt, s=steps.s), axis=0)).sum() for m in (model, other)
     ]
     assert squares[0] == pytest.approx(squares[1], rel=1e-3)
-    assert outside_normalised(model, transient) == 0
+    assert outside(model, transient) == 0
 
 
 @pytest.mark.parametrize("weight", [1e-18, 1e18])
@@ -288,14 +287,7 @@ def test_recorded_knots_are_those_of_the_units():
     point = OperatingPoint(np.zeros(2), np.array([0.5, 0.0]), np.ones(2), np.array([2.0, 1.0]))
     model = fit(transient, additive="noise", operating_point=point, schedule={"u1": (-1, 0, 1)})
     assert model.schedule == Schedule((Axis("u1", knots=(-0.75, -0.25, 0.25)),))
-    assert outside_normalised(model, transient) == 0
-
-
-def outside_normalised(model, transient):
-    steps = transient.transitions()
-    centre, half = model.columns_centre_and_half(model.normalised_columns(steps), steps.dt)
-    x_next = model.operating_point.normalise_x(steps.x_next).T
-    return int((~((centre - half <= x_next) & (x_next <= centre + half))).any(axis=0).sum())
+    assert outside(model, transient) == 0
 
 
 def test_a_number_of_knots_is_placed_where_the_residual_is_largest():
@@ -465,11 +457,9 @@ def test_a_knot_without_a_schedule_is_refused():
         ({"u1": "three"}, "'three'"),
         ({"u1": 0}, "at least 1"),
         ({"u1": True}, "at least 1"),
-        ({"u1": (1, 0)}, "increase"),
         ({"u1": (0.5,)}, "one knot"),
         ({"u1": ["a"]}, "no numbers"),
         ({"u1": 40}, "give fewer"),
-        ({"u1": Modes([-5.0, 5.0])}, "does not list"),
         ({"u1": (0, 1), "u2": (0, 1), "x1": (0, 1)}, "3 scheduling signals"),
         (7, "schedule is int"),
         (Schedule((Axis("speed", knots=(0.0, 1.0)),)), "speed"),
@@ -533,13 +523,6 @@ def test_the_signals_file_schedules_a_fit():
     model, expected = fit(told, additive="both"), fit(transient, additive="both", schedule=THREE)
     assert model.schedule == THREE and (model.A == expected.A).all()
     assert fit(told, additive="both", schedule={"u1": 1}).schedule is None
-
-
-def test_a_scheduled_model_goes_to_its_file_and_back(tmp_path):
-    model = fit(drawn(THREE, 400, 15, noise=1e-3), additive="both", schedule={"u1": (-1, 0, 1, 2)})
-    model.save(tmp_path / "a.model.json")
-    again = UncertainLTI.load(tmp_path / "a.model.json")
-    assert (again.A == model.A).all() and again.block_data == model.block_data and again.schedule == model.schedule
 
 
 def test_without_additive_term_a_recording_at_rest_is_contained():
