@@ -136,6 +136,8 @@ def test_cut_cache_and_wrong_folders_are_named(tmp_path):
         list(partition.blocks())
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "thesis.tex").write_text("")
+    (tmp_path / "c" / ".transitions.f64-x.tmp").write_bytes(b"of a writer that was killed")
+    write_cache(tmp_path / "c", [problem])
     with pytest.raises(FitError, match=r"thesis\.tex.*no cache"):
         write_cache(tmp_path / "other", [problem])
 

@@ -14,13 +14,12 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
@@ -29,7 +28,7 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import too_few
 from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
 from uncertain_lti.identification.fleet import DaskFleet, Fleet
-from uncertain_lti.identification.problem import Block, Problem
+from uncertain_lti.identification.problem import DiskPartition, Problem
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of, unused
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
@@ -49,45 +48,6 @@ from uncertain_lti.signals.signal_map import SignalMap
 _DATA = "transitions.f64"
 
 
-@dataclass(frozen=True)
-class DiskPartition:
-    """A `Partition` in a file: blocks of [z; s; x_next; Δt] as float64, read again by every pass.
-
-    Only one block is in memory at a time.
-
-    `path`: written by `write_cache`; `sizes`: number of transitions of each block; `n`: number of states; `p`: number
-    of states and controls; `q`: number of further scheduling signals; `weights` (n,): constant in time; `columns`:
-    terms that are unknown.
-    """
-
-    path: Path
-    sizes: Sequence[int]
-    n: int
-    p: int
-    q: int
-    weights: Array
-    columns: Columns
-
-    @property
-    def N(self) -> int:
-        """Number of transitions."""
-        return sum(self.sizes)
-
-    def blocks(self) -> Iterator[Block]:
-        """All transitions, in the blocks they were written in."""
-        first, start = self.p + self.q, 0
-        lines = first + self.n + 1
-        with open(self.path, "rb", buffering=0) as stream:
-            for size in self.sizes:
-                data = np.fromfile(stream, dtype="<f8", count=lines * size)
-                if len(data) < lines * size:
-                    raise FitError(f"{self.path.parent}: the cache is cut short; delete the folder and fit again")
-                table = data.reshape(lines, size)
-                s = table[self.p : first] if self.q else None
-                yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
-                start += size
-
-
 def write_cache(folder: str | os.PathLike[str], problems: Iterable[Problem]) -> DiskPartition:
     """Write problems that come one after the other, each of which fits in memory, with weights of one.
 
@@ -97,7 +57,8 @@ def write_cache(folder: str | os.PathLike[str], problems: Iterable[Problem]) -> 
     new = not folder.exists()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        if strangers := {f.name for f in folder.iterdir()} - {_DATA}:
+        known = (_DATA, f".{_DATA}-")  # the second is what was not finished
+        if strangers := [f.name for f in folder.iterdir() if not f.name.startswith(known)]:
             raise FitError(f"{folder}: holds {min(strangers)}, so it is no cache; name an empty or a new folder")
         (folder / _DATA).unlink(missing_ok=True)
         with whole_file(folder / _DATA) as stream:
@@ -304,7 +265,7 @@ def _check(fleet: Fleet, signals: SignalMap) -> None:
     unknowns = fleet.columns.unknowns(fleet.p)
     if fleet.N < unknowns:
         raise FitError(too_few(fleet.N, unknowns))
-    if fleet.columns.disturbance or fleet.columns.noise:
+    if fleet.columns.half:
         return
     count, state, step = fleet.moving_from_rest()
     if count:

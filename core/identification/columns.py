@@ -95,16 +95,6 @@ class Columns:
         return "c" in self.names
 
     @property
-    def disturbance(self) -> bool:
-        """Whether dc is unknown."""
-        return "dc" in self.names
-
-    @property
-    def noise(self) -> bool:
-        """Whether v is unknown."""
-        return "v" in self.names
-
-    @property
     def count(self) -> int:
         """Number of blocks, R."""
         return 1 if self.regimes is None else self.regimes.schedule.blocks

@@ -92,7 +92,7 @@ def check_solvable(problem: Problem, transients: Sequence[Transient], names: Seq
     unknowns = columns.unknowns(problem.p)
     if problem.N < unknowns:
         raise FitError(too_few(problem.N, unknowns))
-    if columns.disturbance or columns.noise:
+    if columns.half:
         return
     rest = np.ones(problem.N, dtype=bool)
     for column in problem.z_columns:
@@ -187,8 +187,7 @@ def describe(
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
     messages += _wide(sums, mean_width, names)
-    columns = problem.columns
-    if columns.drift and columns.noise and not columns.disturbance:
+    if problem.columns.names == {"c", "v"}:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return rank, messages
 

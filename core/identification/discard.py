@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -64,16 +65,17 @@ def choose_discards(
     it carries without it. A discarded transition need not be contained in any row. It stops early when none has an
     effect.
     """
-    chosen: list[tuple[int, float]] = []
-    if progress is not None:
-        progress(CountedStep(f"discard 1 of {budget}", 1, budget))
-    for index, effect in _greedy(WorkingSet(Fleet([problem]), structure), criterion):
-        chosen.append((index, effect))
-        if len(chosen) == budget:
-            break
+
+    def say(number: int) -> None:
         if progress is not None:
-            number = len(chosen) + 1
             progress(CountedStep(f"discard {number} of {budget}", number, budget))
+
+    chosen: list[tuple[int, float]] = []
+    say(1)
+    for found in islice(_greedy(WorkingSet(Fleet([problem]), structure), criterion), budget):
+        chosen.append(found)
+        if len(chosen) < budget:
+            say(len(chosen) + 1)
     return chosen
 
 

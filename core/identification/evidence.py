@@ -110,12 +110,8 @@ class Autocorrelation:
         return bool(correlated and gain >= GAIN and self.curved[state] - 1.0 < CURVED * (gain - 1.0))
 
 
-def _correlated(one: float) -> bool:
-    return one >= FOLLOW or one <= ALTERNATE
-
-
 def _autocorrelated(one: float, two: float) -> bool:
-    return _correlated(one) or abs(two) >= FOLLOW
+    return one >= FOLLOW or one <= ALTERNATE or abs(two) >= FOLLOW
 
 
 def autocorrelation(problem: Problem) -> Autocorrelation | None:

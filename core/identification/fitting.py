@@ -243,8 +243,9 @@ def fit_fleet(
     model, judged, solution = found.envelope, found.judged, found.solution
     facts: dict[str, Any] = {
         "criterion": criterion,
-        **found.facts(model.operating_point.X),
+        **found.reached(),
         "transitions": sums.count,
+        **found.widths(model.operating_point.X),
         "spectral_radius": model.spectral_radius() if dt_median is not None else None,
         "solver": {
             "method": method,

@@ -38,6 +38,10 @@ _COMPARED = 20_000
 """Residuals that the two forms of `model.residuals` are compared on, about."""
 
 
+_Facts = tuple[int, int, int, Columns, Array | None]
+"""Of a partition how many transitions, states, and states and controls; columns; weights that are constant in time."""
+
+
 class Fleet:
     """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
 
@@ -48,7 +52,7 @@ class Fleet:
     def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
         self.partitions = list(partitions)
         self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
-        self._describe([(part.N, part.n, part.p, part.columns) for part in self.partitions])
+        self._describe([_facts(part) for part in self.partitions])
 
     @classmethod
     def of(cls, problem: Problem) -> Fleet:
@@ -57,17 +61,11 @@ class Fleet:
         edges = np.linspace(0, problem.N, count + 1).astype(int).tolist()
         return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)], min(count, core_count()))
 
-    def _describe(self, facts: Sequence[tuple[int, int, int, Columns]]) -> None:
+    def _describe(self, facts: Sequence[_Facts]) -> None:
         self.counts = [count for count, *_ in facts]
         self.offsets = [0, *np.cumsum(self.counts)[:-1].tolist()]
         self.N = sum(self.counts)
-        _, self.n, self.p, self.columns = facts[0]
-
-    @property
-    def weights(self) -> Array | None:
-        """Weights (n,) that are constant in time; None where they are not."""
-        first = self.partitions[0].weights
-        return first if first.ndim == 1 else None
+        _, self.n, self.p, self.columns, self.weights = facts[0]
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments of that partition) for every partition."""
@@ -82,9 +80,7 @@ class Fleet:
     def moments(self, stride: int) -> tuple[Moments, list[Samples]]:
         """One pass for sums over all transitions, and a sample of them."""
         results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
-        total = results[0][0]
-        for sums, _ in results[1:]:
-            total = total + sums
+        total = sum((sums for sums, _ in results[1:]), results[0][0])
         return total, [Samples.join([r[1][i] for r in results], self.p) for i in range(self.n)]
 
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:
@@ -157,19 +153,13 @@ class DaskFleet(Fleet):
         done: Callable[[int], None] | None = None,
     ) -> None:
         self._client = client
-        made = [client.submit(function, *arguments, pure=False, retries=3) for function, arguments in tasks]
-        facts = _gather(client, [client.submit(_facts, part, pure=False, retries=3) for part in made], done)
-        kept = [(part, fact[0]) for part, fact in zip(made, facts, strict=True) if fact[0][0]]
+        made = _submitted(client, tasks)
+        facts = self.run(client, [(_facts, (part,)) for part in made], done)
+        kept = [(part, fact) for part, fact in zip(made, facts, strict=True) if fact[0]]
         if not kept:
             raise FitError("no usable transition in any recording; check the signals file")
         self._parts = [part for part, _ in kept]
-        self._constant_weights = next(fact[1] for fact in facts if fact[0][0])
         self._describe([fact for _, fact in kept])
-
-    @property
-    def weights(self) -> Array | None:
-        """Weights (n,) that are constant in time; None where they are not."""
-        return self._constant_weights  # type: ignore[no-any-return]
 
     @staticmethod
     def run(
@@ -178,15 +168,16 @@ class DaskFleet(Fleet):
         done: Callable[[int], None] | None = None,
     ) -> list[T]:
         """Run tasks on the workers."""
-        return _gather(client, [client.submit(f, *arguments, pure=False, retries=3) for f, arguments in tasks], done)
+        return _gather(client, _submitted(client, tasks), done)
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments) on the workers."""
-        futures = [
-            self._client.submit(function, part, *args, pure=False, retries=3)
-            for part, args in zip(self._parts, arguments, strict=True)
-        ]
-        return _gather(self._client, futures)
+        tasks = [(function, (part, *args)) for part, args in zip(self._parts, arguments, strict=True)]
+        return self.run(self._client, tasks)
+
+
+def _submitted(client: Any, tasks: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]]) -> list[Any]:
+    return [client.submit(function, *arguments, pure=False, retries=3) for function, arguments in tasks]
 
 
 def _gather(client: Any, futures: list[Any], done: Callable[[int], None] | None = None) -> list[Any]:
@@ -207,8 +198,8 @@ def _gather(client: Any, futures: list[Any], done: Callable[[int], None] | None 
     return results
 
 
-def _facts(part: Problem) -> tuple[tuple[Any, ...], Array | None]:
-    return (part.N, part.n, part.p, part.columns), part.weights if part.weights.ndim == 1 else None
+def _facts(part: Partition) -> _Facts:
+    return part.N, part.n, part.p, part.columns, part.weights if part.weights.ndim == 1 else None
 
 
 _FREEDOM = 3.0

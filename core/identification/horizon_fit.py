@@ -186,5 +186,6 @@ def _fitted(
         "seconds": float(np.median(part.dt)),
         "widths": widths,
         "windows": part.N,
-        **found.facts(model.operating_point.X),
+        **found.widths(model.operating_point.X),
+        **found.reached(),
     }

@@ -124,11 +124,16 @@ class Optimum(Generic[E]):
     mean_width: Array
     solution: Solution
 
-    def facts(self, X: Array) -> dict[str, Any]:
-        """For the model file; `X` (n,): scales of the states."""
+    def reached(self) -> dict[str, Any]:
+        """How good it is, for the model file."""
         return {
             "objective": float(self.objective[0]) if self.criterion == "qp" else self.objective,
             "optimality_gap": self.gap if np.isfinite(self.gap) else None,
+        }
+
+    def widths(self, X: Array) -> dict[str, Any]:
+        """How wide it is, for the model file; `X` (n,): scales of the states."""
+        return {
             "mean_width": self.mean_width,
             "max_width": self.judged.largest,
             "mean_width_recorded": self.mean_width * X,

@@ -7,18 +7,19 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""The identification problem as arrays: the transitions of a fit, whole and in blocks."""
+"""The identification problem as arrays: the transitions of a fit, in memory or in a file, whole and in blocks."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
 
 BLOCK = 32768
@@ -74,8 +75,9 @@ class Block:
         return np.sqrt(diagonal).T
 
 
-class Partition(Protocol):
-    """Usable transitions, normalised, wherever they lie; what the passes over all data need.
+@dataclass(frozen=True)
+class Problem:
+    """Usable transitions, normalised, in memory; of all recordings, or a part of them.
 
     They are in the form
 
@@ -83,41 +85,6 @@ class Partition(Protocol):
 
     where rate = (x_next - x) / Δt, which is (8)(9) of Leibov (2006) divided by Δt_k. θ_i is row i of [A B], d_i of
     [ΔA ΔB].
-    """
-
-    @property
-    def columns(self) -> Columns:
-        """Terms that are unknown."""
-        ...
-
-    @property
-    def n(self) -> int:
-        """Number of states."""
-        ...
-
-    @property
-    def p(self) -> int:
-        """Number of states and controls."""
-        ...
-
-    @property
-    def weights(self) -> Array:
-        """(n,), or per transition."""
-        ...
-
-    @property
-    def N(self) -> int:
-        """Number of transitions."""
-        ...
-
-    def blocks(self) -> Iterator[Block]:
-        """All transitions, in blocks."""
-        ...
-
-
-@dataclass(frozen=True)
-class Problem:
-    """A `Partition` in memory, of all recordings.
 
     `z_columns` (p, N): [x; u], samples in columns; `next_columns` (n, N): next states, samples in columns; `dt` (N,):
     Δt, s; `source` (N,): transient that a transition comes from; `k` (N,): its sample in that transient; `weights`
@@ -219,3 +186,46 @@ class Problem:
         keep = np.ones(self.N, dtype=bool)
         keep[index] = False
         return self.subset(keep)
+
+
+@dataclass(frozen=True)
+class DiskPartition:
+    """Usable transitions, normalised, in a file: blocks of [z; s; x_next; Δt] as float64, read again by every pass.
+
+    Only one block is in memory at a time.
+
+    `path`: written by `archive.write_cache`; `sizes`: transitions of each block; `n`: number of states; `p`: number of
+    states and controls; `q`: number of further scheduling signals; `weights` (n,): constant in time; `columns`: terms
+    that are unknown.
+    """
+
+    path: Path
+    sizes: Sequence[int]
+    n: int
+    p: int
+    q: int
+    weights: Array
+    columns: Columns
+
+    @property
+    def N(self) -> int:
+        """Number of transitions."""
+        return sum(self.sizes)
+
+    def blocks(self) -> Iterator[Block]:
+        """All transitions, in the blocks they were written in."""
+        first, start = self.p + self.q, 0
+        lines = first + self.n + 1
+        with open(self.path, "rb", buffering=0) as stream:
+            for size in self.sizes:
+                data = np.fromfile(stream, dtype="<f8", count=lines * size)
+                if len(data) < lines * size:
+                    raise FitError(f"{self.path.parent}: the cache is cut short; delete the folder and fit again")
+                table = data.reshape(lines, size)
+                s = table[self.p : first] if self.q else None
+                yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
+                start += size
+
+
+Partition = Problem | DiskPartition
+"""What the passes over all data take."""

@@ -73,31 +73,24 @@ class Programmes:
         self.allowed = 0.0  # δ that the ties may have, in the same units
         self.exact = row.sums.visits.size > 1  # (11) by the simplex method
         self.least = 0.0  # δ of (11) that it found, in the same units as the limit
-        self.attempt = _ATTEMPTS[0]
-        self._last: dict[str, Answer] = {}  # to the last programme of a kind
-        if like is not None:
-            self.attempt, self._last = like.attempt, dict(like._last)
-        self.drop_simplex()
+        self.attempt: tuple[float, float] = _ATTEMPTS[0] if like is None else like.attempt
+        self._last: dict[str, Answer] = {} if like is None else dict(like._last)  # to the last programme of a kind
+        self._start_simplex_afresh()
 
-    def forget(self) -> None:
-        """Start solvers afresh: the coordinates are others."""
-        self.attempt, self._last = _ATTEMPTS[0], {}
-        self.drop_simplex()
-
-    def drop_simplex(self) -> None:
-        """Start the simplex method afresh: samples are gone."""
+    def _start_simplex_afresh(self) -> None:
         self._simplex: Simplex | None = None
         self._known: Index = np.empty(0, dtype=np.intp)
 
     def refine(self) -> None:
-        """Go over to refined coordinates of the row."""
+        """Go over to refined coordinates of the row, in which solvers start afresh."""
         self.row.refine()
-        self.forget()
+        self.attempt, self._last = _ATTEMPTS[0], {}
+        self._start_simplex_afresh()
 
     def drop(self, index: int) -> None:
         """Take a transition out of what the row holds."""
         self.row.drop(index)
-        self.drop_simplex()
+        self._start_simplex_afresh()
 
     def trial(self) -> Programmes:
         """Those of a copy of the row, which can be solved on its own."""
