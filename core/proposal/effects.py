@@ -86,12 +86,8 @@ def steps_of(
     clock = min(topics, key=lambda t: of[t].rate)
     X, U, dX = [], [], []
     for number, arrival in enumerate(of[clock].arrival):
-        x = np.column_stack([held(c, of[c.topic], number, of[clock]) for c in state])
-        u = (
-            np.column_stack([held(c, of[c.topic], number, of[clock]) for c in controls])
-            if controls
-            else np.empty((len(arrival), 0))
-        )
+        columns = [held(c, of[c.topic], number, of[clock]) for c in [*state, *controls]]
+        x, u = np.hsplit(np.column_stack(columns), [len(state)])
         step = np.diff(arrival)
         if len(step) < 2 + longest:
             continue
@@ -101,17 +97,12 @@ def steps_of(
             u[:, j] = earlier(u[:, j], lag)
         good = (step > 0) & (step <= limit)
         good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
-        if len(good) > 200_000:  # enough to tell
-            good[200_000:] = False
+        good[200_000:] = False  # enough to tell
         X.append(x[:-1][good])
         U.append(u[:-1][good])
         dX.append(np.diff(x, axis=0)[good])
-    n, m = len(state), len(controls)
-    return Steps(
-        np.concatenate([np.empty((0, n)), *X]),
-        np.concatenate([np.empty((0, m)), *U]),
-        np.concatenate([np.empty((0, n)), *dX]),
-    )
+    n, m = np.empty((0, len(state))), np.empty((0, len(controls)))
+    return Steps(np.concatenate([n, *X]), np.concatenate([m, *U]), np.concatenate([n, *dX]))
 
 
 def earlier(values: Array, samples: int) -> Array:

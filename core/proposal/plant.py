@@ -83,8 +83,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for candidate in free:
         set_own_scale(candidate)
         candidate.name, candidate.scale = candidate.path, candidate.scale or 1.0
-    order = [id(c) for c in every]
-    return states, sorted(controls, key=lambda c: order.index(id(c)))
+    return states, [c for c in free if any(c is one for one in controls)]
 
 
 def _finite(candidate: Candidate) -> Array:

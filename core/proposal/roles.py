@@ -137,17 +137,16 @@ def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence
         met[role] |= {id(c) for c in found}
     for source in sources:
         for role, patterns in (("state", states), ("control", controls)):
-            mine = {id(c) for c in source.candidates} & met[role]
+            mine, why = {id(c) for c in source.candidates} & met[role], f"not asked for by --{role}s"
             if mine:
                 source.role, source.reason = role, ""
-                for candidate in source.candidates:
-                    if id(candidate) not in mine and not candidate.reason:
-                        candidate.reason = f"not asked for by --{role}s"
             elif patterns and source.role == role:
-                source.role = "apart"
-                source.reason = source.reason or f"not asked for by --{role}s"
-                for candidate in source.candidates:
-                    candidate.reason = candidate.reason or source.reason
+                source.role, source.reason = "apart", source.reason or why
+            else:
+                continue
+            for candidate in source.free:
+                if id(candidate) not in mine:
+                    candidate.reason = source.reason or why
 
 
 def _plain(path: str) -> str:

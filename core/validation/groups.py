@@ -16,6 +16,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -60,13 +61,10 @@ def group_names(transients: Sequence[Transient], key: str) -> list[str]:
     if kind == "folder" and not value:
         return _folders(transients)
     if kind == "hours" and value:
-        try:
-            hours = float(value)
-        except ValueError:
-            hours = math.nan
-        if not 0 < hours < math.inf:
-            raise FitError(f"group hours={value}: give a positive number of hours, such as hours=2")
-        return _sessions(transients, hours)
+        with suppress(ValueError):
+            if 0 < float(value) < math.inf:
+                return _sessions(transients, float(value))
+        raise FitError(f"group hours={value}: give a positive number of hours, such as hours=2")
     if kind == "metadata" and value:
         return [_from_metadata(t, value) for t in transients]
     if kind == "name" and value:

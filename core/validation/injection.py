@@ -21,7 +21,7 @@ stays as recorded, and no controller reacts to the fault.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -130,44 +130,37 @@ def _recall(recalled: Recalled, moved: Array, k: int, dt: Array) -> Array:
     return difference / dt[:, k - 1] if memory.kind == "rate" and k else difference
 
 
+_CHANGES: Mapping[str, Callable[[Array, Array, Array, Array], Array]] = {
+    "bias": lambda true, size, since, noise: true + size,
+    "offset": lambda true, size, since, noise: true + size,
+    "drift": lambda true, size, since, noise: true + size * since,
+    "scale": lambda true, size, since, noise: true * (1.0 + size),
+    "loss": lambda true, size, since, noise: true * (1.0 - size),
+    "noise": lambda true, size, since, noise: true + size * noise,
+    "spike": lambda true, size, since, noise: true + size * (np.arange(true.shape[1]) == 0),
+}
+"""What becomes of true values from the onset on (W, L - onset), by kinds that need none from before."""
+
+
 def _reading(windows: Windows, kind: str, true: Array, size: Array, noise: Array) -> Array:
     """Readings (W, L - onset) of a sensor from the onset on; of an actuator likewise what it does."""
     t, k = windows.t, windows.onset
     after, since, size = true[:, k:], t[:, k:] - t[:, k : k + 1], size[:, None]
-    if kind in ("bias", "offset"):
-        return np.asarray(after + size)
-    if kind == "drift":
-        return np.asarray(after + size * since)
-    if kind == "scale":
-        return np.asarray(after * (1.0 + size))
-    if kind == "loss":
-        return np.asarray(after * (1.0 - size))
-    if kind == "noise":
-        return np.asarray(after + size * noise[:, k:])
-    if kind == "dropout":
-        return np.where((since < size) & np.isfinite(after), 0.0, after)
-    if kind == "spike":
-        changed = after.copy()
-        changed[:, :1] += size
-        return changed
-    if kind in ("freeze", "stuck"):
-        held = true[:, max(k - 1, 0)][:, None]
+    if kind in _CHANGES:
+        return _CHANGES[kind](after, size, since, noise[:, k:])
+    if kind in ("freeze", "stuck", "dropout"):
+        held = np.zeros((len(t), 1)) if kind == "dropout" else true[:, [max(k - 1, 0)]]
         return np.where((since < size) & np.isfinite(after), held, after)
-    assert kind in ("sensor_delay", "actuator_delay")
-    late = np.empty_like(after)
+    late = np.empty_like(after)  # a delay
     for w, (row, wanted) in enumerate(zip(t, t[:, k:] - size, strict=True)):
         late[w] = true[w, np.maximum(np.searchsorted(row, wanted + 1e-9, side="right") - 1, 0)]
     return late
 
 
 def _response(
-    windows: Windows,
-    kind: str,
-    i: int,
-    size: Array,
-    recalled: Sequence[Recalled],
-    model: UncertainLTI,
+    windows: Windows, kind: str, i: int, size: Array, recalled: Sequence[Recalled], model: UncertainLTI
 ) -> Array:
+    """States (W, L, n) of machines whose actuator or dynamics fail."""
     point = model.operating_point
     x, u, s = point.normalise_x(windows.x), point.normalise_u(windows.u), point.normalise_s(windows.s)
     done = windows.u.copy()
@@ -191,12 +184,11 @@ def _response(
                 done[:, k, at] += _recall(r, moved_by[:, :, r.of] * point.X[r.of], k, dt) / point.U[at]
             healthy, _ = model.centre_and_half(x[:, k], u[:, k], step, s[:, k])
             faulty, _ = model.centre_and_half(before, done[:, k], step, s[:, k])
+            faulty = faulty.copy()
             if kind == "time_constant":
-                faulty = faulty.copy()
                 faulty[:, i] = before[:, i] + faster * (faulty[:, i] - before[:, i])
             elif kind == "gain":
                 idle, _ = model.centre_and_half(before, np.zeros_like(u[:, k]), step, s[:, k])
-                faulty = faulty.copy()
                 faulty[:, i] += size * (faulty[:, i] - idle[:, i])
             difference = faulty - healthy
             # nothing is known of the machine where a sample is missing: the difference stays as it was

@@ -67,58 +67,35 @@ VOID = 0.9
 
 def scenario(model: UncertainLTI, parts: Sequence[Part], what: str, confidence: float) -> dict[str, Any]:
     """The scenario bound on leaving the envelope anywhere in a whole fresh transient or group, or why there is none."""
-    G = int(unit_numbers(parts).max(initial=-1)) + 1
-    discarded = _discarded(model)
+    if what == "block":
+        return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
     condition = (
         f"holds if the {what}s were drawn independently of one another from one and the same distribution, and the "
         f"machine will be run like that again; counted by whole {what}s, margin 1; a guide rather than a theorem, as "
         f"the theorem asks for an objective that does not depend on the recordings, and the sum of squared widths does"
     )
-    if what == "block":
-        return {"words": "no scenario bound: blocks of one recording are not independent of one another"}
-    counted = "transients" if what == "recording" else "groups"
-    if discarded:
-        variables = _variables(model)
-        upper = discarding_bound(variables, discarded, G, confidence)
-        if upper > VOID:
-            return {
-                "words": f"not enough {counted} for a scenario bound: {G} with {variables} unknowns and at most "
-                f"{discarded} with discarded transitions"
-            }
-        return {
-            "interval": [0.0, upper],
-            "discarded": discarded,
-            "variables": variables,
-            "words": f"a fresh {what} leaves the envelope with a probability of at most {upper:.1%} "
-            f"(confidence {confidence:.0%}); {condition}, and each {what} with a discarded transition counted as "
-            f"discarded",
-        }
-    support = int(np.count_nonzero(by_unit(parts, [p.violated for p in parts])))
-    low, high = scenario_interval(support, G, confidence)
+    G = int(unit_numbers(parts).max(initial=-1)) + 1
+    if discarded := len(model.fit_summary.get("discarded", [])):  # at most so many lost a transition to the budget
+        terms = [name for term in ADDITIVE for name in term.names if getattr(model, name).any()]
+        variables = 2 * model.n * (model.n + model.m) + model.n * len(terms)
+        low, high = 0.0, discarding_bound(variables, discarded, G, confidence)
+        facts = {"discarded": discarded, "variables": variables} if high <= VOID else {}
+        few = f"{G} with {variables} unknowns and at most {discarded} with discarded transitions"
+        said = f"with a probability of at most {high:.1%} (confidence {confidence:.0%})"
+        condition += f", and each {what} with a discarded transition counted as discarded"
+    else:
+        support = int(np.count_nonzero(by_unit(parts, [p.violated for p in parts])))
+        low, high = scenario_interval(support, G, confidence)
+        facts = {"support": support}
+        few = f"{support} of {G} left the envelope of the others; record more of them"
+        said = (
+            f"somewhere with a probability between {low:.1%} and {high:.1%} (confidence {confidence:.0%}, {support} of "
+            f"{G} {what}s left the envelope of the others)"
+        )
     if high > VOID:
-        return {
-            "support": support,
-            "words": f"not enough {counted} for a scenario bound: {support} of {G} left the envelope of the others; "
-            f"record more of them",
-        }
-    return {
-        "support": support,
-        "interval": [low, high],
-        "words": f"a fresh {what} leaves the envelope somewhere with a probability between {low:.1%} and "
-        f"{high:.1%} (confidence {confidence:.0%}, {support} of {G} {what}s left the envelope of the others); "
-        f"{condition}",
-    }
-
-
-def _variables(model: UncertainLTI) -> int:
-    nominal = model.n * (model.n + model.m)
-    return 2 * nominal + sum(int(getattr(model, name).any()) * model.n for term in ADDITIVE for name in term.names)
-
-
-def _discarded(model: UncertainLTI) -> int:
-    """Recordings at most that lost a transition to the budget of outliers."""
-    listed = model.fit_summary.get("discarded", [])
-    return len(listed) if isinstance(listed, (list, tuple)) else 0
+        counted = "transients" if what == "recording" else "groups"
+        return {**facts, "words": f"not enough {counted} for a scenario bound: {few}"}
+    return {**facts, "interval": [low, high], "words": f"a fresh {what} leaves the envelope {said}; {condition}"}
 
 
 @dataclass(frozen=True, repr=False)
