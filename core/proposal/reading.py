@@ -60,13 +60,13 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
                 facts[fact.info.topic] = fact
     sources = []
     for topic, fact in facts.items():
-        stamped = fact.stamps in ("usable", "mixed")
-        if fact.info.type == TYPE:
-            sources += _of_table(fact, sum(bag.topics[topic].count for bag in bags if topic in bag.topics))
-            continue
-        source = Source(topic, fact.info.type, role_by_name(topic, fact.info.type), stamped, fact.stamp_offset)
-        sources.append(source)
         total = sum(bag.topics[topic].count for bag in bags if topic in bag.topics)
+        if fact.info.type == TYPE:
+            sources += _of_table(fact, total)
+            continue
+        stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
+        source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
+        sources.append(source)
         if not fact.info.readable:
             source.reason = fact.info.reason
         elif source.role == "apart":

@@ -15,6 +15,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import count
 
 import numpy as np
 
@@ -57,14 +58,10 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
             name = "_".join(words)
             if name in taken or (suffix == "command" and candidate.element in elements):
                 name = f"{name}_{suffix}"
-            number = 2
-            unique = name
-            while unique in taken:
-                unique, number = f"{name}_{number}", number + 1
-            candidate.name = unique
-            taken.add(unique)
-            inner = candidate.path
-            candidate.unit = next((unit for pattern, unit in _UNITS if pattern.search(inner)), "")
+            numbered = (f"{name}_{number}" for number in count(2))
+            candidate.name = name if name not in taken else next(n for n in numbered if n not in taken)
+            taken.add(candidate.name)
+            candidate.unit = next((unit for pattern, unit in _UNITS if pattern.search(candidate.path)), "")
 
 
 def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
@@ -170,13 +167,8 @@ def signals_file(
         f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
-    offsets = [every[t].offset for t in topics]
-    stamped = [o for o in offsets if o is not None]
-    differ = any(every[t].halting for t in topics)
-    differ |= len(stamped) > 0 and (
-        max(stamped) - min(stamped) > 1.0 or (len(stamped) < len(offsets) and _far(stamped))
-    )
-    if differ:
+    offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
+    if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
         lines += [
             "",
             "# Their header stamps do not move, or not all use one clock: times of arrival serve for all.",
@@ -256,10 +248,6 @@ def _place(name: str, member: str) -> str:
     return '"' + (plain.replace(word, "{}", 1) if word in plain else "{}_" + plain) + '"'
 
 
-def _far(offsets: Sequence[float]) -> bool:
-    return max(abs(o) for o in offsets) > 1.0
-
-
 def _quoted(text: str) -> str:
     """As YAML takes it: plain where it may stand so, and is not read as a number or a truth value."""
     plain = not re.fullmatch(r"(?i)(y|n|yes|no|on|off|true|false|null|nan|\\.inf)", text)
@@ -296,13 +284,8 @@ def _left_out(sources: Sequence[Source], chosen: set[int]) -> list[str]:
         for candidate in source.candidates:
             if id(candidate) not in chosen and not candidate.ready:
                 groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
-        if source.reason and (not groups or set(groups) == {source.reason}):
-            lines.append(f"#   {source.topic}: {_one_line(source.reason)}")
-            continue
-        for reason, paths in groups.items():
-            lines.append(f"#   {source.topic} {shortlist(paths, 6)}: {_one_line(reason)}")
+        of = {reason: f" {shortlist(paths, 6)}" for reason, paths in groups.items()}
+        if source.reason and set(groups) <= {source.reason}:
+            of = {source.reason: ""}
+        lines += [f"#   {source.topic}{paths}: {' '.join(reason.split())}" for reason, paths in of.items()]
     return lines
-
-
-def _one_line(text: str) -> str:
-    return " ".join(text.split())
