@@ -32,14 +32,14 @@ from __future__ import annotations
 
 import bisect
 import struct
-from functools import lru_cache
+from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Schema, Statistics
+from mcap.records import Channel, ChunkIndex, DataEnd, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
 from uncertain_lti.recordings.mcap_records import (
@@ -66,13 +66,11 @@ from uncertain_lti.recordings.unreadable import LARGEST_RATIO, most_inflated, no
 
 _DATA_END_SIZE = RECORD.size + 4
 _FOOTER = struct.Struct("<QQI")  # begin of the summary, begin of its offsets, checksum
-_CHUNK_INDEX = struct.Struct("<QQQQI")  # first and last log time, place and length of the chunk, size of what follows
-_INDEX_OFFSET = struct.Struct("<HQ")  # channel, place of its message index
-_INDEX_REST = struct.Struct("<QI")  # length of the message indexes, of the compression's name
-_SIZES = struct.Struct("<QQ")  # compressed, decompressed
+_IN_SUMMARY: dict[int, Any] = {
+    Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.STATISTICS: Statistics, Opcode.CHUNK_INDEX: ChunkIndex,
+}  # fmt: skip
 _LEAST_STRETCH = 1 << 14  # bytes
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
-_CHUNK_AT = struct.Struct("<16xQ")  # in a chunk's index
 _FIRST_WARNINGS = 3  # of a kind that are reported one by one
 _LEAST_RECORDS = 1 << 20
 _LARGEST_DEFINITION = 1 << 24  # bytes
@@ -103,9 +101,7 @@ class _Scanner:
         self.stream = stream
         self.found = Contents(path, size)
         self.sums = 0  # checksum of everything before the current record
-        self.statistics: Statistics | None = None
-        self.summary_schemas: dict[int, Schema] = {}
-        self.summary_channels: dict[int, Channel] = {}
+        self.summary = _Summary(0, True)
         self.known: list[int] = []  # where chunks begin that the summary knows
         self.warned = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
         self.chunk_warnings: list[str] = []
@@ -119,11 +115,10 @@ class _Scanner:
     def run(self) -> Contents:
         found, path = self.found, self.found.path
         self.closed = self._at(found.size - len(MAGIC), len(MAGIC)) == MAGIC and found.size >= 2 * len(MAGIC)
-        if self.closed:
-            self._summary()
+        self._summary()
         ended = self._data_section()
-        found.schemas = self.summary_schemas | found.schemas
-        found.channels = self.summary_channels | found.channels
+        found.schemas = self.summary.schemas | found.schemas
+        found.channels = self.summary.channels | found.channels
         lost = self._orphans()
         if ended and not self.closed:
             found.warnings.append(
@@ -146,7 +141,7 @@ class _Scanner:
             )
         if lost:
             found.warnings.append(f"{path}: {count(lost, 'message')} of channels that are nowhere described left out")
-        stated = self.statistics.message_count if self.statistics else 0
+        stated = self.summary.statistics.message_count if self.summary.statistics else 0
         if stated > found.count:
             found.warnings.append(f"{path}: its summary counts {count(stated, 'message')}, {found.count} could be read")
         return found
@@ -336,29 +331,17 @@ class _Scanner:
         lost = [channel for channel in self.found.tally if channel not in self.found.channels]
         return sum(self.found.tally.pop(channel).count for channel in lost)
 
-    # --- the summary ----------------------------------------------------------------------------------------
-
     def _summary(self) -> None:
-        """Definitions, statistics and places of chunks, where the file states them and their checksum holds."""
-        stated = _summary_of(self.stream, self.found.size)
+        """What the summary of a closed file states, and where chunks begin that it knows, if its checksum holds."""
+        stated = _summary_of(self.stream, self.found.size) if self.closed else None
         if stated is None:
             return
-        _, records, whole = stated
-        if not whole:
+        if not stated.whole:
             self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
             return
-        for opcode, begin, end in walk(records):
-            if opcode == Opcode.SCHEMA and (schema := parse(Schema, records[begin:end])):
-                self.summary_schemas[schema.id] = schema
-            elif opcode == Opcode.CHANNEL and (channel := parse(Channel, records[begin:end])):
-                self.summary_channels[channel.id] = channel
-            elif opcode == Opcode.STATISTICS:
-                self.statistics = parse(Statistics, records[begin:end])
-            elif opcode == Opcode.CHUNK_INDEX:
-                offset = _CHUNK_AT.unpack_from(records, begin)[0] if end - begin >= _CHUNK_AT.size else 0
-                if len(MAGIC) <= offset and self._at(offset, 1) == bytes([Opcode.CHUNK]):
-                    self.known.append(offset)
-        self.known.sort()
+        self.summary = stated
+        places = (chunk.chunk_start_offset for chunk in stated.chunks)
+        self.known = sorted(at for at in places if at >= len(MAGIC) and self._at(at, 1) == bytes([Opcode.CHUNK]))
 
     def _at(self, offset: int, size: int) -> bytes:
         if offset < 0 or offset >= self.found.size:
@@ -384,8 +367,52 @@ def _tally(found: Records) -> dict[int, Tally]:
     return {channel: Tally(number, first, last) for channel, number, first, last in rows}
 
 
-class _NoIndexError(Exception):
-    """The file has no index that can be gone by."""
+@dataclass
+class _Summary:
+    """What the summary of a file states.
+
+    `begin`: where it begins; `whole`: whether its checksum holds; `sound`: whether every record of it can be read, and
+    none contradicts another; `schemas`, `channels`, `statistics`, `chunks`: its records.
+    """
+
+    begin: int
+    whole: bool
+    sound: bool = True
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    statistics: Statistics | None = None
+    chunks: list[ChunkIndex] = field(default_factory=list)
+
+
+def _summary_of(stream: BinaryIO, size: int) -> _Summary | None:
+    """The summary of a file; None where it has none."""
+    foot = size - len(MAGIC) - FOOTER_SIZE
+    if foot < len(MAGIC):
+        return None
+    stream.seek(foot)
+    tail = stream.read(FOOTER_SIZE + len(MAGIC))
+    if tail[:9] != RECORD.pack(Opcode.FOOTER, _FOOTER.size) or not tail.endswith(MAGIC):
+        return None
+    begin, _, checksum = _FOOTER.unpack_from(tail, RECORD.size)
+    if not len(MAGIC) <= begin < foot:
+        return None
+    stream.seek(begin)
+    records = stream.read(foot - begin)
+    found = _Summary(begin, checksum in (0, crc32(tail[: FOOTER_SIZE - 4], crc32(records))))
+    for opcode, start, stop in walk(records if found.whole else b""):
+        if (kind := _IN_SUMMARY.get(opcode)) is None:
+            continue
+        record = parse(kind, records[start:stop])
+        if isinstance(record, Statistics):
+            found.statistics = record
+        elif isinstance(record, ChunkIndex):
+            found.chunks.append(record)
+        elif record is None:
+            found.sound = False
+        else:
+            table = found.schemas if kind is Schema else found.channels
+            found.sound &= table.setdefault(record.id, record) == record
+    return found
 
 
 def outline(path: Path) -> Contents | None:
@@ -400,102 +427,67 @@ def outline(path: Path) -> Contents | None:
             size = stream.seek(0, 2)
             stream.seek(0)
             stated = _summary_of(stream, size) if stream.read(len(MAGIC)) == MAGIC else None
-            if stated is None or not stated[2] or stated[0] < len(MAGIC) + _DATA_END_SIZE:
+            if stated is None or not stated.whole or stated.begin < len(MAGIC) + _DATA_END_SIZE:
                 return None
-            begin, summary, _ = stated
-            stream.seek(begin - _DATA_END_SIZE)
+            stream.seek(stated.begin - _DATA_END_SIZE)
             data_end = stream.read(_DATA_END_SIZE)
     except OSError as error:
         raise os_error(path, error) from None
-    if data_end[:9] != RECORD.pack(Opcode.DATA_END, 4):
+    if data_end[:9] != RECORD.pack(Opcode.DATA_END, 4) or stated.statistics is None:
         return None
-    try:
-        return _contents(path, size, summary, begin - _DATA_END_SIZE, data_end[9:] != bytes(4))
-    except (_NoIndexError, struct.error, UnicodeDecodeError):
-        return None
+    return _contents(path, size, stated, stated.statistics, data_end[9:] != bytes(4))
 
 
-def _summary_of(stream: BinaryIO, size: int) -> tuple[int, bytes, bool] | None:
-    """Where the summary begins, its records, and whether its checksum holds; None where the file states none."""
-    foot = size - len(MAGIC) - FOOTER_SIZE
-    if foot < len(MAGIC):
-        return None
-    stream.seek(foot)
-    tail = stream.read(FOOTER_SIZE + len(MAGIC))
-    if tail[:9] != RECORD.pack(Opcode.FOOTER, _FOOTER.size) or not tail.endswith(MAGIC):
-        return None
-    begin, _, checksum = _FOOTER.unpack_from(tail, RECORD.size)
-    if not len(MAGIC) <= begin < foot:
-        return None
-    stream.seek(begin)
-    records = stream.read(foot - begin)
-    return begin, records, checksum in (0, crc32(tail[: FOOTER_SIZE - 4], crc32(records)))
-
-
-def _contents(path: Path, size: int, summary: bytes, data_end: int, data_crc: bool) -> Contents:
-    found = Contents(path, size, indexed=True, summed=data_crc)
-    statistics: Statistics | None = None
-    blocks: list[Block] = []
-    for opcode, begin, end in walk(summary):
-        if opcode == Opcode.CHUNK_INDEX:
-            blocks.append(_block(summary[begin:end], data_end))
-        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-            record = parse(Schema if opcode == Opcode.SCHEMA else Channel, summary[begin:end])
-            table: dict[int, object] = found.schemas if isinstance(record, Schema) else found.channels  # type: ignore[assignment]
-            if record is None or table.setdefault(record.id, record) != record:
-                raise _NoIndexError
-        elif opcode == Opcode.STATISTICS:
-            statistics = parse(Statistics, summary[begin:end])
-    if statistics is None or statistics.chunk_count != len(blocks):
-        raise _NoIndexError
-    if any(channel.schema_id and channel.schema_id not in found.schemas for channel in found.channels.values()):
-        raise _NoIndexError  # they are in the chunks
-    blocks.sort(key=lambda block: block.offset)
-    if any(before.offset + before.size > after.offset - after.unchecked for before, after in pairwise(blocks)):
-        raise _NoIndexError
-    if statistics.message_count > most_records(size) or sum(block.length for block in blocks) > most_inflated(size):
-        raise _NoIndexError
+def _contents(path: Path, size: int, stated: _Summary, statistics: Statistics, summed: bool) -> Contents | None:
+    """What a summary states, if it can be as it states."""
+    blocks = sorted(map(_block, stated.chunks), key=lambda block: block.offset)
+    shared: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
     counts = {channel: number for channel, number in statistics.channel_message_counts.items() if number}
-    found.blocks = [block for block in blocks if block.channels]
+    found = Contents(path, size, channels=stated.channels, schemas=stated.schemas, indexed=True, summed=summed)
     room: dict[int, int] = {}  # messages that the blocks of a channel can hold
-    for block in found.blocks:
+    for block in blocks:
+        if block.channels:
+            found.blocks.append(block._replace(channels=shared.setdefault(block.channels, block.channels)))
         for channel in block.channels:
             room[channel] = room.get(channel, 0) + block.length // (RECORD.size + MESSAGE.size)
-            there = found.tally.setdefault(channel, Tally(0, block.start, block.end))
+            there = found.tally.setdefault(channel, Tally(counts.get(channel, 0), block.start, block.end))
             there.first, there.last = min(there.first, block.start), max(there.last, block.end)
-    if not counts or room.keys() != counts.keys():
-        raise _NoIndexError
-    for channel, number in counts.items():
-        if channel not in found.channels or number > room[channel]:
-            raise _NoIndexError
-        found.tally[channel].count = number
-    if statistics.message_count != found.count:
-        raise _NoIndexError
-    return found
+    can_be = (
+        stated.sound
+        and statistics.chunk_count == len(blocks)
+        and all(_can_be(chunk, stated.begin - _DATA_END_SIZE) for chunk in stated.chunks)
+        and all(one.offset + one.size <= other.offset - other.unchecked for one, other in pairwise(blocks))
+        and sum(block.length for block in blocks) <= most_inflated(size)
+        and all(channel.schema_id in (0, *found.schemas) for channel in found.channels.values())  # else in the chunks
+        and 0 < statistics.message_count == found.count <= most_records(size)
+        and room.keys() == counts.keys() <= found.channels.keys()
+        and all(number <= room[channel] for channel, number in counts.items())
+    )
+    return found if can_be else None
 
 
-@lru_cache(maxsize=256)
-def _channels(low: bytes, high: bytes) -> frozenset[int]:
-    """Numbers from their low and high bytes; most chunks hold the same channels."""
-    return frozenset(a + 256 * b for a, b in zip(low, high, strict=True))
+def _block(chunk: ChunkIndex) -> Block:
+    before = RECORD.size + CHUNK.size + len(chunk.compression.encode()) + 8
+    return Block(
+        chunk.chunk_start_offset + before,
+        chunk.compressed_size,
+        chunk.compression,
+        chunk.uncompressed_size,
+        start=chunk.message_start_time,
+        end=chunk.message_end_time,
+        channels=frozenset(chunk.message_index_offsets),
+        unchecked=before,
+    )
 
 
-def _block(index: bytes, data_end: int) -> Block:
-    start, end, place, chunk_length, size_of_offsets = _CHUNK_INDEX.unpack_from(index)
-    rest = _CHUNK_INDEX.size + size_of_offsets
-    listed, pair = index[_CHUNK_INDEX.size : rest], _INDEX_OFFSET.size
-    if len(listed) % pair:
-        raise _NoIndexError
-    channels = _channels(listed[::pair], listed[1::pair])
-    index_length, name_length = _INDEX_REST.unpack_from(index, rest)
-    name_at = rest + _INDEX_REST.size
-    compression = index[name_at : name_at + name_length].decode()
-    size, length = _SIZES.unpack_from(index, name_at + name_length)
-    before = RECORD.size + CHUNK.size + name_length + 8
-    if chunk_length != before + size or place < len(MAGIC) or place + chunk_length > data_end:
-        raise _NoIndexError
-    if compression not in ("", "lz4", "zstd") or length > LARGEST_CHUNK or (not compression and length != size):
-        raise _NoIndexError
-    if place + chunk_length + index_length > data_end or end > LATEST:
-        raise _NoIndexError
-    return Block(place + before, size, compression, length, start, end, channels, before)
+def _can_be(chunk: ChunkIndex, data_end: int) -> bool:
+    """Whether there may be such a chunk, in front of the end of the data."""
+    block, begin = _block(chunk), chunk.chunk_start_offset
+    return (
+        chunk.chunk_length == block.unchecked + block.size
+        and len(MAGIC) <= begin <= begin + chunk.chunk_length + chunk.message_index_length <= data_end
+        and block.compression in ("", "lz4", "zstd")
+        and block.length <= LARGEST_CHUNK
+        and (bool(block.compression) or block.length == block.size)
+        and block.end <= LATEST
+    )
