@@ -11,10 +11,8 @@
 
 from __future__ import annotations
 
-import csv
 import math
 import os
-from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -23,12 +21,14 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, real
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
 from uncertain_lti.base.limits import LONGEST_S
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
+from uncertain_lti.sampling.named_columns import csv_columns, frame_columns, listed
+from uncertain_lti.sampling.samples import matrix, names_of, nanoseconds, segments_of
 from uncertain_lti.sampling.status import Counters, Status
 from uncertain_lti.signals.signal import AT, At
 from uncertain_lti.signals.signal_map import ARRIVAL, Signal, SignalMap
@@ -168,15 +168,15 @@ class Transient:
     ) -> None:
         self.name = name
         self.signals = signals
-        t_ns = _nanoseconds(t, name, recorded=signals is not None)
-        self.x = _matrix(x, len(t_ns), "x", name)
-        self.u = _matrix(u, len(t_ns), "u", name)
-        self.s = np.empty((len(t_ns), 0)) if s is None else _matrix(s, len(t_ns), "s", name)
+        t_ns = nanoseconds(t, name, recorded=signals is not None)
+        self.x = matrix(x, len(t_ns), "x", name)
+        self.u = matrix(u, len(t_ns), "u", name)
+        self.s = np.empty((len(t_ns), 0)) if s is None else matrix(s, len(t_ns), "s", name)
         if self.x.shape[1] == 0:
             raise TransientError(f"{name}: x has no column; give at least one state")
-        self.state_names = _names(state_names, signals.states if signals else None, "x", self.x, name)
-        self.control_names = _names(control_names, signals.controls if signals else None, "u", self.u, name)
-        self.scheduling_names = _names(scheduling_names, signals.scheduling if signals else None, "s", self.s, name)
+        self.state_names = names_of(state_names, signals.states if signals else None, "x", self.x, name)
+        self.control_names = names_of(control_names, signals.controls if signals else None, "u", self.u, name)
+        self.scheduling_names = names_of(scheduling_names, signals.scheduling if signals else None, "s", self.s, name)
         self.ends: tuple[At, ...] = (
             tuple(c.at for c in signals.controls) if signals else ("departure",) * self.u.shape[1]
         )
@@ -199,7 +199,7 @@ class Transient:
         if max_gap is None:
             max_gap = min(2.5 * median * 1e-9, LONGEST_S) if median else math.inf
         self.max_gap, self.min_step = float(max_gap), float(min_step)
-        kept, self.segment = _segments(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
+        kept, self.segment = segments_of(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
         self.t_ns = t_ns
         if len(kept) < len(t_ns):
             self.t_ns, self.x, self.u, self.s = t_ns[kept], self.x[kept], self.u[kept], self.s[kept]
@@ -450,22 +450,10 @@ class Transient:
             A column is missing or not numeric.
         """
         name = options.setdefault("name", "data frame")
-        if not hasattr(frame, "iloc"):
-            raise TransientError(f"{name}: frame is of type {type(frame).__name__}; give a pandas DataFrame")
-        states, controls = _listed(states, "states", name), _listed(controls, "controls", name)
-        columns = [str(c) for c in frame.columns]
-
-        def column(wanted: str) -> Any:
-            return frame.iloc[:, _column(columns, wanted, name, lambda i: frame.iloc[:, i])]
-
-        t = frame.index if time is None else column(str(time))
-        if getattr(t.dtype, "kind", "O") in "mM":
-            t = np.asarray(t, dtype=f"{t.dtype.kind}8[ns]")  # of instants with a time zone: UTC
-        else:
-            t = _numeric(t, str(time or "index"), name)
-        values = [_numeric(column(c), c, name) for c in (*states, *controls)]
-        z = np.column_stack(values) if values else np.empty((len(t), 0))
-        return cls(t, z[:, : len(states)], z[:, len(states) :], state_names=states, control_names=controls, **options)
+        states, controls = listed(states, "states", name), listed(controls, "controls", name)
+        t, z = frame_columns(frame, time, [*states, *controls], name)
+        x, u = z[:, : len(states)], z[:, len(states) :]
+        return cls(t, x, u, state_names=states, control_names=controls, **options)
 
     @classmethod
     def from_csv(
@@ -508,35 +496,10 @@ class Transient:
             The file is missing, a column is missing, or a cell is not a number; names the line.
         """
         name = options.setdefault("name", os.fspath(path))
-        states, controls = _listed(states, "states", name), _listed(controls, "controls", name)
-        wanted = (time, *states, *controls)
-        try:
-            with open(path, encoding="utf-8-sig", newline="") as stream:
-                rows = csv.reader(stream, delimiter=delimiter)
-                columns = [c.strip() for c in next(rows, [])]
-                if not columns:
-                    raise TransientError(f"{path}: the file is empty; its first line must name the columns")
-                columns[0] = columns[0].removeprefix("#").strip()  # as numpy.savetxt writes a header
-                cells: dict[int, list[float]] = {i: [] for i, c in enumerate(columns) if c in wanted}
-                for row in rows:
-                    if row and not row[0].startswith("#"):
-                        _take(row, cells, columns, f"{path}: line {rows.line_num}", delimiter)
-        except FileNotFoundError:
-            raise TransientError(f"{path}: there is no such file; check the path") from None
-        except OSError as error:
-            raise TransientError(f"{path}: cannot be read: {error.strerror}; check the path") from None
-        except (UnicodeDecodeError, csv.Error) as error:
-            raise TransientError(f"{path}: cannot be read as CSV: {error}; check the file") from None
-        arrays = {i: np.array(values, dtype=np.float64) for i, values in cells.items()}
-        chosen = [arrays[_column(columns, c, name, arrays.__getitem__)] for c in wanted]
-        if not len(chosen[0]):
-            raise TransientError(f"{path}: there is no row under the header; check the file")
-        for column, values in zip(wanted, chosen, strict=True):
-            if np.isnan(values).all():
-                raise TransientError(f"{path}: column '{column}' holds no number; choose another")
-        z = np.column_stack(chosen)
-        split = 1 + len(states)
-        return cls(z[:, 0], z[:, 1:split], z[:, split:], state_names=states, control_names=controls, **options)
+        states, controls = listed(states, "states", name), listed(controls, "controls", name)
+        z = csv_columns(path, [time, *states, *controls], delimiter, name)
+        t, x, u = z[:, 0], z[:, 1 : 1 + len(states)], z[:, 1 + len(states) :]
+        return cls(t, x, u, state_names=states, control_names=controls, **options)
 
 
 def _ends_of(at: At | Mapping[str, At], transient: Transient) -> tuple[At, ...]:
@@ -585,158 +548,3 @@ def listed_transients(given: Transient | Iterable[Transient]) -> list[Transient]
     for k, transient in enumerate(transients):
         refuse_other(transient, Transient, f"transient {k}", instead, TransientError)
     return transients
-
-
-def _listed(names: Sequence[str], what: str, name: str) -> list[str]:
-    if isinstance(names, str):
-        raise TransientError(f"{name}: {what} is the text '{names}'; give a list of column names")
-    return [str(n) for n in names]
-
-
-def _take(
-    row: Sequence[str], cells: Mapping[int, list[float]], columns: Sequence[str], at: str, delimiter: str
-) -> None:
-    """Append the cells of one row to those of their columns."""
-    if len(row) != len(columns):
-        raise TransientError(
-            f"{at} has {len(row)} cells, and the header names {len(columns)}; mend the file, or is the delimiter "
-            f"not {delimiter!r}?"
-        )
-    for i, values in cells.items():
-        try:
-            values.append(float(row[i]) if row[i].strip() else math.nan)
-        except ValueError:
-            raise TransientError(
-                f"{at}: '{row[i][:40]}' in column '{columns[i]}' is not a number; mend it, or leave the cell empty"
-            ) from None
-
-
-def _column(columns: Sequence[str], wanted: str, name: str, values: Any) -> int:
-    found = [i for i, c in enumerate(columns) if c == wanted]
-    if not found:
-        raise TransientError(f"{name}: there is no column '{wanted}'; columns are {', '.join(columns)}")
-    for other in found[1:]:
-        first, second = (np.asarray(values(i)) for i in (found[0], other))
-        if not ((first == second) | ((first != first) & (second != second))).all():  # NaN in both is the same
-            raise TransientError(f"{name}: column '{wanted}' is there twice with different values; rename one")
-    return found[0]
-
-
-def _numeric(column: Any, wanted: str, name: str) -> Array:
-    """Column of a data frame as numbers, NaN where it has none."""
-    values = column.to_numpy()
-    if values.dtype.kind not in "mMc":
-        try:
-            return np.array(column.to_numpy(dtype=np.float64, na_value=math.nan))
-        except (TypeError, ValueError, NotImplementedError):  # the last from an index of several columns
-            pass
-    raise TransientError(f"{name}: column '{wanted}' is not numeric; choose another or convert it")
-
-
-def _nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
-    """Instants in ns; recorded: they are those of messages, which may follow each other within a few."""
-    raw = np.array(t)
-    if raw.ndim != 1:
-        raise TransientError(f"{name}: t has shape {raw.shape}; it must be a vector (N+1,)")
-    if raw.dtype.kind in "mM":
-        if np.isnat(raw).any():
-            raise TransientError(f"{name}: t[{int(np.argmax(np.isnat(raw)))}] is not a time; leave that sample out")
-        return raw.astype(f"{raw.dtype.kind}8[ns]").astype(np.int64)
-    if raw.dtype.kind in "iu":
-        if raw.size and raw.max() > np.iinfo(np.int64).max:
-            raise TransientError(
-                f"{name}: t reaches {raw.max()} ns, past what 64 bits hold; count from a later instant"
-            )
-        t_ns = raw.astype(np.int64)
-        if not recorded and (step := _median_forward(t_ns)) < 5:
-            raise TransientError(
-                f"{name}: integers are nanoseconds, and the steps are {step:g}; give seconds as floats"
-            )
-        return t_ns
-    try:
-        if raw.size and raw.dtype.kind not in "fO":
-            raise TypeError
-        seconds = raw.astype(np.float64)
-    except (TypeError, ValueError):
-        raise TransientError(f"{name}: t is not numeric; give seconds, or integer nanoseconds") from None
-    if not np.isfinite(seconds).all():
-        where = int(np.argmin(np.isfinite(seconds)))
-        raise TransientError(f"{name}: t[{where}] is {seconds[where]}; leave out samples without a time")
-    if seconds.size and np.abs(seconds).max() > 9.2e9:
-        raise TransientError(
-            f"{name}: t reaches {np.abs(seconds).max():g} s; give seconds, or nanoseconds as an array of integers"
-        )
-    if (step := _median_forward(seconds)) < 5e-9:
-        raise TransientError(
-            f"{name}: steps of {step:g} s are too short for a nanosecond clock; give time in a larger unit"
-        )
-    return np.rint(seconds * 1e9).astype(np.int64)
-
-
-def _median_forward(t: NDArray[Any]) -> float:
-    """Median of the steps forward; infinite without any."""
-    steps = np.diff(t)
-    forward = steps[steps > 0]
-    return float(np.median(forward)) if forward.size else math.inf
-
-
-def _matrix(values: ArrayLike, rows: int, what: str, name: str) -> Array:
-    try:
-        array = real(values)
-    except (TypeError, ValueError):
-        raise TransientError(f"{name}: {what} is not numeric; give real numbers, NaN where there is none") from None
-    if array.ndim == 1 and what == "u" and array.size == 0:
-        array = array.reshape(rows, 0)
-    elif array.ndim == 1:
-        array = array[:, None]
-    if array.ndim != 2 or array.shape[0] != rows:
-        raise TransientError(
-            f"{name}: {what} has shape {array.shape}, and t has {rows} instants; give one row of {what} per instant"
-        )
-    return array
-
-
-def _names(
-    given: Sequence[str] | None, signals: Sequence[Any] | None, letter: str, values: Array, name: str
-) -> tuple[str, ...]:
-    count = values.shape[1]
-    names = tuple(given) if given is not None else tuple(s.name for s in signals) if signals is not None else None
-    if names is None:
-        return tuple(f"{letter}{i + 1}" for i in range(count))
-    if isinstance(given, str) or len(names) != count:
-        raise TransientError(
-            f"{name}: {plural(len(names), 'name')} for {plural(count, 'column')} of {letter}; give a list, one for each"
-        )
-    if len(set(names)) < count:
-        raise TransientError(f"{name}: two columns of {letter} have the same name; give each its own")
-    return names
-
-
-def _segments(
-    t_ns: NDArray[np.int64], max_gap_ns: int, min_step_ns: int, counters: Counter[str]
-) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
-    """Positions of the samples that stay, and the segment of each: the rules of `Sampler`."""
-    steps = np.diff(t_ns)
-    opens = (steps > max_gap_ns) | (steps < -max_gap_ns)
-    if (opens | (steps >= max(min_step_ns, 1))).all():
-        kept = np.arange(len(t_ns))
-    else:  # dropping a sample changes the step of the next one, so one after the other
-        positions: list[int] = [0]
-        last = int(t_ns[0])
-        for position, instant in enumerate(t_ns.tolist()[1:], start=1):
-            step = instant - last
-            if step == 0:
-                counters[Status.EQUAL.value] += 1
-            elif 0 < step < min_step_ns:
-                counters[Status.SHORT.value] += 1
-            elif -max_gap_ns <= step < 0:
-                counters[Status.LATE.value] += 1
-            else:
-                positions.append(position)
-                last = instant
-        kept = np.array(positions, dtype=np.intp)
-        steps = np.diff(t_ns[kept])
-        opens = (steps > max_gap_ns) | (steps < 0)
-    segment = np.zeros(len(kept), dtype=np.int32)
-    segment[1:] = np.cumsum(opens)
-    return kept, segment

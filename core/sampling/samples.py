@@ -1,0 +1,136 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Samples of a run as arrays: what a `Transient` is given, checked, and cut into segments."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from uncertain_lti.base.arrays import Array, real
+from uncertain_lti.base.english import plural
+from uncertain_lti.base.errors import TransientError
+from uncertain_lti.sampling.status import Status
+
+
+def nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
+    """Instants in ns; recorded: they are those of messages, which may follow each other within a few."""
+    raw = np.array(t)
+    if raw.ndim != 1:
+        raise TransientError(f"{name}: t has shape {raw.shape}; it must be a vector (N+1,)")
+    if raw.dtype.kind in "mM":
+        if np.isnat(raw).any():
+            raise TransientError(f"{name}: t[{int(np.argmax(np.isnat(raw)))}] is not a time; leave that sample out")
+        return raw.astype(f"{raw.dtype.kind}8[ns]").astype(np.int64)
+    if raw.dtype.kind in "iu":
+        if raw.size and raw.max() > np.iinfo(np.int64).max:
+            raise TransientError(
+                f"{name}: t reaches {raw.max()} ns, past what 64 bits hold; count from a later instant"
+            )
+        t_ns = raw.astype(np.int64)
+        if not recorded and (step := _median_forward(t_ns)) < 5:
+            raise TransientError(
+                f"{name}: integers are nanoseconds, and the steps are {step:g}; give seconds as floats"
+            )
+        return t_ns
+    try:
+        if raw.size and raw.dtype.kind not in "fO":
+            raise TypeError
+        seconds = raw.astype(np.float64)
+    except (TypeError, ValueError):
+        raise TransientError(f"{name}: t is not numeric; give seconds, or integer nanoseconds") from None
+    if not np.isfinite(seconds).all():
+        where = int(np.argmin(np.isfinite(seconds)))
+        raise TransientError(f"{name}: t[{where}] is {seconds[where]}; leave out samples without a time")
+    if seconds.size and np.abs(seconds).max() > 9.2e9:
+        raise TransientError(
+            f"{name}: t reaches {np.abs(seconds).max():g} s; give seconds, or nanoseconds as an array of integers"
+        )
+    if (step := _median_forward(seconds)) < 5e-9:
+        raise TransientError(
+            f"{name}: steps of {step:g} s are too short for a nanosecond clock; give time in a larger unit"
+        )
+    return np.rint(seconds * 1e9).astype(np.int64)
+
+
+def _median_forward(t: NDArray[Any]) -> float:
+    """Median of the steps forward; infinite without any."""
+    steps = np.diff(t)
+    forward = steps[steps > 0]
+    return float(np.median(forward)) if forward.size else math.inf
+
+
+def matrix(values: ArrayLike, rows: int, what: str, name: str) -> Array:
+    """An argument as numbers, a row per instant."""
+    try:
+        array = real(values)
+    except (TypeError, ValueError):
+        raise TransientError(f"{name}: {what} is not numeric; give real numbers, NaN where there is none") from None
+    if array.ndim == 1 and what == "u" and array.size == 0:
+        array = array.reshape(rows, 0)
+    elif array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2 or array.shape[0] != rows:
+        raise TransientError(
+            f"{name}: {what} has shape {array.shape}, and t has {rows} instants; give one row of {what} per instant"
+        )
+    return array
+
+
+def names_of(
+    given: Sequence[str] | None, signals: Sequence[Any] | None, letter: str, values: Array, name: str
+) -> tuple[str, ...]:
+    """Names of the columns of an argument: those given, of the signals, or its letter and a number."""
+    count = values.shape[1]
+    names = tuple(given) if given is not None else tuple(s.name for s in signals) if signals is not None else None
+    if names is None:
+        return tuple(f"{letter}{i + 1}" for i in range(count))
+    if isinstance(given, str) or len(names) != count:
+        raise TransientError(
+            f"{name}: {plural(len(names), 'name')} for {plural(count, 'column')} of {letter}; give a list, one for each"
+        )
+    if len(set(names)) < count:
+        raise TransientError(f"{name}: two columns of {letter} have the same name; give each its own")
+    return names
+
+
+def segments_of(
+    t_ns: NDArray[np.int64], max_gap_ns: int, min_step_ns: int, counters: Counter[str]
+) -> tuple[NDArray[np.intp], NDArray[np.int32]]:
+    """Positions of the samples that stay, and the segment of each: the rules of `Sampler`."""
+    steps = np.diff(t_ns)
+    opens = (steps > max_gap_ns) | (steps < -max_gap_ns)
+    if (opens | (steps >= max(min_step_ns, 1))).all():
+        kept = np.arange(len(t_ns))
+    else:  # dropping a sample changes the step of the next one, so one after the other
+        positions: list[int] = [0]
+        last = int(t_ns[0])
+        for position, instant in enumerate(t_ns.tolist()[1:], start=1):
+            step = instant - last
+            if step == 0:
+                counters[Status.EQUAL.value] += 1
+            elif 0 < step < min_step_ns:
+                counters[Status.SHORT.value] += 1
+            elif -max_gap_ns <= step < 0:
+                counters[Status.LATE.value] += 1
+            else:
+                positions.append(position)
+                last = instant
+        kept = np.array(positions, dtype=np.intp)
+        steps = np.diff(t_ns[kept])
+        opens = (steps > max_gap_ns) | (steps < 0)
+    segment = np.zeros(len(kept), dtype=np.int32)
+    segment[1:] = np.cumsum(opens)
+    return kept, segment
