@@ -243,6 +243,8 @@ def test_what_cannot_be_recorded_is_said_in_a_sentence(world: World, tmp_path: P
         (["/a", "-o", tmp_path / "there.mcap"], "is there already"),
         (["/a", "-o", tmp_path / "no" / "x.mcap"], "cannot be written"),
         (["/a", "/b", "-o", tmp_path / "x.mcap", "--wait", "0.5"], "/a, /b: not there after 0.5 s"),
+        (["/a b", "-o", tmp_path / "x.mcap", "--wait", "0.5"], "'/a b' is no topic name"),
+        (["", "-o", tmp_path / "x.mcap", "--wait", "0.5"], "'' is no topic name"),
     ]
     for arguments, sentence in refused:
         process = world.command("record", *arguments)
@@ -255,6 +257,14 @@ def test_what_cannot_be_recorded_is_said_in_a_sentence(world: World, tmp_path: P
     process.signal(signal.SIGINT)
     assert process.wait() == 1 and "no message came on /silent" in process.output
     assert sorted(p.name for p in tmp_path.glob("*.mcap*")) == ["there.mcap"]
+
+
+def test_a_domain_without_ports_is_refused_by_the_commands_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("ROS_DOMAIN_ID", "233")
+    assert main(["record", "/a", "--output", str(tmp_path / "x.mcap")]) == 2
+    assert "ROS_DOMAIN_ID is 233; choose one from 0 to 232" in capsys.readouterr().err
 
 
 # --- play ---------------------------------------------------------------------------------------------------

@@ -136,7 +136,6 @@ def run_node(
         return 0
     try:
         _check(given, name)
-        _hold_domain(os.environ.get("ROS_DOMAIN_ID", ""))
         return run(given)
     except UncertainLTIError as error:
         print(f"{name}: {error}", file=sys.stderr)
@@ -157,7 +156,8 @@ def _leave(status: int) -> NoReturn:
     os._exit(status)
 
 
-def _hold_domain(number: str) -> None:
+def hold_domain(number: str) -> None:
+    """Refuse a domain without ports, for which Fast DDS would end the process with status 1."""
     if number.isdecimal() and int(number) > _LAST_DOMAIN:
         raise ArgumentError(f"ROS_DOMAIN_ID is {number}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
 

@@ -30,7 +30,7 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from uncertain_lti_ros.arguments import ArgumentError, hold_overrides, in_words
+from uncertain_lti_ros.arguments import ArgumentError, hold_domain, hold_overrides, in_words
 
 _LATENCY = 0.1  # s that a signal waits at most
 _SPIN = 30.0  # s between two checks whether rclpy has been shut down from elsewhere
@@ -118,6 +118,7 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
     After a signal SIGALRM then ends the process, as no Python runs meanwhile.
     """
+    hold_domain(os.environ.get("ROS_DOMAIN_ID", ""))
     args = list(args or [])
     stop: list[int] = []
     lives: list[Life] = []

@@ -24,6 +24,7 @@ from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.command import print_json
+from uncertain_lti_ros.arguments import ArgumentError
 from uncertain_lti_ros.messages import definition, message_class
 from uncertain_lti_ros.process import Life, Progress, hush, living, say, seconds, tell
 from uncertain_lti_ros.topics import POLL, MatchedSubscription
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace) -> int:
     if output.suffix != ".mcap":
         output = output.with_name(f"{output.name}.mcap")
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
-        topics = list(dict.fromkeys(life.node.resolve_topic_name(topic) for topic in args.topics))
+        topics = list(dict.fromkeys(_resolved(life.node, topic) for topic in args.topics))
         types = _wait_for(life, topics, args.wait)
         subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
         if subscriptions:
@@ -75,6 +76,13 @@ def run(args: argparse.Namespace) -> int:
         + (f", {lost} lost on the way" if lost else "")
     )
     return 0
+
+
+def _resolved(node: Node, topic: str) -> str:
+    try:
+        return node.resolve_topic_name(topic)
+    except (RuntimeError, ValueError):  # RuntimeError: what rcl raises, under names that rclpy does not export
+        raise ArgumentError(f"{topic!r} is no topic name; write letters, digits, _ and /, as in /joint_states") from None
 
 
 def _wait_for(life: Life, topics: list[str], limit: float | None) -> dict[str, str]:
