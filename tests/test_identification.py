@@ -447,6 +447,7 @@ def test_nothing_usable_is_said():
         (none, some, 1.0, "among 20 samples; x1 has no value in any of them .* check its field"),
         (none, none, 1.0, "x1, u1 have no value in any of them"),
         (every_other, some, 1.0, "no two in a row have every signal; there is a value of x1 in 10 of them"),
+        (np.where(np.arange(20)[:, None], some, np.nan), some, 0.01, "no two in a row are at most max_gap"),
         (some, some, 0.01, "no two in a row are at most max_gap and at least min_step apart"),
     ):
         with pytest.raises(FitError, match=words):

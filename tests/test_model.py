@@ -419,8 +419,12 @@ def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: P
     model.save(path)
     assert UncertainLTI.load(path).fit_summary == {"a": None, "b": [0, 1], "c": None, "d": True}
     whole = path.read_bytes()
-    for bad in ({"a": object()}, {"a": "\ud800"}, {"a": {1, 2}}):
-        with pytest.raises(ModelError, match="what JSON cannot"):
+    for bad, remedy in (
+        ({"a": object()}, "mend its fit"),
+        ({"a": "bag\udcef.mcap"}, "rename the recording whose name is not UTF-8"),
+        ({"a": {1, 2}}, "mend its fit"),
+    ):
+        with pytest.raises(ModelError, match=f"what JSON cannot .*{remedy}"):
             model.replace(fit_summary=bad).save(path)
         assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
 

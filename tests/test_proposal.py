@@ -172,6 +172,16 @@ def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
         assert fitted(order, proposal).fit_summary["transients"] == 3
 
 
+def test_a_command_that_one_recording_lacks_is_told_by_name(tmp_path):
+    paths = [save(tmp_path / "a.mcap", driven(), {})]
+    states_alone = [m for m in driven(seed=1) if m.topic == "/plant/state"]
+    paths.append(write([Topic("/plant/state")], states_alone).save(tmp_path / "b.mcap"))
+    proposal = propose(paths)
+    assert not proposal.controls
+    (warning,) = (w for w in proposal.warnings if "/plant/cmd" in w)
+    assert str(paths[1]) in warning and str(paths[0]) not in warning and "leave those recordings out" in warning
+
+
 def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
     """The command and the first of two states fit the limit."""
     import uncertain_lti.proposal.reading as module

@@ -456,7 +456,7 @@ def control(entry: str) -> str:
         ("a: !!python/object:os.system {}", "is not YAML at line 1"),
         ("[" * 5000, "is not YAML"),
         ("a: \x07", "is not YAML"),
-        (b"\xff\xfe\x00", "is not YAML"),
+        (b"\xff\xfe\x00", "is not UTF-8 at byte 1; save it as UTF-8"),
         (
             "clocks: /a\n" + X,
             "unknown key 'clocks' \\(is clock meant\\?\\); known are .*clock, controls, horizons, max_gap",

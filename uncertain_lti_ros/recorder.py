@@ -82,7 +82,9 @@ def _resolved(node: Node, topic: str) -> str:
     try:
         return node.resolve_topic_name(topic)
     except (RuntimeError, ValueError):  # RuntimeError: what rcl raises, under names that rclpy does not export
-        raise ArgumentError(f"{topic!r} is no topic name; write letters, digits, _ and /, as in /joint_states") from None
+        raise ArgumentError(
+            f"{topic!r} is no topic name; write letters, digits, _ and /, as in /joint_states"
+        ) from None
 
 
 def _wait_for(life: Life, topics: list[str], limit: float | None) -> dict[str, str]:

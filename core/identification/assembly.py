@@ -155,7 +155,8 @@ def _too_large(transients: Sequence[Transient]) -> FitError:
 def _without_values(transients: Sequence[Transient]) -> str:
     """Why there may be no usable transition, by signal."""
     first, total = transients[0], sum(len(t) for t in transients)
-    known = sum(np.isfinite(np.concatenate([t.x, t.u, t.s], axis=1)).sum(axis=0) for t in transients)
+    finite = [np.isfinite(np.concatenate([t.x, t.u, t.s], axis=1)) for t in transients]
+    known = sum(f.sum(axis=0) for f in finite)
     names = (*first.state_names, *first.control_names, *first.scheduling_names)
     counts = dict(zip(names, np.asarray(known).tolist(), strict=True))
     never = [name for name, count in counts.items() if not count]
@@ -166,7 +167,7 @@ def _without_values(transients: Sequence[Transient]) -> str:
             f"see max_hold and max_skew), so check {'their fields' if many else 'its field'} in the signals file"
         )
     seldom = [f"{name} in {count}" for name, count in counts.items() if count < total]
-    if seldom:
+    if seldom and not any((whole[1:] & whole[:-1]).any() for whole in (f.all(axis=1) for f in finite)):
         return (
             f"no two in a row have every signal; there is a value of {', '.join(seldom)} of them (otherwise missing, "
             f"not finite or too old, see max_hold and max_skew), so check the signals file"

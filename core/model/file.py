@@ -232,7 +232,9 @@ def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
     try:
         text = _layout(data).encode()
     except (TypeError, ValueError, RecursionError) as error:
-        raise ModelError(f"{path}: the model holds what JSON cannot ({error}); mend its fit or validation") from None
+        named = isinstance(error, UnicodeEncodeError)
+        remedy = "rename the recording whose name is not UTF-8" if named else "mend its fit or validation"
+        raise ModelError(f"{path}: the model holds what JSON cannot ({error}); {remedy}") from None
     with written(path, ModelError) as stream:
         stream.write(text)
 

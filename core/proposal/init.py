@@ -131,6 +131,11 @@ def propose(
     for candidate in ready:
         set_own_scale(candidate)
     warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
+    for topic in (s.topic for s in sources if s.role == "control"):
+        lacking = [str(bag.path) for bag in bags if topic not in bag.topics or not bag.topics[topic].count]
+        if 0 < len(lacking) < len(bags):
+            without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
+            warnings = (*warnings, f"{without}, so it is no control; leave those recordings out")
     members = _members(chosen, used, moving)
     try:
         memories = _memories(chosen, used, sources)

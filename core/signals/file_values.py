@@ -69,7 +69,9 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
         raise SignalError(f"{path}: there is no such signals file; check the path") from None
     except OSError as error:
         raise SignalError(f"{path}: cannot be read: {error.strerror}; check the path") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: not UTF-8, or a date 2001-99-99
+    except UnicodeDecodeError as error:
+        raise SignalError(f"{path}: is not UTF-8 at byte {error.start + 1}; save it as UTF-8 text") from None
+    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError: a date 2001-99-99
         mark = getattr(error, "problem_mark", None)
         line = f" at line {mark.line + 1}" if mark else ""
         problem = str(getattr(error, "problem", None) or error).splitlines()[0]
