@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import WORTH_THREADS, on_cores
+from uncertain_lti.base.cores import WORTH_THREADS, on_cores, one_thread_each
 from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.limits import LARGEST
@@ -195,6 +195,7 @@ def fit(
     return model.replace(fit_summary=facts, horizons=over, run=model.run if over else None)
 
 
+@one_thread_each()
 def fit_fleet(
     fleet: Fleet,
     signals: SignalMap,

@@ -142,6 +142,7 @@ class Optimum(Generic[E]):
         }
 
 
+@one_thread_each()
 def optimum(
     engine: WorkingSet,
     criterion: str,
@@ -156,8 +157,7 @@ def optimum(
     """
     sums = engine.sums
     if method == "working-set":
-        with one_thread_each():
-            solution = engine.solve(criterion)
+        solution = engine.solve(criterion)
     else:
         solution = _as_written(engine, criterion)
     envelope, d, judged = repair(build, engine, solution, names, sizes, False)
