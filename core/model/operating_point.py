@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -40,8 +39,7 @@ def recorded(value: Any, steady: Any, scale: Any) -> Any:
 
 def normalise_columns(values: Array, k: NDArray[np.intp], steady: Array, scale: Array, out: Array) -> float:
     """Rows k (K,) of values (N, n), `normalised`, into columns (n, K), on all cores; the sum of their squares."""
-    edges = np.linspace(0, len(k), max(len(k) // _PIECE, 1) + 1).astype(int).tolist()
-    pieces = [slice(a, b) for a, b in itertools.pairwise(edges)]
+    pieces = [slice(a, a + _PIECE) for a in range(0, len(k), _PIECE)]
     return sum(on_cores(normalised_columns, [(values, k[p], steady, scale, out[:, p]) for p in pieces]))
 
 

@@ -219,6 +219,8 @@ def walk(
     repeats = changes(steps.transient.x, steps.k)[0]
     follows = np.concatenate([[False], np.diff(steps.k) == 1])[: len(steps.k)]
     rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
+    if not len(rows):
+        return
     z = model.normalised_columns(steps.take(rows))
     outside = model.domain.beyond(z) | model.unknown(z)
     given = steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[rows], upper[rows], model.own_rates(z).T, outside
@@ -250,6 +252,8 @@ def repeats_in(model: Any, transient: Any) -> Found:
     most, point, steps = np.zeros((4, model.n)), model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
     some, largest = changes(transient.x, steps.k)
+    if not some.any():
+        return Found(most, windows, noisy, largest)
     steps = steps.take(some)
     with np.errstate(over="ignore", invalid="ignore"):
         centre, half = model.columns_centre_and_half(model.normalised_columns(steps), steps.dt)
