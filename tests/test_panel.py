@@ -214,6 +214,12 @@ def test_what_is_not_worth_having_is_said_first():
     assert still.fit_summary["alarm"]["headline"].startswith("not worth having: nothing that is judged moves")
 
 
+def test_one_recording_does_not_vouch_for_another_day(runs):
+    alarm = fit(runs[:1], "lp", additive="noise").fit_summary["alarm"]
+    assert alarm["what"] == "block" and alarm["worth"] == "some"
+    assert "says nothing of another day" in alarm["headline"]
+
+
 def test_recordings_that_do_not_repeat_one_another_are_named(runs):
     apart = [runs[0], runs[1].replace(x=runs[1].x + 5.0), runs[2].replace(x=runs[2].x - 5.0)]
     alarm = fit(apart, "lp", additive="both").fit_summary["alarm"]

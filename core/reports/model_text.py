@@ -131,8 +131,6 @@ def next_text(model: UncertainLTI, file: str) -> str:
     blind = facts.get("alarm", {}).get("worth") in ("none", "some")
     remedy = remedies(facts.get("messages", []), facts["additive"], model.state_names[0]) if blind else ""
     worry = remedy or (minded[0] if minded else "")
-    if not worry and facts["transients"] == 1:
-        worry = "one recording says nothing of another day; check the model on one that was not fitted"
     rows = [
         (f"uncertain-lti check {file} BAG", "is there an alarm on a recording that was not fitted?"),
         (f"uncertain-lti report {file} BAG", "may I rely on it, and what happened? a page with figures"),

@@ -339,7 +339,13 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"worth having within what was recorded: {plural(count, panel.what)} of {panel.units} {verb} not repeat "
             f"what the others show, so nothing vouches for operation that none of them shows"
         )
-    return "good", f"worth having: it sees jumps of {share.min():.2g} to {share.max():.2g} of the recorded ranges"
+    sees = f"it sees jumps of {share.min():.2g} to {share.max():.2g} of the recorded ranges"
+    if panel.what == "block":
+        return "some", (
+            f"worth having while the machine runs as in the one recording, which says nothing of another day: check it "
+            f"on one that was not fitted; {sees}"
+        )
+    return "good", f"worth having: {sees}"
 
 
 def promises(model: UncertainLTI, panel: Panel) -> list[str]:
