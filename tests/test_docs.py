@@ -159,7 +159,9 @@ class Reader:
             timeout=PATIENCE,
         )
         assert done.returncode == int(block.marks.get("status", 0)), done.stdout
-        self.said = done.stdout
+        self.said = re.sub(
+            r"(?m)^[a-z]+ing: .*\n", "", done.stdout
+        )  # how far long work is, which a busy machine prints
 
     def _python(self, block: Block) -> None:
         code = compile(block.text, f"line {block.line}", "exec")
