@@ -43,8 +43,3 @@ def _style(column: int) -> str:
 def number_text(value: float | None) -> str:
     """Four digits; a dash where there is no finite number."""
     return "–" if value is None or not math.isfinite(value) else f"{value:.4g}"
-
-
-def name_with_unit(name: str, unit: str) -> str:
-    """`name [unit]`, or the name alone where there is no unit."""
-    return f"{name} [{unit}]" if unit else name

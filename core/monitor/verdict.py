@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural, times
-from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.html_table import html_table, number_text
+from uncertain_lti.base.tables import named
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, UPPER, UTILISATION
 from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.frozen import Looked
@@ -403,7 +404,7 @@ class Verdicts:
             count, width = int(given.sum()), (self.upper - self.lower)[given, i]
             rows.append(
                 [
-                    name_with_unit(name, unit),
+                    named(name, unit),
                     str(len(bad)),
                     f"{1 - len(bad) / count:.3%}" if count else "–",
                     number_text(float(width.mean())) if count else "–",

@@ -24,8 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import TransientError, refuse_other
-from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.html_table import html_table, number_text
 from uncertain_lti.base.limits import LONGEST_S
+from uncertain_lti.base.tables import named
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
 from uncertain_lti.sampling.named_columns import csv_columns, frame_columns, listed
 from uncertain_lti.sampling.samples import matrix, names_of, nanoseconds, segments_of
@@ -387,7 +388,7 @@ class Transient:
             finite = values[np.isfinite(values)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)
             rms = float(np.sqrt(np.nanmean(np.diff(values) ** 2))) if len(finite) > 1 else math.nan
-            cells = [name_with_unit(name, unit), kind, number_text(low), number_text(high), number_text(rms)]
+            cells = [named(name, unit), kind, number_text(low), number_text(high), number_text(rms)]
             rows.append([*cells, str(len(values) - len(finite))])
         counts = [
             f"{count} {reason}" for reason, count in sorted(self.counters.items()) if count and reason != "samples"

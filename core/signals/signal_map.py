@@ -18,8 +18,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NoReturn
 
 from uncertain_lti.base.errors import SignalError, refuse_other
-from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.html_table import html_table, number_text
 from uncertain_lti.base.limits import LONGEST_S
+from uncertain_lti.base.tables import named
 from uncertain_lti.signals.choices import Additive, HorizonRule, TableLayout
 from uncertain_lti.signals.entries import LISTS, STEP_CHOICES, map_arguments
 from uncertain_lti.signals.field_path import FieldPath
@@ -426,7 +427,7 @@ class SignalMap:
         groups = (("state", self.states), ("control", self.controls), ("scheduling", self.scheduling))
         rows = [
             [
-                name_with_unit(signal.name, signal.unit),
+                named(signal.name, signal.unit),
                 kind,
                 signal.topic,
                 signal.field,

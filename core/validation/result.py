@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.english import plural
-from uncertain_lti.base.html_table import html_table, name_with_unit, number_text
+from uncertain_lti.base.html_table import html_table, number_text
+from uncertain_lti.base.tables import named
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -150,7 +151,7 @@ class Validation:
         data = self.to_dict()
         rows = [
             [
-                name_with_unit(name, s["unit"]),
+                named(name, s["unit"]),
                 "–" if s["inside"] is None else f"{s['inside']:.3%}",
                 f"{s['parts_inside']}/{data['parts']}",
                 number_text(s["mean_width_left_out"]),
