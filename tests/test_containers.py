@@ -17,7 +17,6 @@ import time
 from contextlib import closing
 from pathlib import Path
 
-import numpy as np
 import pytest
 from by_message import read_stream_by_message
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -113,25 +112,6 @@ def test_columns_are_what_messages_give_and_come_in_blocks(converted, kind):
     assert columns.alone <= 4 < len(columns.topic)  # the rest was read by its plan
 
 
-def test_every_command_takes_them(converted, tmp_path, capsys):
-    path = str(converted["ROS 1 bz2"])
-    model, signals = str(tmp_path / "m.model.json"), str(tmp_path / "s.yaml")
-    assert main(["topics", path]) == 0
-    assert "/engine/state: position[fan_speed]" in capsys.readouterr().out
-    assert main(["init", path, "--output", signals]) == 0
-    with open(signals) as stream:
-        assert "position[fan_speed]" in stream.read()
-    assert main(["fit", path, "--signals", str(SIGNALS), "--additive", "noise", "--output", model]) == 0
-    assert main(["check", model, path]) == 0
-    assert main(["check", model, str(SHIPPED)]) == 0
-    out = capsys.readouterr().out.split("\n")
-    at = [i for i, line in enumerate(out) if "verdicts, " in line]
-    assert len(at) == 2
-    one, two = ([line.partition(": ")[2] or line for line in out[i : i + 8]] for i in at)
-    assert one == two
-    assert main(["validate", model]) == 0
-
-
 @pytest.fixture(scope="module")
 def annotated(tmp_path_factory):
     """A model, and the copy of the shipped recording with its verdicts."""
@@ -184,15 +164,6 @@ def test_the_definitions_in_the_file_come_first(tmp_path):
     for path in (tmp_path / "a", tmp_path / "a.bag"):
         assert [(t, m.thrust, m.mode) for _, t, m in Bag(path).messages(["/c"])] == [(5, 2.5, 3)]
         assert Bag(path).topics["/c"].type == "own_msgs/msg/Command"
-
-
-def test_real_ones(recordings):
-    for path in (recordings / "neato/db3", recordings / "neato/db3/wall_follower_0.db3"):
-        bag = Bag(path)
-        assert (bag.topics["/odom"].count, bag.topics["/odom"].readable) == (52, True)
-        assert "no definition of neato2_interfaces/msg/Bump" in bag.topics["/bump"].reason
-        (transient,) = read_transients(path, ROOT / "config/signals/neato.yaml")
-        assert len(transient) == 52 and np.isfinite(transient.x).all()
 
 
 # --- damaged and hostile --------------------------------------------------------------------------------------
@@ -339,7 +310,7 @@ def test_a_flipped_bit_loses_no_message_in_silence(converted, kind, tmp_path):
     whole = {topic: info.count for topic, info in Bag(converted[kind]).topics.items()}
     path = tmp_path / converted[kind].name
     rng = random.Random(5)
-    for _ in range(8):
+    for _ in range(3):
         hurt = bytearray(data)
         where = rng.randrange(len(hurt)) if rng.random() < 0.5 else len(hurt) - 1 - rng.randrange(6000)
         hurt[where] ^= 1 << rng.randrange(8)

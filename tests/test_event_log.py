@@ -280,17 +280,6 @@ def test_a_flapping_alarm_does_not_flood_the_log_and_each_is_named_or_counted() 
     assert len(starts) + left_out == alarms, "every alarm is named or counted"
 
 
-def test_an_alarm_long_after_others_is_named_at_its_start() -> None:
-    rig = Rig()
-    rig.send(10)
-    for _ in range(4):
-        rig.send(3, off=2.0)
-        rig.send(10)
-    rig.lines.clear()
-    rig.send(3, off=2.0)
-    assert rig.session.alarm and [line[:6] for line in rig.lines] == ["alarm,"]
-
-
 def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     rig = Rig()
     rig.wait(30.0)

@@ -25,7 +25,6 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import settled
-from uncertain_lti.model import repeats
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.repeats import Repeats, repeats_in, together
@@ -37,7 +36,6 @@ from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.status import Status
-from uncertain_lti.sampling.transient import Transitions
 
 DT = 0.01
 MS = 1_000_000
@@ -511,29 +509,6 @@ def test_a_short_repeat_is_usual_up_to_twice_the_longest_of_the_fit() -> None:
         model = UncertainLTI([[0.0]], [[100.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
         frozen = EnvelopeMonitor(model).check(transient).frozen[:, 0]
         assert np.flatnonzero(frozen)[0] == 49 + steps and frozen[49 + steps :].all()
-
-
-def test_how_active_is_looked_up_in_parts_of_a_long_recording(
-    model: UncertainLTI, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """From its beginning to its end: a machine that moves more later on is as active as it is in the middle."""
-    long = run(7, seconds=480.0)
-    more = np.linspace(0.1, 1.9, len(long))[:, None]
-    long = changed(long, x=long.x * more, u=long.u * more)
-    whole = repeats_of(model, [long]).active_beyond
-    looked_at = []
-    taken = Transitions.take
-
-    def look(steps: Transitions, at: Any) -> Transitions:
-        if isinstance(at, slice):
-            looked_at.append(at.stop - at.start)
-        return taken(steps, at)
-
-    monkeypatch.setattr(Transitions, "take", look)
-    monkeypatch.setattr(repeats, "_MOST", 7200)
-    monkeypatch.setattr(repeats, "_SPREAD", 400)
-    assert repeats_of(model, [long]).active_beyond == pytest.approx(whole, rel=0.3)
-    assert sum(looked_at) == 7200
 
 
 def test_a_slow_sensor_repeats_regularly() -> None:

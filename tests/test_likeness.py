@@ -244,23 +244,8 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     model, taught = str(tmp_path / "m.model.json"), str(tmp_path / "s.model.json")
     noise = [str(p) for p in sorted(bags.glob("turbofan_*_noise.mcap"))]
     signals = str(bags.parent / "config" / "signals" / "turbofan.yaml")
-    assert (
-        main(
-            [
-                "fit",
-                *noise,
-                "--signals",
-                signals,
-                "--output",
-                model,
-                "--criterion",
-                "lp",
-                "--additive",
-                "noise",
-            ]
-        )
-        == 0
-    )
+    words = ["--signals", signals, "--output", model, "--criterion", "lp", "--additive", "noise"]
+    assert main(["fit", *noise, *words]) == 0
     rule = ["--violations", "2", "--window", "5"]
     labelled = [f"{kind}={bags / f'turbofan_{kind}.mcap'}" for kind in ("fan_damage", "fuel_stuck", "nozzle_stuck")]
     assert main(["signature", model, *labelled, "--output", taught, *rule]) == 0

@@ -43,7 +43,7 @@ from uncertain_lti.signals.signal_map import Signal
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from geometry_msgs.msg import TwistStamped, Vector3Stamped
+from geometry_msgs.msg import Vector3Stamped
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from ros_processes import Diagnostics, World, open_world, until
@@ -395,37 +395,6 @@ def test_a_looped_bag_starts_anew_and_gives_the_same_again(world: World, tmp_pat
     assert world.status()["counters"]["resets"] == 1
 
 
-@pytest.mark.slow
-def test_a_real_recording_gives_live_what_it_gives_offline(world: World, tmp_path: Path, recordings: Path) -> None:
-    """Two seconds of a quadruped, 500 Hz on each of two topics, at real time."""
-    whole = Bag(recordings / "go2" / "test_3.mcap")
-    start = min(info.first for info in whole.topics.values() if info.first is not None) + 5 * 10**9
-    topics = ("/go2/joint_states", "/go2/joint_command")
-    cut = [m for m in whole.raw_messages(topics) if start <= m.log_time_ns < start + 2 * 10**9]
-    bag = write(
-        [Topic(t, JOINT_STATE) for t in topics], [Message(m.topic, m.log_time_ns, m.data) for m in cut]
-    ).save(tmp_path / "go2.mcap")  # fmt: skip
-    signals = SignalMap(
-        (
-            Signal("angle", topics[0], "position[j2]", type=JOINT_STATE),
-            Signal("speed", topics[0], "velocity[j2]", type=JOINT_STATE),
-        ),
-        (Signal("command", topics[1], "position[j2]", type=JOINT_STATE, max_hold=0.05),),
-    )
-    step = 0.002
-    signals = replace(signals, clock=topics[0], time=dict.fromkeys(topics, "header"), max_gap=2.5 * step)
-    model = UncertainLTI(
-        [[0.0, 1.0], [-200.0, -10.0]], [[0.0], [200.0]], [[0.0, 0.5], [50.0, 5.0]], [[0.0], [50.0]], v=[1e-3, 0.1],
-        signals=signals, sampling=Sampling(step),
-    )  # fmt: skip
-    path = saved(model, tmp_path)
-    verdicts = offline(path, bag)
-    world.monitor(path)
-    outputs = Outputs.of(world)
-    world.command("play", bag).succeed()
-    outputs.hold_against(verdicts, ("angle", "speed"))
-
-
 # --- behaviour ----------------------------------------------------------------------------------------------
 
 
@@ -500,24 +469,6 @@ def test_every_verdict_and_every_heartbeat_is_published(world: World, tmp_path: 
     assert status["violations"] == {"a": 2, "b": 2} and status["alarm"] is False
 
 
-def test_a_sample_outside_the_fitted_domain_is_marked_and_still_judged(world: World, tmp_path: Path) -> None:
-    domain = Domain(np.full(2, -1.0), np.full(2, 1.0), np.full(2, -0.5), np.full(2, 0.5))
-    model = by_hand(domain=domain)
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.2)
-    diagnostics = world.diagnostics()
-    outputs = Outputs.of(world)
-    plant = Plant(world, model).subscribed()
-    plant.send(3)
-    plant.u = np.full(2, 0.7)
-    plant.send(1)
-    plant.send(1, off=3.0)
-    plant.send(1)
-    flags = outputs.topics["flags"].count(6)
-    assert [m.velocity[1] for m in flags[1:]] == [0.0, 0.0, 0.0, 1.0, 1.0]
-    assert [m.position[1] for m in flags[1:]] == [0.0, 0.0, 0.0, 0.0, 1.0]
-    assert diagnostics.latest("envelope_monitor: monitor") is not None
-
-
 def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp_path: Path) -> None:
     domain = Domain(np.full(2, -1.0), np.full(2, 1.0), np.full(2, -0.5), np.full(2, 0.5))
     model = by_hand(domain=domain, alarm_rule=AlarmRule(3, 5))
@@ -555,25 +506,6 @@ def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp
     assert diagnostics.latest("envelope_monitor: a").level == bytes([STALE])
     values = Diagnostics.values(diagnostics.latest("envelope_monitor: monitor"))
     assert (values["gaps"], values["dropped"], values["alarms"]) == ("1", "1", "1")
-
-
-def test_a_control_that_never_comes_is_named_and_nothing_is_called_contained(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.4)
-    diagnostics = world.diagnostics()
-    outputs = Outputs.of(world)
-    plant = Plant(world, model)
-    world.subscribed(plant.state)
-    for k in range(100):
-        message = JointState(name=["a", "b"], position=[0.3, 0.3])
-        message.header.stamp.sec, message.header.stamp.nanosec = divmod(EPOCH_NS + k * STEP_NS, 10**9)
-        plant.state.publish(message)
-        time.sleep(0.01)
-    status = diagnostics.reaches(STALE, saying=f"nothing ever received on {CONTROL}")
-    assert "no verdict yet" in status.message
-    flags = outputs.topics["flags"].count(100)
-    assert np.isnan([m.position for m in flags]).all()
-    assert not outputs.topics["lower"].messages
 
 
 def test_a_model_is_swapped_as_a_whole_or_not_at_all(world: World, tmp_path: Path) -> None:
@@ -737,33 +669,6 @@ def test_a_signal_ends_the_node_with_status_0(world: World, tmp_path: Path, end:
     until(lambda: diagnostics.latest("envelope_monitor: monitor").message.startswith("finalized"), "its last words")
 
 
-def test_best_effort_publishers_are_heard_and_followed_when_they_change(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
-    outputs = Outputs.of(world)
-    plant = Plant(world, model)
-    world.node.destroy_publisher(plant.state)
-    best_effort = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-    plant.state = world.publisher(JointState, STATE, best_effort)
-    plant.subscribed().send(5)
-    outputs.topics["flags"].count(5)
-    world.node.destroy_publisher(plant.state)
-    lasting = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    plant.state = world.publisher(JointState, STATE, lasting)
-    diagnostics = world.diagnostics()
-    until(
-        lambda: (
-            (status := diagnostics.latest("envelope_monitor: monitor"))
-            and Diagnostics.values(status)[f"qos {STATE}"] == "reliable volatile"
-        ),
-        "a reliable subscription",
-    )
-    plant.subscribed().send(5)
-    outputs.topics["flags"].count(10)
-    time.sleep(0.3)
-    assert len(outputs.topics["flags"].messages) == 10
-
-
 def test_what_was_published_before_by_a_transient_local_publisher_is_heard(world: World, tmp_path: Path) -> None:
     model = by_hand()
     lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -783,13 +688,6 @@ def test_quality_of_service_that_cannot_be_had_is_told(world: World, tmp_path: P
     assert "best effort is offered, reliable asked" in status.message
     accepted, reason = world.set(**{"qos.reliability": "match"})
     assert not accepted
-
-
-def test_a_publisher_of_another_type_is_told(world: World, tmp_path: Path) -> None:
-    world.publisher(TwistStamped, STATE)
-    world.monitor(saved(by_hand(), tmp_path), diagnostics_period=0.1)
-    diagnostics = world.diagnostics()
-    diagnostics.reaches(STALE, saying=f"{STATE}: a publisher sends geometry_msgs/msg/TwistStamped")
 
 
 def test_bounds_are_predicted_only_while_somebody_listens(world: World, tmp_path: Path) -> None:

@@ -30,7 +30,6 @@ from hypothesis.extra import numpy as hnp
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.limits import LARGEST, LONGEST_S
-from uncertain_lti.model import file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.file import FORMATS
@@ -237,16 +236,6 @@ def test_a_free_run_follows_the_controls_and_begins_again_after_gaps() -> None:
         model.free_run(Transient(t, np.zeros((30, 3)), u))
 
 
-def test_a_transient_of_the_nominal_model_has_no_discrepancy() -> None:
-    model = leibov2006()
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=(101, 4))
-    x = model.simulate(np.zeros(5), u[:-1], 0.025)
-    transient = Transient(25_000_000 * np.arange(101), x, u)
-    total, largest = model.discrepancy(transient)
-    assert total < 1e-20 and (largest < 1e-12).all()
-
-
 def test_weights_of_another_shape_are_refused() -> None:
     transient = Transient([0.0, 1.0, 2.0], np.zeros((3, 2)), np.zeros((3, 1)))
     with pytest.raises(ModelError, match=r"W has shape \(3,\); it must be \(2,\), \(2, 2\) or \(2, 2, 2\)"):
@@ -398,17 +387,6 @@ def test_a_model_fitted_to_arrays_has_a_file_too(tmp_path: Path) -> None:
     assert (loaded.n, loaded.m, loaded.state_names) == (2, 0, ("x1", "x2"))
     assert loaded.bounds(np.ones(2), np.ones(0), 0.1)[0].shape == (2,)
     assert not loaded.domain.outside(np.full(2, 1e300), np.ones(0))
-
-
-def test_a_term_that_format_1_lacks_is_written_only_if_a_model_has_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A new row of the table of terms leaves the files of all other models as they are."""
-    model = leibov2006()
-    before = file.structure(model)
-    monkeypatch.setattr(file, "ARRAYS", (*file.ARRAYS, "r"))
-    monkeypatch.setattr(model, "r", np.zeros(model.n), raising=False)
-    assert file.structure(model) == before and before["format"] == FORMATS[0]
-    monkeypatch.setattr(model, "r", np.full(model.n, 0.5))
-    assert file.structure(model) == {**before, "format": FORMATS[1], "r": [0.5] * model.n}
 
 
 def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: Path) -> None:
@@ -621,17 +599,6 @@ def test_a_file_that_is_no_model_is_refused(content: bytes, words: str, tmp_path
     assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
 
 
-@pytest.mark.parametrize("name", ["A", "v", "states", "sampling", "domain", "alarm", "fit"])
-def test_nesting_ends_in_a_sentence(name: str, tmp_path: Path) -> None:
-    for depth in (50, 300, 480, 900, 3000):
-        text = json.dumps(put(name, "HERE")).replace('"HERE"', "[" * depth + "]" * depth)
-        path = tmp_path / "deep.model.json"
-        path.write_text(text)
-        with pytest.raises(ModelError) as caught:
-            UncertainLTI.load(path)
-        assert str(caught.value).startswith(str(path)) and len(str(caught.value)) < 500
-
-
 def test_a_file_that_is_not_there_or_far_too_large(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="there is no such model file; write one with `uncertain-lti fit`"):
         UncertainLTI.load(tmp_path / "none.model.json")
@@ -684,18 +651,6 @@ def test_a_damaged_file_is_a_model_or_an_error(tmp_path_factory: pytest.TempPath
     with np.errstate(all="ignore"):
         for one, other in zip(model.bounds([0.1, 0.2], [0.3], 0.1), again.bounds([0.1, 0.2], [0.3], 0.1), strict=True):
             assert bits(one) == bits(other)
-
-
-@given(st.integers(0, 2000), st.integers(0, 255))
-def test_a_flipped_byte_is_a_model_or_an_error(tmp_path_factory: pytest.TempPathFactory, at: int, value: int) -> None:
-    content = bytearray(json.dumps(base()).encode())
-    content[at % len(content)] = value
-    path = tmp_path_factory.getbasetemp() / "flipped.model.json"
-    path.write_bytes(content)
-    try:
-        UncertainLTI.load(path)
-    except UncertainLTIError as error:
-        assert str(error).startswith(str(path)) and len(str(error).splitlines()) == 1
 
 
 # --- writing is atomic ---------------------------------------------------------------------------------------

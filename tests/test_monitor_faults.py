@@ -27,7 +27,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import Layout, Message, Topic, write
+from bag_writer import Message, Topic, write
 from conftest import ROOT
 
 from uncertain_lti import UncertainLTI
@@ -65,7 +65,6 @@ from test_live import (
     Outputs,
     Plant,
     by_hand,
-    header_bag,
     joint_state,
     offline,
     run_of,
@@ -101,43 +100,6 @@ def ever(diagnostics: Diagnostics, level: int, saying: str) -> bool:
 
 
 # --- clocks, disorder and bad messages ----------------------------------------------------------------------
-
-
-def faulty_bag(model: UncertainLTI, path: Path, steps: int) -> Path:
-    """Stamps a year ahead on either topic, jumps forward and back, and messages filled oddly for a while."""
-    x, u = run_of(model, steps, 5)
-    messages: list[Message] = []
-    year = 365 * 86400 * 10**9
-    t, log = EPOCH_NS, EPOCH_NS
-    for k in range(steps):
-        state, control = joint_state(t, x[k]), vector(t, *u[k])
-        if k % 97 == 40:
-            state = joint_state(t + year, x[k])
-        elif k % 97 == 50:
-            control = vector(t + year, *u[k])
-        elif k % 97 in (60, 61):
-            state = joint_state(t, [np.inf, -np.inf])
-        elif k % 97 == 63:
-            state = joint_state(t, [1e308, x[k][1]])  # a sentinel: judged, and far outside
-        elif k % 97 in range(65, 70):
-            state = joint_state(t, [*x[k], 0.0], ("c", "b", "a"))
-        elif k % 97 in range(70, 75):
-            state = joint_state(t, x[k][:1])  # two names, one value
-        elif k % 97 == 76:
-            state = joint_state(t, np.zeros(20_000), tuple(f"n{i}" for i in range(20_000)))
-        elif k % 97 in range(78, 82):
-            state = joint_state(t, [], ())
-        elif k % 97 == 84:
-            state = joint_state(t, [*x[k], *x[k]], ("a", "b", "a", "b"))
-        messages += [Message(CONTROL, log, control), Message(STATE, log + 200_000, state)]
-        t += STEP_NS
-        log += STEP_NS
-        if k % 97 == 90:
-            t += 3600 * 10**9
-        elif k % 97 == 95:
-            t -= 2 * 3600 * 10**9
-    topics = [Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR)]
-    return write(topics, messages, Layout("zstd", chunk_size=1 << 16)).save(path)
 
 
 def orderly_bag(model: UncertainLTI, path: Path, steps: int) -> Path:
@@ -272,26 +234,6 @@ def test_missed_deadlines_are_told(world: World, tmp_path: Path) -> None:
 # --- processes that are killed ------------------------------------------------------------------------------
 
 
-def test_a_publisher_that_is_killed_and_comes_back_causes_no_wrong_verdict(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    path = saved(model, tmp_path)
-    bag = header_bag(model, tmp_path / "run.mcap", 150)
-    once = offline(path, bag)
-    world.monitor(path, diagnostics_period=0.1, state_timeout=0.3)
-    diagnostics = world.diagnostics()
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    player = world.command("play", bag)
-    flags.count(40)
-    player.kill()
-    diagnostics.reaches(STALE, saying=f"no message on {STATE} for")
-    time.sleep(0.3)
-    heard = len(flags.messages)
-    np.testing.assert_array_equal([m.position for m in flags.messages], [v.flags for v in once[:heard]])
-    world.command("play", bag).succeed()
-    again = flags.count(heard + len(once))[heard:]
-    np.testing.assert_array_equal([m.position for m in again], [v.flags for v in once])
-
-
 def test_a_monitor_that_is_killed_is_missed_and_resumes_without_a_wrong_verdict(world: World, tmp_path: Path) -> None:
     model = by_hand()
     path = saved(model, tmp_path)
@@ -372,7 +314,7 @@ sys.exit(envelope_monitor.main())
 @pytest.mark.slow
 def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
     """`benchmarks/live_monitor.py --soak 600 --armed` in short, slowly enough for a machine that is busy."""
-    soak = ("--soak", "20", "--soak-rate", "150", "--armed")
+    soak = ("--soak", "10", "--soak-rate", "150", "--armed")
     command = [sys.executable, str(ROOT / "benchmarks" / "live_monitor.py"), *soak]
     with own_domain() as domain:
         command += ["--domain", str(domain)]
@@ -892,21 +834,6 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     accepted = world.set(enable=f"{STATE} position[c] > 0", enable_type="")
     assert accepted == (True, f"parameter enable: {STATE} comes without a number in position[c]")
     assert world.set(enable=f"{STATE} position[b] > -9") == (True, "")
-
-
-def test_a_monitor_that_comes_back_and_hears_nothing_says_so_while_it_lasts(world: World, tmp_path: Path) -> None:
-    """After kill -9 the middleware may deliver nothing for a while: each time there are verdicts or a word on it."""
-    model = by_hand()
-    path = saved(model, tmp_path)
-    plant, diagnostics = Plant(world, model), world.diagnostics()
-    for _ in range(4):
-        process = world.monitor(path, diagnostics_period=0.1)
-        before, until_s = diagnostics.count, time.monotonic() + 8.0
-        while time.monotonic() < until_s and not world.status()["verdicts"]:
-            plant.send(20)
-        if not world.status()["verdicts"]:
-            diagnostics.reaches(STALE, saying="nothing", since=before)  # received in 5 s, or ever received
-        process.kill()
 
 
 def test_publishers_that_nothing_comes_from_are_told(world: World, tmp_path: Path) -> None:

@@ -406,8 +406,9 @@ def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
     assert re.fullmatch(r"\S+in.mcap: played \d+ messages of 1 topics in \S+ s, then interrupted\n", player.output)
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-@pytest.mark.parametrize("more", [[], ["--lockstep", "nobody"]], ids=["subscribers", "the node"])
+@pytest.mark.parametrize(
+    ("more", "number", "status"), [([], signal.SIGINT, 130), (["--lockstep", "nobody"], signal.SIGTERM, 143)]
+)
 def test_a_signal_ends_waiting_at_once(world: World, tmp_path: Path, more: list[str], number: int, status: int) -> None:
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 10**8))).save(tmp_path / "in.mcap")
     until = time.monotonic() + PATIENCE

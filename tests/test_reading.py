@@ -102,7 +102,7 @@ def same(transient: Transient, reference: Reference) -> None:
     assert +transient.counters == +reference.counters
 
 
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(cases() | cases(tame=True), st.sampled_from(["none", "lz4", "zstd"]))
 def test_recordings_become_what_the_rules_say(
     tmp_path_factory: pytest.TempPathFactory, case: tuple[SignalMap, list[Sent]], compression: str
@@ -142,14 +142,6 @@ def test_recordings_become_what_the_rules_say(
         same(transient, reference)
         assert transient.signals == signals
         assert transient.sources == (str(path),) and transient.name == str(path)
-        for word in unused(transient):
-            assert (
-                any(word.endswith(s) for s in ("missing", "gap", "reset"))
-                or "dropped (" in word
-                or "late " in word
-                or "stale " in word
-                or "invalid " in word
-            )
 
 
 # --- real recordings against a plain reader -------------------------------------------------------------------
@@ -186,20 +178,12 @@ READ: dict[str, tuple[str, str, Any, str, Any, float | None]] = {
 RECORDINGS = [
     ("go2/test_3.mcap", "go2_joint", 10449, 6, 6541),
     ("micro_gas_turbine/ex_1.mcap", "micro_gas_turbine", 9920, 1, 9919),
-    ("micro_gas_turbine/ex_20.mcap", "micro_gas_turbine", 6495, 2, 6493),
     ("micro_gas_turbine/ex_24.mcap", "micro_gas_turbine", 9023, 3, 9020),
     ("hunter_se/straight_even_t_0_2_run_01.mcap", "hunter_se", 2515, 1, 2514),
-    ("hunter_se/straight_even_t_0_2_run_02.mcap", "hunter_se", 2515, 1, 2514),
-    ("hunter_se/straight_odd_t_0_5_run_01.mcap", "hunter_se", 2513, 1, 2512),
-    ("hunter_se/straight_odd_t_0_5_run_02.mcap", "hunter_se", 2518, 1, 2517),
     ("neato/person_follower.mcap", "neato", 149, 1, 131),
-    ("neato/draw_square.mcap", "neato", 292, 1, 278),
     ("crazyflie/rollbag_0.mcap", "crazyflie_vicon", 2652, 1, 2645),
     ("crazyflie/yx3bag_0.mcap", "crazyflie_vicon", 363, 5, 355),
-    ("crazyflie/yx4bag_0.mcap", "crazyflie_vicon", 2359, 1, 275),
     ("crazyflie/rollbag_0.mcap", "crazyflie_estimate", 315, 5, 310),
-    ("crazyflie/yx3bag_0.mcap", "crazyflie_estimate", 112, 2, 109),
-    ("crazyflie/yx4bag_0.mcap", "crazyflie_estimate", 236, 1, 28),
 ]
 
 
@@ -262,44 +246,6 @@ def test_real_recordings_read_as_a_plain_reader_reads_them(
         np.testing.assert_array_equal(transient.u[k], expected, err_msg=f"u of sample {k}")
 
 
-def test_commands_that_have_ended_are_no_input(recordings: Path, signals_folder: Path) -> None:
-    """Go2: commands end at 13.1 s of 20.9 s; from 0.05 s later on no transition is usable."""
-    (transient,) = read_transients(recordings / "go2" / "test_3.mcap", signals_folder / "go2_joint.yaml")
-    came, _, _ = plain_read(recordings / "go2" / "test_3.mcap", "/go2/joint_command", lambda m: [0.0])
-    _, sent, _ = plain_read(recordings / "go2" / "test_3.mcap", "/go2/joint_command", lambda m: [0.0])
-    end = sent.max() + 50 * MS
-    assert not transient.usable[transient.t_ns[:-1] > end].any()
-    assert transient.usable[(transient.t_ns[:-1] > sent.min()) & (transient.t_ns[:-1] < sent.max())].mean() > 0.99
-    assert 7.0 < (transient.t_ns[-1] - end) * 1e-9 < 8.0
-    assert transient.counters["stale command"] == (transient.t_ns[:-1] > end).sum()
-
-
-def test_a_drop_out_of_vicon_is_a_gap_and_missing_commands_are_no_commands(
-    recordings: Path, signals_folder: Path
-) -> None:
-    (gone,) = read_transients(recordings / "crazyflie" / "yx3bag_0.mcap", signals_folder / "crazyflie_vicon.yaml")
-    assert gone.dt.max() > 0.8 and gone.counters["gaps"] == 4
-    (empty,) = read_transients(recordings / "crazyflie" / "yx4bag_0.mcap", signals_folder / "crazyflie_vicon.yaml")
-    assert empty.counters["missing roll_control"] == np.isnan(empty.u[:-1]).sum() > 2000
-    assert np.isfinite(empty.transitions().u).all()
-
-
-def test_an_underwater_vehicle_whose_clocks_are_days_apart(recordings: Path) -> None:
-    """Header stamps of the IMU are zero and those of the depth lie 515 220 s before log time; types are its own."""
-    signals = SignalMap(
-        (Signal("depth", "/coug2/depth_data", "pose.pose.position.z"),),
-        (Signal("fin", "/coug2/controls/command", "fin[0]"), Signal("yaw", "/coug2/modem_imu", "yaw(orientation)")),
-    )
-    path = recordings / "cougars_auv" / "SO_bag_0.mcap"
-    (transient,) = read_transients(path, signals)
-    assert transient.signals is not None
-    assert transient.signals.time["/coug2/depth_data"] == "header"
-    assert transient.signals.time["/coug2/modem_imu"] == "log"
-    assert np.isfinite(transient.u[1:-1]).mean() > 0.9, (
-        "a held value counts by arrival where stamps are of other clocks"
-    )
-
-
 # --- what a signals file leaves open --------------------------------------------------------------------------
 
 
@@ -334,15 +280,6 @@ def test_stamps_count_where_most_messages_have_one(tmp_path: Path, zero: int, so
     assert transient.counters["no stamp"] == (zero if source == "header" else 0)
     said = SignalMap((Signal("x", "/x", "position[0]"),), time={"/x": "log"})
     assert read_transients(path, said)[0].dt.tolist() == [3 * MS * 1e-9] * 9
-
-
-def test_the_resolved_map_has_types_numbers_and_sources(tmp_path: Path) -> None:
-    path = float_bag(tmp_path, "a.mcap", range(0, 1000 * MS, 100 * MS), range(0, 1000 * MS, 30 * MS))
-    (transient,) = read_transients(str(path), XU)
-    signals = transient.signals
-    assert signals is not None
-    assert (signals.clock, signals.max_gap, signals.time) == ("/x", pytest.approx(0.25), {"/x": "log", "/u": "log"})
-    assert {s.type for s in signals.signals} == {FLOAT64}
 
 
 def test_auto_is_resolved_once_over_all_recordings_and_told(tmp_path: Path) -> None:
@@ -520,39 +457,9 @@ def test_a_clock_that_stands_still_is_named(tmp_path: Path) -> None:
         read_transients(path, SignalMap((Signal("x", "/x", "data"),)))
 
 
-def test_header_time_without_any_stamp_is_named(tmp_path: Path) -> None:
-    path = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), range(0, 100 * MS, 10 * MS))
-    with pytest.raises(SignalError, match="topics: /u: time is header, and no message has a stamp; write log"):
-        read_transients(path, replace(XU, time={"/u": "header"}))
-
-
 def test_no_recording_is_an_error() -> None:
     with pytest.raises(BagError, match="no recording is named; give at least one"):
         read_transients([], XU)
-
-
-@pytest.mark.parametrize(
-    ("file", "words"),
-    [
-        ("odd/empty.mcap", "empty"),
-        ("odd/lfs_pointer.mcap", "Git LFS"),
-        ("odd/none.mcap", "no such"),
-        ("neato/db3", "there is no topic /x; topics there: "),
-        ("odd/talker.mcap", "there is no topic /x; topics there: "),
-    ],
-)
-def test_files_that_are_no_recording_of_this(recordings: Path, file: str, words: str) -> None:
-    with pytest.raises(BagError, match=f"(?i){words}") as caught:
-        read_transients(recordings / file, XU)
-    assert str(recordings / file) in str(caught.value) and "\n" not in str(caught.value)
-
-
-def test_a_truncated_recording_gives_what_is_there(recordings: Path, signals_folder: Path) -> None:
-    map_file = signals_folder / "crazyflie_vicon.yaml"
-    (cut,) = read_transients(recordings / "odd" / "rollbag_truncated.mcap", map_file)
-    (whole,) = read_transients(recordings / "crazyflie" / "rollbag_0.mcap", map_file)
-    assert 100 < len(cut) < len(whole) and cut.notes
-    assert cut.t_ns.tolist() == whole.t_ns[: len(cut)].tolist()
 
 
 # --- for a model ---------------------------------------------------------------------------------------------

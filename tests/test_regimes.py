@@ -31,7 +31,6 @@ from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import check_regimes, unknown_in_words
-from uncertain_lti.reports.figures import matrices_figure, save
 from uncertain_lti.reports.findings import CARE, UNKNOWN
 from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -228,17 +227,6 @@ def test_the_report_has_every_regime(case: str, tmp_path: Path, capsys: pytest.C
     assert {r["weight"] for r in reasons} <= {CARE, UNKNOWN}
 
 
-def test_layouts_notebooks_and_texts(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    model = model_of(case)
-    model.save(tmp_path / "m.json")
-    assert main(["layout", str(tmp_path / "m.json"), "--foxglove", str(tmp_path / "l.json")]) == 0
-    shown = model._repr_html_()
-    for r in range(len(model.blocks)):
-        assert model.block_name(r) in shown
-    assert f"{len(model.blocks)} blocks over" in repr(model)
-    assert "violations" in checked(model)._repr_html_()
-
-
 # --- facts -------------------------------------------------------------------------------------------------------
 
 
@@ -275,34 +263,4 @@ def test_what_the_file_says_of_its_blocks_may_be_anything() -> None:
 LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
 
 
-def sized(blocks: tuple[int, ...], n: int = 2, modes: bool = False) -> UncertainLTI:
-    rng = np.random.default_rng(sum(blocks))
-    axes = tuple(
-        Axis(f"{LONG}{k}", **{"modes" if modes else "knots": tuple(np.linspace(-1, 1, count))})
-        for k, count in enumerate(blocks)
-    )
-    R = math.prod(blocks)
-    signals = SignalMap(
-        tuple(Signal(f"{LONG}{i}", "", "x", unit="$kPa$") for i in range(n)), (Signal("push", "", "u"),)
-    )
-    return UncertainLTI(
-        rng.normal(size=(R, n, n)), rng.normal(size=(R, n, 1)), rng.random((R, n, n)), rng.random((R, n, 1)),
-        rng.normal(size=(R, n)), rng.random((R, n)), rng.random((R, n)), schedule=Schedule(axes), signals=signals,
-        block_data=[BlockData(r % 5 * 40, 0 if r == 1 else None) for r in range(R)],
-        fit_summary={"blocks": [{"mean_width": rng.random(n).tolist()} for _ in range(R)]},
-    )  # fmt: skip
-
-
 SIZES = [((1,), 2, True), ((200,), 3, False), ((40, 3), 9, False)]
-
-
-@pytest.mark.parametrize(("blocks", "n", "modes"), SIZES)
-def test_every_size_can_be_drawn(blocks: tuple[int, ...], n: int, modes: bool, tmp_path: Path) -> None:
-    figure = matrices_figure(sized(blocks, n, modes))
-    width, height = figure.get_size_inches()
-    assert width <= 16 and height <= 40
-    save(figure, tmp_path / "f.png", 50)
-    figure.canvas.draw()
-    for axis in figure.axes:  # nothing is cut off below or on the left
-        box = axis.get_tightbbox()
-        assert box.x0 >= -3 and box.y0 >= -3, (axis.get_title("left"), box)

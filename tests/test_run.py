@@ -245,11 +245,6 @@ def test_programs_run_in_the_folder_of_the_caller(elsewhere, tmp_path, program):
         assert elsewhere(program, *arguments) == [program, str(tmp_path / "some where"), *arguments]
 
 
-def test_python_runs_in_the_folder_of_the_caller(elsewhere, tmp_path):
-    (tmp_path / "some where" / "mine.py").write_text("import os; print(os.getcwd())")
-    assert elsewhere("python", "mine.py") == [str(tmp_path / "some where")]
-
-
 def test_programs_hear_this_machine_alone_unless_told_otherwise(elsewhere, tmp_path):
     names = "ROS_DOMAIN_ID", "ROS_AUTOMATIC_DISCOVERY_RANGE"
     (tmp_path / "some where" / "mine.py").write_text(f"import os; print(*map(os.getenv, {names}))")
@@ -257,10 +252,6 @@ def test_programs_hear_this_machine_alone_unless_told_otherwise(elsewhere, tmp_p
     assert 1 <= int(domain) <= 100 and reach == "LOCALHOST"
     robot = dict(zip(names, ("7", "SUBNET"), strict=True))
     assert elsewhere("python", "mine.py", **robot) == ["7 SUBNET"]
-
-
-def test_the_demo_writes_to_the_folder_of_the_caller(elsewhere, tmp_path):
-    assert elsewhere("demo", "--rate", "9") == ["uncertain-lti", str(tmp_path / "some where"), "demo", "--rate", "9"]
 
 
 @pytest.fixture

@@ -517,7 +517,7 @@ def loops(draw: st.DrawFn) -> tuple[SignalMap, list[Sent]]:
     return signals, first[: len(first) - overlap] + mixed + second[overlap:]
 
 
-@settings(max_examples=250)
+@settings(max_examples=150)
 @given(cases() | cases(tame=True) | loops())
 def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[Sent]]) -> None:
     """Samples, which message decided each of them, and counts; the last sample has what it knows of itself."""
@@ -563,7 +563,7 @@ def test_a_recording_that_does_not_fit_its_topics_is_refused() -> None:
             Sampler(two_topics()).push_all(topic, one, one, values)
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(loops())
 def test_each_pass_of_a_looped_bag_is_as_on_its_own(case: tuple[SignalMap, list[Sent]]) -> None:
     """However topics overtake each other where the passes meet; and nothing of a pass is late for the one before."""
@@ -577,7 +577,7 @@ def test_each_pass_of_a_looped_bag_is_as_on_its_own(case: tuple[SignalMap, list[
     assert steps[1:] == wanted[1:]
 
 
-@settings(max_examples=80)
+@settings(max_examples=50)
 @given(loops())
 def test_arrival_times_that_loop_do_as_stamps_that_loop(case: tuple[SignalMap, list[Sent]]) -> None:
     """A bag played anew with /clock to topics without stamps: the node's clock steps back as stamps would."""
@@ -696,26 +696,7 @@ def test_single_messages_of_another_time_leave_nothing_behind() -> None:
         assert len(sampler.kept("/u")) <= (4 if 550 <= k <= 552 else 2)
 
 
-def test_states_of_two_topics_are_judged_when_the_sample_closes() -> None:
-    signals = SignalMap(
-        (Signal("x", "/c", "data"), Signal("y", "/s", "data")),
-        clock="/c",
-        max_gap=0.05,
-        time={"/c": "header", "/s": "header"},
-    )
-    stream = [at("/c", 1, 1), at("/s", 1, 1, 2.0), at("/c", 2, 2), at("/s", 2, 2, 3.0), at("/c", 3, 3)]
-    decided, _ = run(signals, stream)
-    assert [len(d) for d in decided] == [0, 0, 1, 0, 1]
-    last = only(decided)[1]
-    assert (last.status, last.t_ns, last.x.tolist(), last.x_next.tolist()) == (
-        Status.OK,
-        2 * TICK,
-        [1.0, 2.0],
-        [1.0, 3.0],
-    )
-
-
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(cases())
 def test_latest_changes_nothing_and_is_what_would_be_fixed_now(case: tuple[SignalMap, list[Sent]]) -> None:
     signals, messages = case
@@ -773,7 +754,7 @@ def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older(
     assert sampler.counters["missing u"] == 1
 
 
-@settings(max_examples=150)
+@settings(max_examples=80)
 @given(case=cases() | cases(tame=True), room=st.integers(4, 8))
 def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap, list[Sent]], room: int) -> None:
     signals, messages = case
@@ -853,12 +834,6 @@ def test_resolve_takes_the_slowest_state_topic_and_two_and_a_half_of_its_median_
     assert resolved.time == {"/fast": "header", "/slow": "log", "/slower": "log"}
     said = replace(signals, clock="/fast", max_gap=7.0)
     assert resolve(said, instants, resolved.time) == replace(said, time=resolved.time)
-
-
-def test_a_clock_that_stands_still_is_an_error_that_names_it() -> None:
-    signals = SignalMap((Signal("x", "/c", "data"),))
-    with pytest.raises(SignalError, match="/c: 3 messages without a forward step in time"):
-        resolve(signals, {"/c": [np.array([5, 5, 4])]}, {"/c": "header"})
 
 
 @pytest.mark.parametrize("missing", ["clock", "max_gap", "time"])

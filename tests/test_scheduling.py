@@ -25,7 +25,6 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.cli.options import schedule as _schedule
 from uncertain_lti.identification import fitting
-from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.free_run import run_over
 from uncertain_lti.proposal.scheduling import EXCESS_FOR_MUCH, Candidate, best_of, choose_knots, decide
 from uncertain_lti.proposal.search import EXCESS
@@ -157,17 +156,6 @@ def test_groups_are_left_out_together():
     assert facts["units"] == 3 and facts["left_out"] == "group"
     with pytest.raises(FitError, match="nothing out"):
         fit(RUNS, groups=list("aabbcc"))
-
-
-def test_knots_on_one_signal_beside_modes_of_another():
-    rng = np.random.default_rng(1)
-    runs = []
-    for one in RUNS:
-        gear = np.repeat(rng.choice([1.0, 2.0], len(one) // 50 + 1), 50)[: len(one), None]
-        runs.append(one.replace(s=gear, scheduling_names=["gear"]))
-    model = fit(runs, schedule={"gear": Modes([1, 2]), "x1": "auto"}, **options())
-    assert [axis.signal for axis in model.schedule.axes] in (["gear"], ["x1", "gear"], ["gear", "x1"])
-    assert model.fit_summary["schedule"][0]["candidates"][0]["knots"] == 1
 
 
 def with_further(transients):

@@ -18,7 +18,6 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.fleet import likelier_alone
-from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, some_beyond
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon, Residuals
@@ -342,11 +341,6 @@ def test_rules_of_a_monitor_take_the_place_of_the_models() -> None:
     only = EnvelopeMonitor(given, rules=RULES[1:2])
     assert only.rule == AlarmRule() and only.alarms.rules == RULES[1:2], "flags need a margin and arm nothing"
     assert EnvelopeMonitor(given, 2, 3, rules=RULES[1:2]).alarms.rules == (AlarmRule(2, 3), RULES[1])
-
-
-def test_kinds_are_numbered_in_the_order_of_the_rules() -> None:
-    for number, name in enumerate(KINDS):
-        assert getattr(arithmetic, name.upper()) == number
 
 
 @pytest.mark.parametrize("relative", [True, False])

@@ -117,18 +117,6 @@ def test_parquet_and_feather(shipped, names, tmp_path):
             open_recording(tmp_path / f"run{suffix}")
 
 
-def test_without_pyarrow_the_sentence_names_the_command(tmp_path, monkeypatch):
-    import sys
-
-    for name in list(sys.modules):
-        if name.partition(".")[0] == "pyarrow":
-            monkeypatch.delitem(sys.modules, name)
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    (tmp_path / "a.parquet").write_bytes(b"PAR1")
-    with pytest.raises(BagError, match=r"package pyarrow is not installed; in the checkout: pip install '.\[tables\]"):
-        open_recording(tmp_path / "a.parquet")
-
-
 def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
     path, model, signals = str(tables[".csv"]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
     assert main(["topics", path]) == 0
@@ -145,22 +133,6 @@ def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
     assert "a table, and only ROS recordings are copied; leave out --write" in capsys.readouterr().err
     (expected,) = UncertainLTI.load(model).fit_summary["sources"]
     assert expected["file"] == path and len(expected["sha256"]) == 64
-
-
-def test_the_model_of_a_table_is_that_of_the_bag(tables, shipped, names, tmp_path):
-    signals = tmp_path / "s.yaml"
-    text = signals_of(names, len(shipped.signals.states))
-    for s in shipped.signals:
-        points = f"steady: {s.steady!r}, scale: {s.scale!r}"
-        text = text.replace(f"field: {s.name}, steady: auto, scale: auto", f"field: {s.name}, {points}")
-    signals.write_text(text)
-    ours, theirs = tmp_path / "a.model.json", tmp_path / "b.model.json"
-    assert main(["fit", str(tables[".csv"]), "--signals", str(signals), "--output", str(ours), "-q"]) == 0
-    of_bag = ["fit", str(SHIPPED), "--signals", str(SIGNALS), "--additive", "noise", "--output", str(theirs), "-q"]
-    assert main(of_bag) == 0
-    one, two = UncertainLTI.load(ours), UncertainLTI.load(theirs)
-    for name in ("A", "dA", "B", "dB", "v"):
-        assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
 # --- what CSV files look like ---------------------------------------------------------------------------------
@@ -297,21 +269,8 @@ def test_runs_in_one_file_are_recordings(many, tmp_path, capsys):
     assert "(3 recordings)" in capsys.readouterr().out
     assert main(["validate", str(model), "--group", r"name=\[(\d)\]"]) == 0
     cached = tmp_path / "c.model.json"
-    assert (
-        main(
-            [
-                "fit",
-                str(many),
-                "--signals",
-                str(tmp_path / "s.yaml"),
-                "--output",
-                str(cached),
-                "--cache",
-                str(tmp_path / "cache"),
-            ]
-        )
-        == 0
-    )
+    words = ["--signals", str(tmp_path / "s.yaml"), "--output", str(cached), "--cache", str(tmp_path / "cache")]
+    assert main(["fit", str(many), *words]) == 0
     np.testing.assert_allclose(UncertainLTI.load(cached).A, loaded.A, rtol=1e-6)
     with pytest.raises(BagError, match=r"there is no run '9' in .*; there are 3, 1, 2"):
         open_recording(f"{many}[9]", layout=TableLayout("clock", "ms", "trial"))
@@ -401,7 +360,7 @@ def test_damage_anywhere_is_read_or_a_sentence(tables, kind, tmp_path):
     data = tables[kind].read_bytes()
     path = tmp_path / f"hurt{kind}"
     rng = random.Random(3)
-    for _ in range(10):
+    for _ in range(3 if kind == ".mat" else 10):  # which another process reads
         hurt = bytearray(data)
         where = rng.randrange(len(hurt)) if rng.random() < 0.5 else rng.randrange(2000)
         hurt[where : where + rng.choice([1, 4, 100])] = rng.randbytes(rng.choice([1, 4, 100]))
@@ -545,7 +504,7 @@ def test_a_mat_file_that_breaks_its_reader_down_is_a_sentence(tables, tmp_path):
     data = tables[".mat"].read_bytes()
     rng = random.Random(1)
     path = tmp_path / "a.mat"
-    for _ in range(12):
+    for _ in range(4):
         hurt = bytearray(data)
         hurt[128 + rng.randrange(64)] ^= 1 << rng.randrange(8)
         path.write_bytes(hurt)

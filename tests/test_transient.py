@@ -417,19 +417,3 @@ def test_a_csv_file_that_is_not_there(tmp_path: Path) -> None:
 def test_equal_columns_of_one_name_are_one_also_where_cells_are_empty(tmp_path: Path) -> None:
     transient = read(tmp_path, "t,x,u,x\n0,1,2,1\n1,,3,\n2,4,5,4\n")
     np.testing.assert_array_equal(transient.x, [[1.0], [NAN], [4.0]])
-
-
-@pytest.mark.parametrize("file", ["RLC_data_id_lin.csv", "RLC_data_train_lin.csv"])
-def test_the_recorded_circuit_is_the_circuit(recordings: Path, file: str) -> None:
-    """V_C stands twice in the file; at 0.5 µs the samples obey the known equations of the circuit."""
-    transient = Transient.from_csv(recordings / "rlc" / file, time="time", states=["V_C", "I_L"], controls=["V_IN"])
-    assert len(transient) == 10_000 and transient.segments == 1
-    assert set(transient.dt.tolist()) == {500 * 1e-9}
-    assert transient.usable.all()
-    R, C, L = 3.0, 270e-9, 50e-6
-    V_C, I_L, V_IN = transient.x[:, 0], transient.x[:, 1], transient.u[:, 0]
-    slope = np.diff(V_C) / transient.dt
-    assert np.corrcoef(slope, (I_L[1:] + I_L[:-1]) / 2 / C)[0, 1] > 0.999
-    slope = np.diff(I_L) / transient.dt
-    middle = (V_IN - V_C - R * I_L)[:-1] / 2 + (V_IN[:-1] - V_C[1:] - R * I_L[1:]) / 2
-    assert np.corrcoef(slope, middle / L)[0, 1] > 0.99

@@ -16,13 +16,13 @@ import pytest
 
 pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
 
-from turbofan_fleet import lever_moves, simulate_fleet
+from turbofan_fleet import simulate_fleet
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
 from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
-from uncertain_lti.plants.turbofan_gas import P_STANDARD, T_STANDARD
+from uncertain_lti.plants.turbofan_gas import T_STANDARD
 from uncertain_lti.plants.turbofan_runs import (
     DT,
     KINDS,
@@ -117,17 +117,6 @@ def test_maximum_regime_is_an_engine_of_its_class():
     assert 0.68 < p.specific_consumption < 0.79
 
 
-def test_less_lever_means_less_of_everything_down_to_idle():
-    trims = [trim(pla) for pla in LEVERS]
-    for quantity in ("thrust", "W2", "P3", "T3", "T4", "T5", "fuel", "P13"):
-        values = [getattr(t.path, quantity) for t in trims]
-        assert all(a > b for a, b in zip(values, values[1:], strict=False)), quantity
-    for t in trims:
-        assert t.path.T3 > t.path.T13 > T_STANDARD
-        assert t.path.T4 > t.path.T5 > t.path.T6
-        assert t.path.P3 > t.path.P13 > t.path.P6 > P_STANDARD
-
-
 @pytest.mark.parametrize("pla", [68.0, 60.0])
 def test_controls_act_as_they_do_on_an_engine(plant, pla):
     point, t = operating_point(), trim(pla)
@@ -195,19 +184,6 @@ def test_limits_hold(plant, accelerated):
     assert accelerated.x[:, 1].max() < 1.002 * Controller.COMPRESSOR_LIMIT * plant.design.compressor_speed
 
 
-def test_a_worn_engine_is_held_at_its_temperature_limit(monkeypatch):
-    """Where the maximum's fan speed would cost more, the turbine's temperature is what holds the fuel."""
-    lever, fault = ((0.0, 68.0),), Fault("compressor_wear", 0.0)
-    free = simulate(Run(601, lever=lever, fault=fault))
-    monkeypatch.setattr(Controller, "TEMPERATURE_LIMIT", 1.005)
-    held = simulate(Run(601, lever=lever, fault=fault))
-    point = operating_point()
-    assert free.x[-1, 4] > 1.01 * point.X[4]
-    assert held.x[:, 4].max() < 1.01 * point.X[4]
-    assert held.x[-1, 4] == pytest.approx(1.005 * point.X[4], rel=1e-3)
-    assert held.x[-1, 0] < free.x[-1, 0]
-
-
 # --- runs ---------------------------------------------------------------------------------------------------
 
 
@@ -237,35 +213,6 @@ def test_pulses_start_from_the_steady_state_of_the_lever():
     assert run.u[75:] - begin.u == pytest.approx(0.1 * point.U * [1, 0, 0, 0] * np.ones((65, 1)), abs=1e-12)
 
 
-def test_the_lever_ramps_between_its_corners_and_jumps_where_two_are_at_one_instant(monkeypatch):
-    asked = []
-    step = Controller.step
-    monkeypatch.setattr(Controller, "step", lambda self, pla, x: asked.append(pla) or step(self, pla, x))
-    simulate(Run(81, lever=((0.0, 66.0), (0.5, 66.0), (1.0, 62.0), (1.5, 62.0), (1.5, 68.0)), ramps=True))
-    corners = [[0.0, 0.5, 1.0, 1.5 - 1e-6, 1.5], [66.0, 66.0, 62.0, 62.0, 68.0]]
-    assert asked == pytest.approx(np.interp(np.arange(81) * DT, *corners), abs=1e-9)
-
-
-def test_moves_of_the_lever_at_random_reach_the_ends_and_keep_the_rates():
-    seeds = [lever_moves(60.0, seed, rate=(2.0, 3.0)) for seed in range(40)]
-    assert seeds[0] == lever_moves(60.0, 0, rate=(2.0, 3.0)) != seeds[1]
-    angles = np.array([pla for corners in seeds for _, pla in corners])
-    assert angles.min() == 60.0 and angles.max() == 68.0
-    assert 0.1 < (angles == 60.0).mean() < 0.3 and 0.1 < (angles == 68.0).mean() < 0.3
-    jumps = 0
-    for corners in seeds:
-        t, pla = np.array(corners).T
-        assert t[0] == 0.0 and (np.diff(t) >= 0.0).all() and t[-1] < 66.0
-        moves, taken = np.diff(pla)[1::2], np.diff(t)[1::2]
-        assert not np.diff(pla)[::2].any()  # it rests between two moves
-        ramps = taken > 0
-        rate = np.abs(moves[ramps]) / taken[ramps]
-        assert ((rate > 1.999) & (rate < 3.001)).all()
-        jumps += np.count_nonzero(~ramps & (moves != 0))
-    assert jumps / sum(len(corners) // 2 for corners in seeds) == pytest.approx(0.5, abs=0.15)
-    assert all(not np.diff([t for t, _ in lever_moves(60.0, s, jumps=1.0)])[1::2].any() for s in range(5))
-
-
 def test_a_run_is_the_same_every_time_and_noise_is_what_was_asked_for():
     quiet = simulate(make_run("levels", samples=201))
     runs = [simulate(make_run("levels", noise=1e-3, seed=seed, samples=201)) for seed in (5, 5, 6)]
@@ -287,16 +234,6 @@ def test_a_fault_shows_from_its_onset_and_not_before(kind):
     assert last > 1e-4
     if kind in ("sensor_bias", "fan_damage"):  # sudden: at the very sample
         assert np.abs((faulty.x[onset] - healthy.x[onset]) / operating_point().X).max() > 1e-5
-
-
-@pytest.mark.parametrize("kind", ["fan_damage", "compressor_wear", "sensor_bias", "sensor_drift"])
-def test_a_fault_of_twice_the_size_moves_the_readings_twice_as_far(kind):
-    def moved(size: float) -> np.ndarray:
-        return (simulate(Run(21, fault=Fault(kind, 0.1, size))).x - operating_point().x_s) / operating_point().X
-
-    single, double = moved(1.0), moved(2.0)
-    assert np.abs(single).max() > 1e-6
-    assert double == pytest.approx(2.0 * single, rel=0.1, abs=0.02 * float(np.abs(single).max()))
 
 
 def test_many_runs_at_once_are_the_runs_one_by_one():
@@ -358,9 +295,7 @@ def test_the_signals_file_says_what_the_plant_is():
     assert (read.clock, read.max_gap, dict(read.time)) == (made.clock, made.max_gap, dict(made.time))
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in RECORDINGS if n in ("turbofan_check", "turbofan_pulses_up", "turbofan_fan_damage")]
-)
+@pytest.mark.parametrize("name", ["turbofan_check", "turbofan_pulses_up"])
 def test_a_recording_holds_what_a_simulation_gives(name):
     """Read from the bag that two processes made, beside the same run made here: stamps, readings and commands."""
     (bag,) = read_transients(ROOT / "bags" / f"{name}.mcap", ROOT / "config/signals/turbofan.yaml")
@@ -393,26 +328,19 @@ def test_every_recording_is_shipped_and_says_what_happens_in_it():
 
 
 @pytest.mark.slow
-def test_recording_anew_gives_identical_payloads(tmp_path):
-    """Node and recorder, two processes, twice: byte for byte the same messages on every topic."""
+def test_what_node_and_recorder_write_is_the_simulation(tmp_path):
+    """Two processes: bit for bit the same stamps and readings."""
     pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
     from ros_processes import open_world
 
-    parameters = {"manoeuvre": "check", "noise": 1e-4, "seed": 9, "rate": 4.0}
-    payloads = []
-    for number in (1, 2):
-        folder = tmp_path / str(number)
-        folder.mkdir()
-        with open_world(folder) as world:
-            bag = folder / "run.mcap"
-            recorder = world.command("record", "/engine/state", "/engine/control", "--output", bag)
-            world.run_node("turbofan", parameters).succeed()
-            recorder.signal(2)
-            recorder.succeed()
-        payloads.append({t: [m.data for m in Bag(bag).raw_messages([t])] for t in ("/engine/state", "/engine/control")})
-    assert payloads[0] == payloads[1]
-    assert [len(p) for p in payloads[0].values()] == [101, 101]
+    bag = tmp_path / "run.mcap"
+    with open_world(tmp_path) as world:
+        recorder = world.command("record", "/engine/state", "/engine/control", "--output", bag)
+        world.run_node("turbofan", {"manoeuvre": "check", "noise": 1e-4, "seed": 9, "rate": 4.0}).succeed()
+        recorder.signal(2)
+        recorder.succeed()
     (read,) = read_transients(bag, ROOT / "config/signals/turbofan.yaml")
     made = simulate(make_run("check", noise=1e-4, seed=9))
-    assert np.array_equal(read.x, made.x) and np.array_equal(read.t_ns, made.t_ns)
+    assert len(read) == 101 and np.array_equal(read.x, made.x) and np.array_equal(read.t_ns, made.t_ns)
+    assert np.array_equal(read.u[:-1], made.u[:-1])
     assert list(read.state_names) == list(STATES)
