@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import math
 import signal
 import time
 from collections.abc import Iterator
@@ -28,7 +27,6 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.horizon import Horizon
-from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.reason import over_recording
@@ -324,75 +322,6 @@ def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp
     outputs = Outputs.of(world)
     world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed()
     outputs.hold_against(verdicts, ("a",))
-
-
-def scheduled_by_hand() -> UncertainLTI:
-    """`by_hand` over three knots of a state and the modes of a further topic; block 0 was never visited."""
-    one = by_hand(alarm_rule=AlarmRule(2, 5))
-    gear = Signal("gear", "/gear", "data", type="std_msgs/msg/Float64", max_hold=0.3)
-    signals = replace(one.signals, scheduling=(gear,), time={**one.signals.time, "/gear": "log"})
-    schedule = Schedule((Axis("a", knots=(-0.02, 0.0, 0.03)), Axis("gear", modes=(1.0, 2.0))))
-    rng = np.random.default_rng(8)
-    arrays = {
-        name: np.stack([getattr(one, name) * rng.uniform(0.5, 1.0) for _ in range(schedule.blocks)]) for name in ARRAYS
-    }
-    return UncertainLTI(
-        **arrays,
-        schedule=schedule,
-        block_data=[BlockData(r) for r in range(schedule.blocks)],
-        signals=signals,
-        sampling=one.sampling,
-        alarm_rule=one.alarm_rule,
-    )
-
-
-def test_a_scheduled_model_gives_live_what_it_gives_offline(world: World, tmp_path: Path) -> None:
-    model = scheduled_by_hand()
-    path = saved(model, tmp_path)
-    plain = header_bag(by_hand(), tmp_path / "plain.mcap", 500)
-    messages = [Message(m.topic, m.log_time_ns, m.data) for m in Bag(plain).raw_messages((STATE, CONTROL))]
-    first = messages[0].log_time
-    gears = [1.0, 2.0, 1.0, 3.0, 2.0, math.nan, 1.0]  # the model lists no third one, and NaN is none
-    for k, gear in enumerate(gears * 4):
-        messages.append(Message("/gear", first + k * 17 * STEP_NS + 1, float64(gear)))
-    messages.sort(key=lambda m: m.log_time)
-    topics = [Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR), Topic("/gear")]
-    bag = write(topics, messages).save(tmp_path / "run.mcap")
-    verdicts = offline(path, bag)
-    assert {v.status for v in verdicts} >= {Status.OK, Status.MODE, Status.MISSING}
-    assert 10 < sum(v.unknown_regime for v in verdicts) < sum(v.judged for v in verdicts) - 10
-    checked = EnvelopeMonitor(model).check(read_as_fitted(bag, UncertainLTI.load(path).signals))
-    assert bits(checked.lower[checked.judged]) == bits([v.lower for v in verdicts if v.judged])
-    folder = tmp_path / "snapshots"
-    world.monitor(path, **{"use_sim_time": True, "snapshot.folder": str(folder), "snapshot.seconds": 600.0})
-    outputs = Outputs.of(world)
-    diagnostics = Diagnostics(world)
-    world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed()
-    outputs.hold_against(verdicts, ("a", "b"))
-    answer = world.call(Trigger, "/envelope_monitor/snapshot", Trigger.Request())
-    assert answer.success, answer.message
-    (snapshot,) = until(lambda: list(folder.glob("*.mcap")), "the snapshot")
-    again = offline(path, snapshot)
-    assert [v.status for v in again] == [v.status for v in verdicts]
-    assert [v.unknown_regime for v in again] == [v.unknown_regime for v in verdicts]
-    assert [bits(v.lower) for v in again if v.judged] == [bits(v.lower) for v in verdicts if v.judged]
-    texts = " ".join(status.message for message in diagnostics.topic.messages for status in message.status)
-    assert "regime not fitted" in texts and "gear = 3 is not among the modes of the model, 1, 2" in texts
-
-
-def test_a_looped_bag_starts_anew_and_gives_the_same_again(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    path = saved(model, tmp_path)
-    bag = header_bag(model, tmp_path / "run.mcap", 150)
-    once = offline(path, bag)
-    world.monitor(path)
-    outputs = Outputs.of(world)
-    for _ in range(2):
-        world.command("play", bag, "--rate", 3).succeed()
-    flags = outputs.topics["flags"].count(2 * len(once))
-    again = [m.position for m in flags[len(once) :]]
-    np.testing.assert_array_equal(again, [v.flags for v in once])
-    assert world.status()["counters"]["resets"] == 1
 
 
 # --- behaviour ----------------------------------------------------------------------------------------------

@@ -326,50 +326,6 @@ def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
 # --- the alarm ----------------------------------------------------------------------------------------------
 
 
-def test_masks_grace_latch_and_reset(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, masked="b", latch=True, state_timeout=60.0)
-    diagnostics = world.diagnostics()
-    outputs = Outputs.of(world)
-    flags, violation = outputs.topics["flags"], outputs.topics["violation"]
-    plant = Plant(world, model).subscribed()
-    only_b = np.array([0.0, 2.0])
-    plant.send(1)
-    plant.send(3, off=only_b)  # type: ignore[arg-type]
-    plant.send(1)
-    assert [list(m.position) for m in flags.count(5)[1:]] == [[0, 0], [0, 1], [0, 1], [0, 1]]
-    assert not any(m.data for m in violation.messages)
-    status = diagnostics.reaches(OK, saying="masked: b")
-    assert diagnostics.latest("envelope_monitor: b").message.endswith("(masked)")
-    plant.send(1, off=2.0)
-    plant.send(5)
-    until(lambda: violation.messages[-1].data, "the alarm")
-    flags.count(11)
-    time.sleep(0.3)
-    assert [m.position[0] for m in flags.messages[-4:]] == [0, 0, 0, 0] and violation.messages[-1].data, "not latched"
-    status = diagnostics.reaches(ERROR, saying="latched until ~/reset")
-    assert Diagnostics.values(status)["latched"] == "1"
-    success, message = trigger(world, "reset")
-    assert success and message == "the alarm is reset"
-    until(lambda: not violation.messages[-1].data, "the end of the alarm")
-    plant.send(3)
-    diagnostics.reaches(OK)
-    assert trigger(world, "reset")[0]
-
-    for wrong, why in (("c", "masked state 'c' is not in the model"), ("a, b", "every state of the model is masked")):
-        accepted, reason = world.set(masked=wrong)
-        assert not accepted and why in reason
-    heard = len(flags.messages)
-    assert world.set(masked="", latch=False, grace=20 * STEP_NS * 1e-9) == (True, "")
-    before = len(violation.messages)
-    plant.send(15, off=2.0)
-    flags.count(heard + 15)
-    assert not any(m.data for m in violation.messages[before:]), "an alarm within the grace"
-    plant.send(10, off=2.0)
-    until(lambda: violation.messages[-1].data, "an alarm after the grace")
-    assert all(m.position[0] == 1.0 for m in flags.count(heard + 25)[heard + 1 :])
-
-
 def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Path) -> None:
     model = by_hand()
     world.monitor(saved(model, tmp_path), diagnostics_period=0.1, enable="/machine/mode data == 3", state_timeout=60.0)
@@ -653,33 +609,6 @@ def test_what_still_waits_at_the_end_is_judged(world: World, tmp_path: Path) -> 
     process.signal(signal.SIGINT)
     process.succeed()
     assert len(flags.count(20)) == 20
-
-
-def test_an_alarm_takes_a_snapshot_when_asked_to(world: World, tmp_path: Path) -> None:
-    folder = tmp_path / "deep" / "snapshots"
-    model = by_hand()
-    options: dict[str, Any] = {"snapshot.folder": str(folder), "snapshot.on_alarm": True, "snapshot.after": 2.0}
-    path = saved(model, tmp_path)
-    process = world.monitor(path, **options)
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
-    plant.send(10)
-    plant.send(1, off=2.0)
-    plant.send(10)
-    flags.count(21)
-    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file")
-    verdicts = offline(path, found)
-    assert sum(bool((v.flags == 1.0).any()) for v in verdicts) == 1
-    assert len(verdicts) > 13, "what came after the alarm is there as well"
-    until(lambda: world.status()["snapshot"] == str(found), "the status")
-    folder.chmod(0o500)
-    try:
-        if os.geteuid():
-            success, reason = trigger(world, "snapshot")
-            assert not success and "Permission denied" in reason
-    finally:
-        folder.chmod(0o700)
-    assert process.running
 
 
 def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(world: World, tmp_path: Path) -> None:

@@ -468,18 +468,6 @@ def test_lockstep_asks_again_where_an_answer_is_lost(world: World, tmp_path: Pat
     assert received[0] == 5 and answers[0] > 5 and not held
 
 
-def test_quiet_says_nothing_but_errors(world: World, tmp_path: Path) -> None:
-    output = tmp_path / "out.mcap"
-    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 2 * 10**9, 10**8))).save(tmp_path / "in.mcap")
-    process = world.command("record", "/x", "--output", output, "--duration", "1", "--quiet")
-    player = world.command("play", bag, "--quiet")
-    said = (player.succeed() + process.succeed()).splitlines()
-    assert not [line for line in said if "[RTPS_" not in re.sub("\x1b.*?m", "", line)]  # nor Fast DDS of its ports
-    assert Bag(output).topics["/x"].count > 5
-    again = world.command("record", "/x", "--output", output, "--quiet")
-    assert again.wait() != 0 and "is there already" in again.output
-
-
 def test_json_is_all_that_is_printed_where_it_is_asked_for(world: World, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 2 * 10**9, 10**8))).save(tmp_path / "in.mcap")

@@ -24,14 +24,10 @@ from uncertain_lti.sampling.reading import read_as_fitted
 RECORDINGS = [  # recordings, signals file, additive term that its noise asks for, are pure intervals infeasible
     (("go2/test_3.mcap",), "go2_joint.yaml", "both", True),
     (("micro_gas_turbine/ex_1.mcap", "micro_gas_turbine/ex_20.mcap"), "micro_gas_turbine.yaml", "both", True),
-    (("micro_gas_turbine/ex_24.mcap",), "micro_gas_turbine.yaml", "noise", None),
     (("hunter_se/straight_odd_t_0_5_run_01.mcap",), "hunter_se.yaml", "disturbance", True),
     (("neato/person_follower.mcap",), "neato.yaml", "both", True),
-    (("neato/draw_square.mcap",), "neato.yaml", "noise", True),
     (("crazyflie/rollbag_0.mcap",), "crazyflie_vicon.yaml", "noise", False),
     (("crazyflie/rollbag_0.mcap",), "crazyflie_estimate.yaml", "noise", False),
-    (("crazyflie/yx3bag_0.mcap",), "crazyflie_vicon.yaml", "disturbance", False),
-    (("crazyflie/yx4bag_0.mcap",), "crazyflie_estimate.yaml", "noise", False),
 ]
 
 
@@ -59,17 +55,15 @@ def test_fit_contains_and_is_not_absurd(recordings, signals_folder, bags, signal
     wide = model.fit_summary["mean_width_recorded"] > 0.5 * span  # an envelope as wide as the range tells nothing
     said = " ".join(m for m in model.fit_summary["messages"] if "as wide as the state's own range" in m)
     assert [f"'{name}' (" in said for name in model.state_names] == wide.tolist()
-    if infeasible is not None:
-        try:
-            pure = fit(transients, criterion, additive="none")
-        except FitError as error:
-            assert infeasible and "--additive noise" in str(error)
-        else:
-            assert not infeasible
-            assert outside(pure, transients) == 0
+    try:
+        pure = fit(transients, criterion, additive="none")
+    except FitError as error:
+        assert infeasible and "--additive noise" in str(error)
+    else:
+        assert not infeasible and outside(pure, transients) == 0
 
 
-@pytest.mark.parametrize("joint", range(12))
+@pytest.mark.parametrize("joint", [0, 4, 11])
 def test_go2_fit_on_every_other_second_holds_on_the_others(recordings, signals_folder, joint, tmp_path):
     """Coverage beside width on samples that were not fitted, for every joint."""
     text = (signals_folder / "go2_joint.yaml").read_text().replace("[j0]", f"[j{joint}]")
@@ -130,20 +124,6 @@ def test_other_run_of_the_same_machine(recordings, signals_folder):
     assert same.outside_domain.sum() < 0.01 * same.judged.sum()
     cruising = EnvelopeMonitor(model).check(read_as_fitted(runs["even_t_0_2_run_01"], model.signals))
     assert cruising.judged.sum() > 2000
-
-
-def test_steering_that_never_moves_is_named(recordings, signals_folder, tmp_path):
-    text = (signals_folder / "hunter_se.yaml").read_text()
-    text = text.replace(
-        "\ncontrols:", "\n  - {name: yaw_rate, topic: /hunter/twist, field: twist.angular.z}\ncontrols:"
-    )
-    (tmp_path / "s.yaml").write_text(text + "  - {name: steering, topic: /hunter/cmd, field: vector.y}\n")
-    transients = read_transients(recordings / "hunter_se/straight_odd_t_0_5_run_01.mcap", tmp_path / "s.yaml")
-    steering = transients[0].transitions().u[:, 1]
-    model = fit(transients, additive="disturbance")
-    assert outside(model, transients) == 0
-    if np.ptp(steering) == 0:
-        assert any("'steering'" in message for message in model.fit_summary["messages"])
 
 
 def test_gas_turbine_recordings_differ_and_the_check_says_so(recordings, signals_folder, tmp_path):
