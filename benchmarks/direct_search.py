@@ -36,7 +36,7 @@ from scipy.optimize import golden
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.tables import table
+from uncertain_lti.base.text import table
 from uncertain_lti.identification import fit
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI

@@ -512,7 +512,7 @@ LIMITS = (
 
 
 def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, left: float) -> None:
-    from uncertain_lti.base.tables import table
+    from uncertain_lti.base.text import table
 
     rows, held = [], []
     for n in sizes:
@@ -566,7 +566,7 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
 
 def compare_versions(before: str, rates: list[float], sizes: list[int], seconds: float, repeats: int) -> None:
     """CPU per sample of this checkout's monitor over that of another one, turn by turn."""
-    from uncertain_lti.base.tables import table
+    from uncertain_lti.base.text import table
 
     rows = []
     for n in sizes:

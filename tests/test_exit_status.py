@@ -22,8 +22,8 @@ from bag_writer import Message, Topic, cdr, header, write
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError, absent
+from uncertain_lti.base.text import printable
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
@@ -97,7 +97,7 @@ def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package
         assert package not in ("lz4", "mcap")
 
 
-@pytest.mark.parametrize("module", ["uncertain_lti.base.english", "uncertain_lti.cli.judge", "argparse"])
+@pytest.mark.parametrize("module", ["uncertain_lti.base.text", "uncertain_lti.cli.judge", "argparse"])
 def test_a_damaged_installation_is_no_alarm(module):
     start = "from uncertain_lti.cli.program import main"
     broken = f"import sys; {start}; sys.modules[{module!r}] = None; sys.exit(main())"

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from test_pages import by_hand
 
 from uncertain_lti import EnvelopeMonitor, Transient
-from uncertain_lti.base.tables import beyond
+from uncertain_lti.base.text import beyond
 from uncertain_lti.identification import fit
 from uncertain_lti.reports.check import APART
 from uncertain_lti.reports.findings import CARE, NO, YES, findings, findings_text

@@ -21,8 +21,8 @@ from test_event_log import Rig
 from test_live import CONTROL, STATE, joint_state, vector
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
+from uncertain_lti.base.arrays import LARGEST
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule

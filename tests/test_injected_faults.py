@@ -19,7 +19,7 @@ from tanks import Tanks
 
 from uncertain_lti import Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.tables import text_of
+from uncertain_lti.base.text import text_of
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients, validate
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.base.html_table import MOST
+from uncertain_lti.base.text import MOST
 from uncertain_lti.identification import fit
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule

@@ -32,7 +32,7 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
 from uncertain_lti import SignalMap, UncertainLTI
-from uncertain_lti.base.limits import LONGEST_S
+from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.schedule import BlockData, Schedule

@@ -24,8 +24,8 @@ from bag_writer import JAZZY
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import define
 from uncertain_lti.signals.field_path import FieldPath, numeric_paths
 from uncertain_lti.signals.field_types import FieldType, TypeFields

@@ -18,7 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
 from rclpy.node import Node
 
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.text import plural
 from uncertain_lti.monitor.session import Report
 from uncertain_lti_ros.topics import MatchedSubscription
 

@@ -31,8 +31,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, String
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti.base.text import plural
 from uncertain_lti.monitor.outputs import NODE
 from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
 from uncertain_lti_ros.messages import stamp_ns

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Base: errors, whole files, progress, English and HTML tables for every room.
+"""Base: errors, whole files, progress, numbers and text for every room.
 
 Imports nothing of the project.
 """

@@ -7,7 +7,9 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""The types of arrays, and what becomes one of real numbers."""
+"""Arrays of numbers: their types, what becomes one of real numbers, and the largest numbers that a file may state."""
+
+from __future__ import annotations
 
 from typing import Any
 
@@ -29,3 +31,9 @@ def real(values: Any) -> Array:
     if np.iscomplexobj(values):
         raise TypeError("complex numbers")
     return np.array(values, dtype=np.float64)
+
+
+LONGEST_S = 9e9
+"""s; 2^63 ns are 9.2e9 s."""
+LARGEST = 1e50
+"""Magnitude of a number in recorded units or in 1/s, and of a scale or its inverse: squares of ratios stay finite."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from uncertain_lti.base.english import printable
+from uncertain_lti.base.text import printable
 
 
 class UncertainLTIError(Exception):

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO
 
-from uncertain_lti.base.english import printable
+from uncertain_lti.base.text import printable
 
 _DELAY = 0.4  # s; what is done sooner shows no bar
 _REDRAW = 0.1  # s

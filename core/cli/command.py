@@ -23,8 +23,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.text import printable
 from uncertain_lti.cli.options import Option, declare
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ def print_json(data: Any) -> None:
 def load_model(name: str) -> UncertainLTI:
     """Load the model of a file, or the published one by its name."""
     from uncertain_lti import UncertainLTI
-    from uncertain_lti.base.english import meant
+    from uncertain_lti.base.text import meant
     from uncertain_lti.plants.leibov import leibov2006
 
     if not os.path.exists(name):

@@ -17,8 +17,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from uncertain_lti.base.english import plural, shortlist
 from uncertain_lti.base.errors import BagError, ModelError, SignalError
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.cli.command import ALARM, BAD_INPUT, DONE, UNKNOWN, Command, Result, complain, load_model
 from uncertain_lti.cli.options import DEPLOYED, PUBLISHED, RECORDINGS, helped
 

@@ -144,7 +144,7 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        from uncertain_lti.base.english import meant
+        from uncertain_lti.base.text import meant
 
         if match := re.search(r"invalid choice: '?(.*?)'? \(choose from (.*)\)", message):
             message += meant(match[1], re.findall(r"[\w-]+", match[2]), 1)

@@ -17,8 +17,8 @@ import shlex
 from pathlib import Path
 from typing import Any
 
-from uncertain_lti.base.english import printable
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import printable
 from uncertain_lti.cli.command import Command, Result, model_target
 from uncertain_lti.cli.options import RECORDINGS, helped
 
@@ -31,7 +31,7 @@ _LONGEST_LIST = 100_000
 
 def run_topics(options: argparse.Namespace) -> Result:
     """Print the topics of a recording and what each holds."""
-    from uncertain_lti.base.tables import number, table
+    from uncertain_lti.base.text import number, table
     from uncertain_lti.recordings.formats import open_recording
 
     bag = open_recording(options.bag)
@@ -68,8 +68,8 @@ def run_topics(options: argparse.Namespace) -> Result:
 
 def run_init(options: argparse.Namespace) -> Result:
     """Write or print the proposed signals file."""
-    from uncertain_lti.base.english import shortlist
     from uncertain_lti.base.files import written
+    from uncertain_lti.base.text import shortlist
     from uncertain_lti.proposal.init import propose
 
     output = options.output

@@ -17,10 +17,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, Array, real
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.evidence import (

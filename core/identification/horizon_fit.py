@@ -22,10 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum

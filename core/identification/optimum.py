@@ -19,8 +19,8 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import one_thread_each
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import formulation
 from uncertain_lti.identification.passes import Envelope, Judged, Moments
 from uncertain_lti.identification.problem import Problem

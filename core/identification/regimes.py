@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import FitError, ModelError
+from uncertain_lti.base.text import meant, plural
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem

@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, TERMS
 

@@ -20,9 +20,9 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import on_cores, one_by_one
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Samples
 from uncertain_lti.identification.programmes import GOOD, WIDTH_SLACK, Programmes

@@ -17,9 +17,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST, LONGEST_S
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.horizon import MOST_STEPS
 from uncertain_lti.model.terms import object_of
 

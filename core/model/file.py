@@ -21,11 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, LONGEST_S, Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import kind_of, written
-from uncertain_lti.base.limits import LARGEST, LONGEST_S
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Residuals, Run

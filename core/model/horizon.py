@@ -30,8 +30,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import Judge
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import Elements, blocks_of, checked, object_of

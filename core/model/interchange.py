@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import written
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.file import FORMATS
 from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, Schedule

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.html_table import MOST, html_table
-from uncertain_lti.base.tables import Table, list_of, named, number, numbers_of
+from uncertain_lti.base.text import MOST, Table, html_table, list_of, named, number, numbers_of
 from uncertain_lti.model.alarm_rule import AlarmRule
 
 

@@ -34,9 +34,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST
 from uncertain_lti.kernel.arithmetic import changes, edges
 from uncertain_lti.model.terms import checked, object_of
 

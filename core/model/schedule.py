@@ -30,10 +30,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import Blocks
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.terms import object_of

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.terms import checked
 
 MOST_SIGNATURES = 256

@@ -28,10 +28,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, Array, real
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import Blocks, centre_and_half
 
 

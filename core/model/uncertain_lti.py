@@ -22,8 +22,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
 from uncertain_lti.model import free_run as nominal
 from uncertain_lti.model import interchange, overview

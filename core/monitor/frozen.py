@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.arrays import LARGEST
 from uncertain_lti.kernel.arithmetic import FLAGS, UTILISATION
 from uncertain_lti.model.repeats import Moved, Repeating, Repeats, Transition
 from uncertain_lti.model.uncertain_lti import UncertainLTI

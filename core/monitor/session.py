@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from uncertain_lti.base.english import plural, shortlist
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.monitor.deployed import Rule as Rule

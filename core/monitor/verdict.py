@@ -23,9 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural, times
-from uncertain_lti.base.html_table import html_table, number_text
-from uncertain_lti.base.tables import named
+from uncertain_lti.base.text import html_table, named, number_text, plural, times
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, UPPER, UTILISATION
 from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.frozen import Looked

@@ -24,7 +24,7 @@ from scipy.linalg import expm
 
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.base.tables import number, table
+from uncertain_lti.base.text import number, table
 from uncertain_lti.identification import fit
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor

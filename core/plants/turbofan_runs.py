@@ -22,8 +22,8 @@ from functools import cache
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, JOINT_STATE, STATE_TOPIC
 from uncertain_lti.plants.turbofan import (

@@ -17,8 +17,8 @@ from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of, unused
 from uncertain_lti.identification.structure import Structure

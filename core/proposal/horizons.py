@@ -18,8 +18,8 @@ from typing import Any, get_args
 
 import numpy as np
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI

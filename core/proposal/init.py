@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, TransientError, absent
+from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.proposal.candidates import FEWEST, Candidate, Source
 from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.effects import earlier

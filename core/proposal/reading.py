@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import plural
 from uncertain_lti.proposal.candidates import FEWEST, OF_QUATERNION, WRAPPING, Candidate, Source
 from uncertain_lti.proposal.effects import residual
 from uncertain_lti.proposal.roles import role_by_name, role_of_column

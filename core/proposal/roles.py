@@ -18,8 +18,8 @@ from fnmatch import fnmatchcase
 
 import numpy as np
 
-from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.proposal.candidates import Source
 from uncertain_lti.proposal.effects import SHOWS, explained
 from uncertain_lti.recordings.table import TYPE

@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.uncertain_lti import UncertainLTI

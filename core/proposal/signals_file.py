@@ -19,9 +19,8 @@ from itertools import count
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import printable, shortlist
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.arrays import LARGEST, Array
+from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source
 from uncertain_lti.proposal.effects import held
 from uncertain_lti.recordings.recording import Recording

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.evidence import autocorrelation, late_controls

@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uncertain_lti.base.english import printable, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.base.files import natural
+from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.recordings.bag_arrays import ColumnReader, IndexMismatchError, in_reach
 from uncertain_lti.recordings.bag_files import (
     listed_parts,

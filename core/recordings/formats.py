@@ -17,8 +17,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.bag import Bag, group_bags
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import Table, is_table

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.english import plural, printable, shortlist
 from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.text import plural, printable, shortlist
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import Column, RawTable, read_table
 from uncertain_lti.recordings.table_time import NO_TIME, field_name, find_column, instants

@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError, absent
+from uncertain_lti.base.text import plural
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"

@@ -19,8 +19,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.table_files import YEARS as _YEARS
 from uncertain_lti.recordings.table_files import Column, RawTable

@@ -22,9 +22,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC, kind_of, natural
+from uncertain_lti.base.text import shortlist
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 """Suffixes of files that hold ROS messages."""

@@ -20,8 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
-from uncertain_lti.base.english import plural, shortlist, times
-from uncertain_lti.base.tables import Block, Table, beyond, named, number, share, shortened, text_of
+from uncertain_lti.base.text import (
+    Block,
+    Table,
+    beyond,
+    named,
+    number,
+    plural,
+    share,
+    shortened,
+    shortlist,
+    text_of,
+    times,
+)
 from uncertain_lti.model.domain import jump_words, jumps
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI

@@ -29,7 +29,7 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.base.tables import shortened
+from uncertain_lti.base.text import shortened
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports import charts

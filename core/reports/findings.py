@@ -17,9 +17,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from uncertain_lti import __version__
-from uncertain_lti.base.english import plural, shortlist, times
 from uncertain_lti.base.files import sha256
-from uncertain_lti.base.tables import finite_data, list_of, number, numbers_of, shortened
+from uncertain_lti.base.text import finite_data, list_of, number, numbers_of, plural, shortened, shortlist, times
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI

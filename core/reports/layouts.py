@@ -25,7 +25,7 @@ from jinja2 import Environment
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.files import target
-from uncertain_lti.base.tables import named
+from uncertain_lti.base.text import named
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, OUTPUTS, Output
 from uncertain_lti.reports.pages import write_page

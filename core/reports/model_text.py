@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.english import plural, shortlist
-from uncertain_lti.base.tables import Block, Table, list_of, named, number, numbers_of, share, text_of
+from uncertain_lti.base.text import Block, Table, list_of, named, number, numbers_of, plural, share, shortlist, text_of
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.overview import blocks_table, elements_table

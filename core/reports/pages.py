@@ -33,10 +33,9 @@ from markupsafe import Markup, escape
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, written
-from uncertain_lti.base.tables import Block, Table, list_of, number, share
+from uncertain_lti.base.text import Block, Table, list_of, number, plural, share
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording

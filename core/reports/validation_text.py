@@ -15,8 +15,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from uncertain_lti.base.english import plural
-from uncertain_lti.base.tables import Block, Table, named, number, share, text_of
+from uncertain_lti.base.text import Block, Table, named, number, plural, share, text_of
 from uncertain_lti.validation.signatures import Learnt
 
 MOST_PARTS = 20

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.english import meant, shortlist
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
+from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.sampling.reading_processes import read_streams

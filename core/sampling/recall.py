@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import TransientError
+from uncertain_lti.base.text import meant
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.functions import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules

@@ -17,9 +17,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.base.limits import LONGEST_S
+from uncertain_lti.base.text import plural
 from uncertain_lti.sampling.instants import median_step_ns, period_ns, to_ns
 from uncertain_lti.signals.signal_map import SignalMap
 

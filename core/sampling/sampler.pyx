@@ -20,7 +20,7 @@ from libc.math cimport NAN, isfinite, rint
 from libc.stdlib cimport calloc, free, realloc
 from libc.string cimport memcpy
 
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.text import plural
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling.instants import to_ns
 from uncertain_lti.sampling.status import INVALID, LATE, MISSING, TOO_OLD, Counters, Status

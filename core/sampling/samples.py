@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import TransientError
+from uncertain_lti.base.text import plural
 from uncertain_lti.sampling.status import Status
 
 

@@ -21,12 +21,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import meant, plural
+from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import TransientError, refuse_other
-from uncertain_lti.base.html_table import html_table, number_text
-from uncertain_lti.base.limits import LONGEST_S
-from uncertain_lti.base.tables import named
+from uncertain_lti.base.text import html_table, meant, named, number_text, plural
 from uncertain_lti.sampling.instants import median_step_ns, to_ns
 from uncertain_lti.sampling.named_columns import csv_columns, frame_columns, listed
 from uncertain_lti.sampling.samples import matrix, names_of, nanoseconds, segments_of

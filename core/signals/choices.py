@@ -15,8 +15,8 @@ import reprlib
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, get_args
 
-from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import meant
 from uncertain_lti.signals.file_values import checked_mapping, checked_number, wrong
 
 WidthChoice = Literal["auto", "growing", "constant"]

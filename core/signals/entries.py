@@ -19,8 +19,8 @@ from dataclasses import fields
 from functools import partial
 from typing import Any
 
-from uncertain_lti.base.english import shortlist
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.signals.choices import CHOICES, CHOICES_TEXT, HorizonRule, TableLayout
 from uncertain_lti.signals.file_values import (
     checked_list,

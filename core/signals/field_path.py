@@ -17,8 +17,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-from uncertain_lti.base.english import meant, plural
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import meant, plural
 from uncertain_lti.signals.field_types import FieldType, TypeFields
 from uncertain_lti.signals.functions import FUNCTIONS, KINDS, QUATERNION, FieldFunction, as_number, parse_memory
 

@@ -18,9 +18,9 @@ import reprlib
 from collections.abc import Callable
 from typing import Any, TextIO, TypeVar
 
-from uncertain_lti.base.english import meant
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.files import kind_of
+from uncertain_lti.base.text import meant
 
 T = TypeVar("T")
 _ODD = re.compile(r"[-+]?0[0-7_]+|.*[:_].*")  # octal, sexagesimal, with underscores

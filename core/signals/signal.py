@@ -17,8 +17,8 @@ import struct
 from dataclasses import dataclass
 from typing import Literal
 
+from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.functions import LONGEST_DELAY, Memory, parse_memory
 

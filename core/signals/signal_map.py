@@ -17,10 +17,9 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NoReturn
 
+from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.base.errors import SignalError, refuse_other
-from uncertain_lti.base.html_table import html_table, number_text
-from uncertain_lti.base.limits import LONGEST_S
-from uncertain_lti.base.tables import named
+from uncertain_lti.base.text import html_table, named, number_text
 from uncertain_lti.signals.choices import Additive, HorizonRule, TableLayout
 from uncertain_lti.signals.entries import LISTS, STEP_CHOICES, map_arguments
 from uncertain_lti.signals.field_path import FieldPath

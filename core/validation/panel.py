@@ -36,10 +36,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
+from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.limits import LARGEST
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm

@@ -20,9 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.english import plural
-from uncertain_lti.base.html_table import html_table, number_text
-from uncertain_lti.base.tables import named
+from uncertain_lti.base.text import html_table, named, number_text, plural
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI

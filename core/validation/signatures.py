@@ -16,8 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uncertain_lti.base.english import plural
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.text import plural
 from uncertain_lti.model.signature import Signature, closeness
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.likeness import AHEAD, LEAST, MATCH, Pattern, scaled

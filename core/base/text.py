@@ -7,16 +7,90 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Blocks: lines and tables that texts and pages are made of; numbers and names in them."""
+"""Text for people: counted things, numbers and names in sentences; lines and tables of texts, pages and notebooks."""
 
 from __future__ import annotations
 
+import difflib
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
-from uncertain_lti.base.english import plural
+LONGEST = 2000
+"""Letters of a sentence as it is shown."""
+
+
+def printable(text: str, limit: int = LONGEST) -> str:
+    r"""A text that came from outside, for a terminal: one line, no control characters, not too long."""
+    text = _shortened(text, limit)
+    if text.isprintable():
+        return text
+    return _shortened("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text), limit)
+
+
+def _shortened(text: str, limit: int) -> str:
+    tail = limit // 3
+    return text if len(text) <= limit else f"{text[: limit - tail - 5]} ... {text[-tail:]}"
+
+
+def plural(count: object, word: str) -> str:
+    """A count and its noun: 1 state, 2 states, 0 states; 1 pass, 2 passes."""
+    return f"{count} {word}" if count == 1 else f"{count} {_several(word)}"
+
+
+def times(count: int) -> str:
+    """Once, or how many times."""
+    return "once" if count == 1 else f"{count} times"
+
+
+def shortlist(names: Sequence[str], limit: int) -> str:
+    """The first names, and how many more there are."""
+    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
+
+
+def meant(word: object, known: Iterable[str], most: int = 3) -> str:
+    """(is X meant?), with the known names that are near to a word, or nothing."""
+    names = {name.lower(): name for name in sorted(known)}
+    near = difflib.get_close_matches(str(word).lower(), names, n=most, cutoff=0.65 if most == 1 else 0.7)
+    return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""
+
+
+def _several(word: str) -> str:
+    if word.endswith(("s", "x", "ch", "sh")):
+        return f"{word}es"
+    return f"{word[:-1]}ies" if word.endswith("y") and word[-2:-1] not in "aeiou" else f"{word}s"
+
+
+MOST = 12
+"""Rows and columns of a matrix that are shown."""
+
+
+def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]], below: Sequence[str] = ()) -> str:
+    """A plain table, which scrolls where it is wide; every text is escaped.
+
+    The first column is aligned to the left, the others to the right.
+    """
+    head = "".join(f"<th style='{_style(i)}'>{escape(cell)}</th>" for i, cell in enumerate(header))
+    body = "".join(
+        "<tr>" + "".join(f"<td style='{_style(i)}'>{escape(c)}</td>" for i, c in enumerate(row)) + "</tr>"
+        for row in rows
+    )
+    notes = "".join(f"<div>{escape(text)}</div>" for text in below)
+    return (
+        f"<div><div style='overflow-x:auto'><table><caption style='text-align:left'><b>{escape(caption)}</b></caption>"
+        f"<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>{notes}</div>"
+    )
+
+
+def _style(column: int) -> str:
+    return f"text-align:{'right' if column else 'left'};white-space:nowrap"
+
+
+def number_text(value: float | None) -> str:
+    """Four digits; a dash where there is no finite number."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.4g}"
 
 
 @dataclass(frozen=True)
