@@ -272,7 +272,7 @@ def read_every_way(path: Path, checked: bool) -> str:
     from uncertain_lti import SignalMap
     from uncertain_lti.base.errors import UncertainLTIError
     from uncertain_lti.recordings.bag import Bag
-    from uncertain_lti.sampling.streams import read_stream
+    from uncertain_lti.sampling.reading import read_stream
 
     folder = path.parent
     signals = SignalMap.load(folder / "signals.yaml")

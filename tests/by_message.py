@@ -18,7 +18,7 @@ import numpy as np
 from uncertain_lti.recordings.bag_arrays import in_reach
 from uncertain_lti.recordings.message_reader import header_stamp_ns
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.sampling.streams import Stream, check_paths, refuse_absent
+from uncertain_lti.sampling.reading import Stream, check_paths, refuse_absent
 from uncertain_lti.signals.signal_map import SignalMap
 
 

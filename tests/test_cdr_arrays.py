@@ -42,7 +42,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from uncertain_lti.base.errors import SignalError, UncertainLTIError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import Definition, define
-from uncertain_lti.sampling.streams import Stream, read_stream
+from uncertain_lti.sampling.reading import Stream, read_stream
 from uncertain_lti.signals import functions
 from uncertain_lti.signals.field_path import FieldPath, numeric_paths
 from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction

@@ -30,7 +30,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_files import survey
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.sampling.streams import read_stream
+from uncertain_lti.sampling.reading import read_stream
 from uncertain_lti.signals.signal_map import SignalMap
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -106,7 +106,7 @@ def test_columns_are_what_messages_give_and_come_in_blocks(converted, kind):
     assert whole.topic.tobytes() == alone.topic.tobytes() and whole.arrival.tobytes() == alone.arrival.tobytes()
     assert whole.stamp.tobytes() == alone.stamp.tobytes()
     assert [v.tobytes() for v in whole.values] == [v.tobytes() for v in alone.values]
-    from uncertain_lti.sampling.streams import check_paths
+    from uncertain_lti.sampling.reading import check_paths
 
     columns = bag.columns(signals.topics, check_paths(bag, signals))
     assert columns.alone <= 4 < len(columns.topic)  # the rest was read by its plan

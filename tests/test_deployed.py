@@ -25,7 +25,7 @@ from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_reader import MessageReader
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.clock import Status
 
 SIGNALS = """
 states:

@@ -372,7 +372,7 @@ def test_a_number_that_stands_for_no_value_is_named_and_no_steady_state(code, at
     ],
 )
 def test_what_is_no_code(values):
-    from uncertain_lti.sampling.codes import codes
+    from uncertain_lti.sampling.steady_state import codes
 
     assert codes(values) == {}
 

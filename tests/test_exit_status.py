@@ -29,10 +29,9 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.sampling.instants import LONGEST_NS, to_ns
+from uncertain_lti.sampling.clock import LONGEST_NS, Status, to_ns
 from uncertain_lti.sampling.reading import read_transients
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import SignalMap
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -30,8 +30,8 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
 from uncertain_lti.monitor.verdict import Foreseen
 from uncertain_lti.monitor.verdict import place as place_of
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Sampler, Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal
 
 pytestmark = pytest.mark.numpy

@@ -49,8 +49,7 @@ from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.mcap_scan import outline
 from uncertain_lti.recordings.message_types import define
 from uncertain_lti.reports.annotate import annotate
-from uncertain_lti.sampling.reading import read_as_fitted_with_decisions
-from uncertain_lti.sampling.streams import read_stream
+from uncertain_lti.sampling.reading import read_as_fitted_with_decisions, read_stream
 
 TOPIC = Topic("/a")
 DEFINED = schema_record(1, TOPIC) + channel_record(1, TOPIC, 1)

@@ -33,9 +33,9 @@ from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_reader import header_stamp_ns
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal
 

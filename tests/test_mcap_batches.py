@@ -27,7 +27,7 @@ from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 import uncertain_lti.recordings.bag_arrays
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.sampling.streams import Stream, read_stream
+from uncertain_lti.sampling.reading import Stream, read_stream
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[2]"),), (Signal("u", "/u", "data"),))

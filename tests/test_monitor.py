@@ -22,8 +22,8 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Sampler, Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal
 
 

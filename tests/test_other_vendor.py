@@ -28,7 +28,7 @@ from test_live import by_hand, header_bag, offline, saved
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.clock import Status
 
 # Cyclone DDS on loopback, where multicast may be missing: the peer is named.
 _CONFIGURATION = """<CycloneDDS><Domain><General>

@@ -33,8 +33,8 @@ from uncertain_lti.monitor.outputs import (
 )
 from uncertain_lti.monitor.verdict import NUMBERS, place
 from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 
 
 def with_horizons() -> UncertainLTI:

@@ -24,7 +24,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.model.alarm_rule import KINDS, AlarmRule
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.monitor.session import ERROR, Rule
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.clock import Status
 
 COUNTS = {perturbed.in_disorder: 16, perturbed.of_a_swapped_model: 8, perturbed.held_up_on_the_way: 8}
 

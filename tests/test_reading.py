@@ -40,8 +40,8 @@ from test_sampler import Reference, Sent, cases
 
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted, read_transients, unused
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

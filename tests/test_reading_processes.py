@@ -24,11 +24,10 @@ from bag_writer import float64
 from processes import runs as runs_still
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
-import uncertain_lti.sampling.reading_processes
+import uncertain_lti.sampling.reading
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.sampling.reading import read_transients
-from uncertain_lti.sampling.reading_processes import children_ignore_ctrl_c, processes_for
+from uncertain_lti.sampling.reading import children_ignore_ctrl_c, processes_for, read_transients
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
@@ -139,7 +138,7 @@ def test_ctrl_c_while_processes_start_is_neither_lost_nor_theirs() -> None:
 
 SCRIPT = """
     import sys, threading, time
-    import uncertain_lti.sampling.reading_processes as side
+    import uncertain_lti.sampling.reading as side
     from uncertain_lti.base.errors import BagError
     from uncertain_lti.sampling.reading import read_transients
     from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -175,7 +174,7 @@ def test_small_recordings_are_read_without_processes(tmp_path: Path, monkeypatch
     bags = group_recordings(runs(tmp_path), indexed=True)
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(8), raising=False)
     assert processes_for(bags) == 1
-    monkeypatch.setattr(uncertain_lti.sampling.reading_processes, "WORTH_IT", 1000)
+    monkeypatch.setattr(uncertain_lti.sampling.reading, "WORTH_IT", 1000)
     assert processes_for(bags) == 3
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(2), raising=False)
     assert processes_for(bags) == 1  # which reads ahead on the other core

@@ -22,8 +22,8 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.alarm import Raised
 from uncertain_lti.monitor.reason import Facts, Reasons, over_recording
 from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 DT = 0.1

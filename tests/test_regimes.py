@@ -32,7 +32,7 @@ from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import check_regimes, unknown_in_words
 from uncertain_lti.reports.findings import CARE, UNKNOWN
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 START = 10**18  # ns

@@ -24,10 +24,8 @@ from hypothesis import strategies as st
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling import sampler as sampler_module
-from uncertain_lti.sampling.instants import median_step_ns, to_ns
-from uncertain_lti.sampling.resolve import resolve
+from uncertain_lti.sampling.clock import Status, median_step_ns, resolve, to_ns
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, Sampler, Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 TICK = 10_000_000  # ns

@@ -22,8 +22,8 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal
 
 pytestmark = pytest.mark.numpy

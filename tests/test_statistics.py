@@ -23,8 +23,8 @@ from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRul
 from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 
 C = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.3], [0.0, -0.3, 0.5]])
 MEAN = np.array([0.1, -0.2, 0.0])

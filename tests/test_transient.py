@@ -24,8 +24,8 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError, TransientError
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

@@ -98,7 +98,7 @@ def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
 
 def _local_cluster(dask: Any, workers: int) -> Any:
     """Worker processes that leave Ctrl-C to this one, which ends them."""
-    from uncertain_lti.sampling.reading_processes import children_ignore_ctrl_c
+    from uncertain_lti.sampling.reading import children_ignore_ctrl_c
 
     with children_ignore_ctrl_c():
         return dask.LocalCluster(

@@ -39,8 +39,7 @@ from uncertain_lti.model.repeats import Found, repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.sampling.reading import Times, load_signals, resolved_by, sample, times_of, types_of
-from uncertain_lti.sampling.streams import read_stream
+from uncertain_lti.sampling.reading import Times, load_signals, read_stream, resolved_by, sample, times_of, types_of
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.signal_map import SignalMap

@@ -23,7 +23,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.clock import to_ns
 from uncertain_lti.sampling.transient import Transient
 
 LONGEST_GRACE = 86400.0

@@ -44,8 +44,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
 from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step, all_finite
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
 
 

@@ -22,7 +22,7 @@ from uncertain_lti.model.domain import jumps, jumps_in_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, row_of
 from uncertain_lti.monitor.verdict import Verdict, Verdicts
-from uncertain_lti.sampling.status import Status
+from uncertain_lti.sampling.clock import Status
 
 WHY = {
     Status.FIRST: "there is no sample before",

@@ -33,7 +33,7 @@ from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
 from uncertain_lti.monitor.stream import topic_types as topic_types
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.recordings.message_reader import UnreadableError
-from uncertain_lti.sampling.status import MISSING, TOO_OLD, Counters, Status
+from uncertain_lti.sampling.clock import MISSING, TOO_OLD, Counters, Status
 
 _BURST, _REFILL = 6, 10.0  # lines on one subject at once, and s until one more is allowed
 _LOGGED = 5.0  # s between two log entries on unexpected errors

@@ -32,9 +32,8 @@ from uncertain_lti.monitor.likeness import Explainer
 from uncertain_lti.monitor.reason import QUIET, Reasons
 from uncertain_lti.monitor.verdict import Foreseen, Verdict
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
-from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.clock import LATE, Status, to_ns
 from uncertain_lti.sampling.sampler import Sampler, all_finite
-from uncertain_lti.sampling.status import LATE, Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.field_types import TypeFields
 

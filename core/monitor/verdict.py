@@ -27,8 +27,8 @@ from uncertain_lti.base.text import html_table, named, number_text, plural, time
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, UPPER, UTILISATION
 from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.frozen import Looked
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
 NUMBERS = ("flags", "lower", "upper", "state", "utilisation")

@@ -27,7 +27,7 @@ from uncertain_lti.proposal.effects import residual
 from uncertain_lti.proposal.roles import role_by_name, role_of_column
 from uncertain_lti.recordings.recording import Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
-from uncertain_lti.sampling.codes import codes
+from uncertain_lti.sampling.steady_state import codes
 from uncertain_lti.signals.field_path import FieldPath
 
 Iterate = Callable[[Iterable[object], int], Iterable[object]]

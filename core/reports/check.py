@@ -40,8 +40,8 @@ from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import unused
-from uncertain_lti.sampling.status import Status
 from uncertain_lti.sampling.transient import Transient
 
 UNVOUCHED, STRANGE = 0.2, 0.5

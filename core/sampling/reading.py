@@ -7,31 +7,106 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Bags into transients: field values through the Sampler, with what a signals file leaves open resolved."""
+"""Recordings into transients: field values through the Sampler, several recordings side by side."""
 
 from __future__ import annotations
 
+import math
+import multiprocessing
 import os
+import signal
+import threading
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.cores import core_count
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Progress, Recording
-from uncertain_lti.sampling.reading_processes import read_streams
-from uncertain_lti.sampling.resolve import resolve
+from uncertain_lti.sampling.clock import INVALID, LATE, TOO_OLD, Status, resolve
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.status import INVALID, LATE, TOO_OLD, Status
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.sampling.streams import Stream, read_stream
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
+
+
+@dataclass
+class Stream:
+    """The wanted field values of one recording in order of arrival.
+
+    `bag`: the recording; `topic` (messages,): positions in `signals.topics`; `arrival` (messages,): log time, ns;
+    `stamp` (messages,): header stamp, ns; -1 for no stamp; `values` (messages of the topic, signals on it): one array
+    per topic, in the order of `signals.on(topic)`.
+    """
+
+    bag: Recording
+    topic: NDArray[np.int64]
+    arrival: NDArray[np.int64]
+    stamp: NDArray[np.int64]
+    values: list[NDArray[np.float64]]
+
+
+def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
+    """Read the fields of a signals file from one recording."""
+    paths = check_paths(bag, signals)
+    columns = bag.columns(signals.topics, paths, progress)
+    refuse_absent(bag, signals, paths, columns.values)
+    return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
+
+
+def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
+    """Field paths per topic; every problem of the map is found before the long read.
+
+    What the index of a file says is wrong is looked for in the file itself before it is reported: they may differ.
+    """
+    if bag.indexed:
+        try:
+            if not _fits(bag, signals):
+                bag.walk()
+        except SignalError:
+            bag.walk()
+    _fits(bag, signals)
+    return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
+
+
+def _fits(bag: Recording, signals: SignalMap) -> bool:
+    """Whether every topic can be read; raises SignalError where a path of one that can be does not fit its type."""
+    readable = [name for name in signals.topics if name in bag.topics and bag.topics[name].readable]
+    for name in readable:
+        try:
+            signals.check(name, bag.topics[name].type, bag.type_fields(name))
+        except SignalError as error:
+            raise SignalError(f"{bag.path}: {error}") from None
+    return len(readable) == len(signals.topics)
+
+
+def refuse_absent(
+    bag: Recording, signals: SignalMap, paths: Sequence[Sequence[FieldPath]], values: Sequence[NDArray[np.float64]]
+) -> None:
+    """What no message has: a topic, or what the first lacks and gave no number in any other, a mistake in the map."""
+    for name, columns, read in zip(signals.topics, paths, values, strict=True):
+        if not len(read):
+            raise BagError(f"{bag.path}: {name} has no message; record it, or choose another topic or recording")
+        for path, column in zip(columns, read.T, strict=True):
+            looked_up = any(kind != "attribute" for kind, _ in path.steps)
+            if not looked_up or not math.isnan(column[0]) or not np.isnan(column).all():
+                continue
+            notes = bag.reading_notes
+            _, _, first = next(iter(bag.messages([name])))
+            bag.restore_notes(*notes)
+            if absent := path.absent(first):
+                raise SignalError(f"field '{path.text}' of {name} in {bag.path}: {absent}")
+
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
 
@@ -157,7 +232,7 @@ def read_transients(
         Wraps what goes through the messages of a recording, given their number: (iterable, total) -> iterable.
     processes : int or None
         How many recordings are read at the same time, each in a process of its own; None chooses
-        (`reading_processes.processes_for`). A script that asks for more than 1 needs `if __name__ == "__main__":`.
+        (`processes_for`). A script that asks for more than 1 needs `if __name__ == "__main__":`.
 
     Returns
     -------
@@ -319,3 +394,99 @@ def unused(transient: Transient) -> list[str]:
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
     kinds = [(kind, *of) for kind in (LATE, TOO_OLD, INVALID) for of in sorted(counters.of(kind).items())]
     return parts + [f"{count} {kind} {name}" for kind, name, count in kinds]
+
+
+WORTH_IT = 1 << 28
+"""Bytes of recordings from which on processes that have to be started first save time."""
+
+
+def processes_for(bags: Sequence[Recording]) -> int:
+    """How many processes to read these recordings with: 1 for small ones, and on few cores.
+
+    One process keeps nearly two cores busy, as it reads ahead.
+    """
+    size = sum(bag.size for bag in bags)
+    return max(1, min(len(bags), core_count() // 2)) if size >= WORTH_IT else 1
+
+
+def read_streams(
+    bags: Sequence[Recording], signals: SignalMap, progress: Progress | None, processes: int | None
+) -> list[Stream]:
+    """`read_stream` of every recording; where processes read them, progress advances by whole recordings."""
+    processes = min(processes_for(bags) if processes is None else processes, len(bags))
+    if processes == 1:
+        return [read_stream(bag, signals, progress) for bag in bags]
+    for bag in bags:
+        check_paths(bag, signals)  # what is wrong with the map is found before anything is started
+    counts = [sum(bag.topics[topic].count for topic in signals.topics) for bag in bags]
+    with _pool(processes) as pool:
+        futures = {pool.submit(_read, bag, signals): number for number, bag in enumerate(bags)}
+
+        def messages() -> Iterator[None]:
+            for future in as_completed(futures):
+                yield from [None] * counts[futures[future]]
+
+        steps: Iterable[object] = messages()
+        for _ in steps if progress is None else progress(steps, sum(counts)):
+            pass
+        return [_stream(bag, future) for bag, future in zip(bags, futures, strict=True)]
+
+
+def _stream(bag: Recording, future: Future[tuple[Any, ...]]) -> Stream:
+    try:
+        walked, undecoded, *columns = future.result()
+    except BrokenProcessPool:
+        raise BagError(
+            f"{bag.path}: the process that read it was ended, perhaps for want of memory; "
+            f"read fewer recordings at once, or fit with --cache"
+        ) from None
+    if walked:
+        bag.walk()
+    bag.restore_notes(bag.reading_notes[0], undecoded)
+    return Stream(bag, *columns)
+
+
+def _read(bag: Recording, signals: SignalMap) -> tuple[Any, ...]:
+    """In a process of its own: whether the index did not hold, messages left out by topic, and the columns."""
+    indexed = bag.indexed
+    stream = read_stream(bag, signals)
+    walked = indexed and not bag.indexed
+    return walked, bag.reading_notes[1], stream.topic, stream.arrival, stream.stamp, stream.values
+
+
+@contextmanager
+def children_ignore_ctrl_c() -> Iterator[None]:
+    """Processes that are started in the block leave Ctrl-C to this one, which takes it at the end of the block.
+
+    They inherit that SIGINT is blocked. In another than the main thread it cannot be set.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    came: list[int] = []  # another thread may take the signal, which makes this one call the handler
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)
+
+
+@contextmanager
+def _pool(processes: int) -> Iterator[ProcessPoolExecutor]:
+    """Processes that leave Ctrl-C to this one, which ends them where it breaks off."""
+    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    with children_ignore_ctrl_c():
+        for _ in range(processes):
+            pool.submit(os.getpid)  # each starts a process as long as none is idle
+    try:
+        yield pool
+    except BaseException:
+        for process in list((getattr(pool, "_processes", None) or {}).values()):
+            process.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)

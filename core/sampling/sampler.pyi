@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.sampling.status import Counters, Status
+from uncertain_lti.sampling.clock import Counters, Status
 from uncertain_lti.signals.signal_map import SignalMap
 
 Integers = NDArray[np.int64]

@@ -22,8 +22,8 @@ from libc.string cimport memcpy
 
 from uncertain_lti.base.text import plural
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.sampling.instants import to_ns
-from uncertain_lti.sampling.status import INVALID, LATE, MISSING, TOO_OLD, Counters, Status
+from uncertain_lti.sampling.clock import to_ns
+from uncertain_lti.sampling.clock import INVALID, LATE, MISSING, TOO_OLD, Counters, Status
 from uncertain_lti.signals.field_path import FieldPath
 
 BUFFERED_MESSAGES = 10_000

@@ -24,10 +24,16 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.text import html_table, meant, named, number_text, plural
-from uncertain_lti.sampling.instants import median_step_ns, to_ns
-from uncertain_lti.sampling.named_columns import csv_columns, frame_columns, listed
-from uncertain_lti.sampling.samples import matrix, names_of, nanoseconds, segments_of
-from uncertain_lti.sampling.status import Counters, Status
+from uncertain_lti.sampling.clock import Counters, Status, median_step_ns, to_ns
+from uncertain_lti.sampling.samples import (
+    csv_columns,
+    frame_columns,
+    listed,
+    matrix,
+    names_of,
+    nanoseconds,
+    segments_of,
+)
 from uncertain_lti.signals.signal import AT, At
 from uncertain_lti.signals.signal_map import ARRIVAL, Signal, SignalMap
 

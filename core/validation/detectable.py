@@ -25,7 +25,7 @@ from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.model.alarm_rule import FADING, AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.sampling.instants import to_ns
+from uncertain_lti.sampling.clock import to_ns
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.injection import KINDS, Windows, faulty
 from uncertain_lti.validation.intervals import quantile_share_interval

@@ -1,0 +1,164 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""The clock: whole nanoseconds, the status of each of its messages, and what a signals file leaves open of it."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.arrays import LONGEST_S
+from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.text import plural
+from uncertain_lti.signals.signal_map import SignalMap
+
+
+class Status(StrEnum):
+    """What became of one clock message."""
+
+    OK = "ok"  # the transition that ends in this sample can be judged
+    FIRST = "first"  # first sample of a recording
+    RESET = "reset"  # time stepped back by more than max_gap: first sample of a new segment
+    GAP = "gap"  # the step is longer than max_gap: first sample of a new segment
+    MISSING = "missing"  # a signal at either end is missing, stale, not finite, or too large for the bounds
+    STEP = "step out of range"  # the step is shorter or longer than those that the model was fitted to
+    MODE = "mode not in the model"  # the scheduling signal has a value that the model does not list
+    FROZEN = "frozen"  # a state repeats exactly although the nominal model moves it: no value of this instant
+    UNASKED = "outside the time asked for"  # a check from one instant to another leaves the rest alone
+    EQUAL = "equal stamp"  # dropped: the instant of the sample before
+    SHORT = "short step"  # dropped: less than min_step after the sample before
+    LATE = "late"  # dropped: at most max_gap before the sample before
+    UNSTAMPED = "no stamp"  # dropped: header time is wanted and the stamp is zero
+
+    @property
+    def dropped(self) -> bool:
+        """The message made no sample."""
+        return self in (Status.EQUAL, Status.SHORT, Status.LATE, Status.UNSTAMPED)
+
+    @property
+    def opens_segment(self) -> bool:
+        """The sample has no predecessor."""
+        return self in (Status.FIRST, Status.RESET, Status.GAP)
+
+
+LATE, TOO_OLD, MISSING, INVALID = "late", "stale", "missing", "invalid"
+"""Kinds that are counted per topic (late) or per signal."""
+
+
+class Counters(Counter[str]):
+    """Counts by flat name, as diagnostics and `--json` show them: `samples`, `gaps`, `late /topic`, `stale signal`.
+
+    `of` gives the counts of one kind by topic or signal, so that nobody takes the names apart.
+    """
+
+    def add(self, kind: str, name: str, count: int = 1) -> None:
+        """Count something of a topic or signal."""
+        self[f"{kind} {name}"] += count
+
+    def of(self, kind: str) -> dict[str, int]:
+        """Counts of one kind."""
+        start = f"{kind} "
+        return {key[len(start) :]: count for key, count in self.items() if key.startswith(start) and count}
+
+
+LONGEST_NS = 2**62
+"""Longer than any recording; what is longer still counts as this."""
+
+
+def to_ns(seconds: float) -> int:
+    """Seconds to whole nanoseconds."""
+    if abs(seconds) < LONGEST_NS * 1e-9:
+        return round(seconds * 1e9)
+    return -LONGEST_NS if math.isfinite(seconds) and seconds < 0 else LONGEST_NS
+
+
+def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:
+    """Median of the forward steps of clock instants over all recordings.
+
+    Equal stamps and steps back do not count; an instant less than min_step_ns after the one before is passed over,
+    as the sampler does.
+
+    `instants` (messages,): of each recording, ns.
+    """
+    pooled = np.concatenate([np.empty(0, np.int64), *(_forward_steps(i, min_step_ns) for i in instants)])
+    return int(np.median(pooled)) if pooled.size else None
+
+
+def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.int64]:
+    steps = np.diff(instants)
+    forward = steps[steps > 0]
+    if (forward >= min_step_ns).all():
+        return forward
+    longer = []
+    last = int(instants[0])
+    for instant in instants.tolist()[1:]:
+        if instant - last >= min_step_ns:
+            longer.append(instant - last)
+        elif instant >= last:
+            continue
+        last = instant
+    return np.array(longer, dtype=np.int64)
+
+
+def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:
+    """Period of a clock that samples evenly, whatever its stamps do, over all recordings.
+
+    The median of the time that 100 samples take (fewer of short recordings), divided by their number: a stamp that is
+    late, or a sample that is lost, changes few of these.
+
+    `instants` (messages,): of each recording, ns.
+    """
+    steps = [_forward_steps(i, min_step_ns) for i in instants]
+    longest = max((len(s) for s in steps), default=0)
+    if not longest:
+        return None
+    over = max(1, min(100, longest // 4))
+    times = [np.concatenate([np.zeros(1, np.int64), np.cumsum(s)]) for s in steps]
+    return max(1, round(float(np.median(np.concatenate([t[over:] - t[:-over] for t in times]))) / over))
+
+
+def resolve(
+    signals: SignalMap,
+    instants: Mapping[str, Sequence[NDArray[np.int64]]],
+    time: Mapping[str, str],
+) -> SignalMap:
+    """Fill in clock, max_gap, a constant step and time sources by the stated rules."""
+    if signals.max_skew is not None and len({s.topic for s in signals.states}) == 1:
+        raise SignalError(
+            f"{signals.source}: max_skew limits the age of states from another topic than the clock, and all states "
+            f"are on {signals.states[0].topic}; leave it out (the age of a control is limited by max_hold)"
+        )
+    min_step_ns = to_ns(signals.min_step)
+    medians = {t: median_step_ns(instants[t], min_step_ns) for t in dict.fromkeys(s.topic for s in signals.states)}
+    clock = signals.clock or max(medians, key=lambda t: medians[t] or 0)
+    step = medians[clock]
+    if step is None:
+        count = sum(len(i) for i in instants[clock])
+        raise SignalError(
+            f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
+            f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
+        )
+    max_gap = signals.max_gap if signals.max_gap is not None else min(2.5 * step * 1e-9, LONGEST_S)
+    constant = signals.step
+    if constant == "constant":
+        constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9
+    return replace(
+        signals,
+        clock=clock,
+        max_gap=max_gap,
+        step=constant,
+        time={t: "header" if time[t] == "header" else "log" for t in signals.topics},
+    )
