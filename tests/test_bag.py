@@ -62,8 +62,7 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.message_types import RawMessage
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.field_types import FieldType
+from uncertain_lti.signals.field_path import FieldPath, FieldType
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real recordings (../shared/data) are not here")

@@ -26,7 +26,7 @@ from uncertain_lti.recordings import formats
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import Format, group_recordings, open_recording
 from uncertain_lti.recordings.recording import Columns, TopicFacts, TopicInfo
-from uncertain_lti.signals.field_types import FieldType
+from uncertain_lti.signals.field_path import FieldType
 
 ROOT = Path(__file__).resolve().parents[1]
 TOPIC, SECOND = "/table", 10**9

@@ -24,7 +24,7 @@ from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import text_of
 from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.model_text import horizon_blocks
-from uncertain_lti.signals.choices import HorizonRule
+from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import rules_for, sizes_of
 

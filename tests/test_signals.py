@@ -27,8 +27,7 @@ from hypothesis import strategies as st
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import define
-from uncertain_lti.signals.field_path import FieldPath, numeric_paths
-from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, numeric_paths
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 NAN, INF = math.nan, math.inf
@@ -590,7 +589,7 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
     path.write_text(bomb)
     with pytest.raises(SignalError, match=r"at line 2: an alias \(\*name\); write out what it stands for"):
         SignalMap.load(path)
-    from uncertain_lti.signals.file_values import compose, construct
+    from uncertain_lti.signals.values import compose, construct
 
     text = "{a: 010, b: 1:30, c: 1_000, d: 10, e: 1.5e-3, f: -0.5, g: 0x10, h: 0}"
     assert construct(compose(text)) == {
@@ -599,7 +598,7 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
 
 
 def test_a_unit_of_the_table_that_is_a_list(tmp_path):
-    from uncertain_lti.signals.choices import TableLayout
+    from uncertain_lti.signals.values import TableLayout
 
     with pytest.raises(SignalError, match="unit is \\['ms'\\]"):
         TableLayout.from_dict({"unit": ["ms"]}, "table")

@@ -22,7 +22,7 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
-from uncertain_lti.signals.choices import TableLayout
+from uncertain_lti.signals.values import TableLayout
 
 ROOT = Path(__file__).resolve().parents[1]
 SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"

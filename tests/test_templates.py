@@ -21,8 +21,8 @@ from uncertain_lti import SignalMap, Transient
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.identification import fit
 from uncertain_lti.sampling.recall import with_memories
-from uncertain_lti.signals.entries import members_of
 from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.signal import members_of
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from functools import cache
 from typing import Any, Literal
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.signals.field_types import FieldType
+from uncertain_lti.signals.field_path import FieldType
 
 _ARRAY = re.compile(r"(?P<element>[^\[\]]+)\[(?P<count>\d+)\]")
 _SEQUENCE = re.compile(r"sequence<(?P<element>[^,]+?)(?:,\s*(?P<bound>\d+))?>")

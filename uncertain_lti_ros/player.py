@@ -34,7 +34,7 @@ from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
 from uncertain_lti.cli.command import print_json
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
-from uncertain_lti.signals.field_types import TypeFields
+from uncertain_lti.signals.field_path import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Life, Progress, hush, living, say, seconds, speed, tell
 

@@ -16,7 +16,7 @@ import math
 import re
 from typing import Any
 
-from uncertain_lti.signals.choices import CHOICES
+from uncertain_lti.signals.values import CHOICES
 
 Option = str | tuple[str, dict[str, Any]]
 """A name in `OPTIONS`, with what is otherwise for one command."""

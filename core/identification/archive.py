@@ -41,8 +41,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.reading import Times, load_signals, read_stream, resolved_by, sample, times_of, types_of
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.values import Additive
 
 _DATA = "transitions.f64"
 

@@ -24,7 +24,7 @@ from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns
 from uncertain_lti.sampling.transient import Transient, Transitions
-from uncertain_lti.signals.choices import Additive
+from uncertain_lti.signals.values import Additive
 
 
 def is_constant(dt: Array) -> bool:

@@ -21,8 +21,8 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, TERMS, Term
-from uncertain_lti.signals.choices import CHOICES, CHOICES_TEXT, Additive
 from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.values import CHOICES, CHOICES_TEXT, Additive
 
 
 @dataclass(frozen=True)

@@ -46,9 +46,9 @@ from uncertain_lti.model.repeats import repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
-from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
+from uncertain_lti.signals.values import Additive
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""

@@ -32,8 +32,8 @@ from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, object_of
-from uncertain_lti.signals.choices import TableLayout
 from uncertain_lti.signals.signal_map import Signal, SignalMap
+from uncertain_lti.signals.values import TableLayout
 
 FORMATS = ("uncertain-lti/1", "uncertain-lti/2")
 """Formats of model files, oldest first; the oldest that holds a model is written."""

@@ -34,8 +34,7 @@ from uncertain_lti.monitor.verdict import Foreseen, Verdict
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
 from uncertain_lti.sampling.clock import LATE, Status, to_ns
 from uncertain_lti.sampling.sampler import Sampler, all_finite
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.field_types import TypeFields
+from uncertain_lti.signals.field_path import FieldPath, TypeFields
 
 SHOWN = 5
 """Signals that a report names."""

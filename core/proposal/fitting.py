@@ -30,8 +30,8 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.horizons import choose_horizons, lengths_of
 from uncertain_lti.proposal.scheduling import choose_knots, knots_of
 from uncertain_lti.sampling.transient import Transient, listed_transients
-from uncertain_lti.signals.choices import Additive, HorizonRule, WidthChoice
 from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.values import Additive, HorizonRule, WidthChoice
 from uncertain_lti.validation.monitor_fit import choose_monitored
 
 

@@ -25,7 +25,7 @@ from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.search import EXCESS, PAYS, WORSE, Fold, Score, jackknife
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.choices import HorizonRule
+from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.part import by_unit
 from uncertain_lti.validation.result import Validation
 

@@ -39,8 +39,8 @@ from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.choices import TableLayout
 from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.values import TableLayout
 
 
 @dataclass(frozen=True)

@@ -26,9 +26,9 @@ from uncertain_lti.proposal.effects import held
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TOPIC
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.signals.choices import CHOICES_TEXT
 from uncertain_lti.signals.functions import FUNCTIONS
 from uncertain_lti.signals.signal_map import Signal
+from uncertain_lti.signals.values import CHOICES_TEXT
 
 _PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 

@@ -33,8 +33,8 @@ from uncertain_lti.proposal.fitting import fit
 from uncertain_lti.proposal.search import PAYS, Fold
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.choices import Additive
 from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.values import Additive
 from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
 

@@ -34,8 +34,7 @@ from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count
 from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, normal_name, undefined
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo, topic_facts
 from uncertain_lti.recordings.unreadable import os_error
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 
 __all__ = ["Bag", "group_bags"]
 

@@ -28,7 +28,7 @@ from uncertain_lti.recordings.mcap_records import RECORD, Contents, messages, pa
 from uncertain_lti.recordings.mcap_scan import outline, scan
 from uncertain_lti.recordings.message_types import normal_name
 from uncertain_lti.recordings.unreadable import SUFFIXES, file_names, no_recording, os_error
-from uncertain_lti.signals.file_values import compose, construct
+from uncertain_lti.signals.values import compose, construct
 
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.(?:mcap|db3|bag)")
 

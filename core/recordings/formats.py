@@ -22,7 +22,7 @@ from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.bag import Bag, group_bags
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import Table, is_table
-from uncertain_lti.signals.choices import TableLayout
+from uncertain_lti.signals.values import TableLayout
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from uncertain_lti.base.arrays import Array, Integers
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.field_types import TypeFields
+from uncertain_lti.signals.field_path import FieldPath, TypeFields
 
 CODES: Mapping[str, str]
 """Type -> its code in struct and in numpy."""

@@ -27,7 +27,7 @@ from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, u
 from libc.string cimport memchr, memcmp, memcpy
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.signals.field_types import FieldType
+from uncertain_lti.signals.field_path import FieldType
 
 CODES = {
     "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",

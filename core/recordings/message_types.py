@@ -32,7 +32,7 @@ from rosbags.typesys.store import Typestore
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
 from uncertain_lti.recordings.unreadable import one_line
-from uncertain_lti.signals.field_types import FieldType
+from uncertain_lti.signals.field_path import FieldType
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
 _LARGEST_PARSED = 1 << 18  # bytes without comments

@@ -24,8 +24,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.message_types import RawMessage
-from uncertain_lti.signals.field_path import FieldPath, signal_paths
-from uncertain_lti.signals.field_types import TypeFields
+from uncertain_lti.signals.field_path import FieldPath, TypeFields, signal_paths
 
 
 @dataclass(frozen=True)

@@ -27,9 +27,8 @@ from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, To
 from uncertain_lti.recordings.table_files import Column, RawTable, read_table
 from uncertain_lti.recordings.table_time import NO_TIME, field_name, find_column, instants
 from uncertain_lti.recordings.unreadable import TABLES, missing
-from uncertain_lti.signals.choices import TableLayout
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.field_types import FieldType, TypeFields
+from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
+from uncertain_lti.signals.values import TableLayout
 
 TOPIC = "/table"
 """The topic of a table."""

@@ -24,7 +24,7 @@ from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.table_files import YEARS as _YEARS
 from uncertain_lti.recordings.table_files import Column, RawTable
-from uncertain_lti.signals.choices import UNITS, TableLayout
+from uncertain_lti.signals.values import UNITS, TableLayout
 
 NO_TIME = -(2**63)
 """Instant of a row without one."""
@@ -43,7 +43,7 @@ _DAY = re.compile(r"(\d{1,2})[/.](\d{1,2})[/.](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _LARGEST_ZONE = 14  # hours
-_INEXACT = 10**15  # ns, above which a float of seconds does not keep each
+_LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
 
 def field_name(column: str) -> str:
@@ -152,7 +152,7 @@ def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[
     if largest > LATEST:
         raise _too_late(where)
     times = np.full(len(values), NO_TIME, dtype=np.int64)
-    if largest > _INEXACT and table.exact is not None:
+    if largest > _LARGE and table.exact is not None:
         cells = table.exact(name)
         if len(cells) == len(values):
             times[known] = [_exactly(cells[i], factor, float(values[i])) for i in np.flatnonzero(known).tolist()]

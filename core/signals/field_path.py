@@ -13,14 +13,31 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import meant, plural
-from uncertain_lti.signals.field_types import FieldType, TypeFields
 from uncertain_lti.signals.functions import FUNCTIONS, KINDS, QUATERNION, FieldFunction, as_number, parse_memory
+
+
+@dataclass(frozen=True, slots=True)
+class FieldType:
+    """Type of one message field.
+
+    `kind`: what one element is; `type_name`: type of one element, as the message definition writes it; `array`: none
+    for a single value, 0 for a sequence of any length, n for n elements.
+    """
+
+    kind: Literal["number", "bool", "string", "message", "other"]
+    type_name: str
+    array: int | None = None
+
+
+TypeFields = Callable[[str], Mapping[str, FieldType]]
+"""Type name -> {field name: FieldType}; raises SignalError for an unknown type."""
+
 
 _STEP = re.compile(
     r"""\.?([A-Za-z_]\w*)|\[\s*(\d{1,18})\s*\]|\[\s*"([^"]+)"\s*\]|\[\s*([^\[\]"\s](?:[^\[\]"]*[^\[\]"\s])?)\s*\]"""
