@@ -7,28 +7,268 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Files of a recording of ROS messages: which belong together, in which order, and what was written about them."""
+"""Files of a recording of ROS messages: what belongs together, in which order, and containers other than MCAP.
+
+ROS 1 bags and rosbag2 databases (.db3) are read by `rosbags` for convenience, once, in a process of its own (`aside`),
+which counts their messages and compares them with the file's own index. Afterwards blocks of them are read as MCAP
+records with CDR messages. In a damaged file what is before the damage in time counts.
+"""
 
 from __future__ import annotations
 
 import itertools
 import os
 import re
-from collections.abc import Sequence
+import struct
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, BinaryIO, ClassVar
+from urllib.parse import quote
 
 from mcap.opcode import Opcode
-from mcap.records import Metadata
+from mcap.records import Channel, Metadata, Schema
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC, natural
-from uncertain_lti.recordings.foreign import scan_foreign
-from uncertain_lti.recordings.mcap_records import RECORD, Contents, messages, parse
+from uncertain_lti.recordings.mcap_records import (
+    LATEST,
+    RECORD,
+    Block,
+    Contents,
+    Tally,
+    count,
+    message_record,
+    messages,
+    parse,
+)
 from uncertain_lti.recordings.mcap_scan import outline, scan
-from uncertain_lti.recordings.message_types import normal_name
-from uncertain_lti.recordings.unreadable import SUFFIXES, file_names, no_recording, os_error
+from uncertain_lti.recordings.message_types import Definition, define, distribution_text, normal_name, ros2_text
+from uncertain_lti.recordings.unreadable import SUFFIXES, aside, file_names, no_recording, one_line, os_error
 from uncertain_lti.signals.values import compose, construct
+
+_DATABASE = b"SQLite format 3\0"
+_BAG = b"#ROSBAG V2.0\n"
+_BLOCK = 1 << 22  # bytes of messages that are read at once, at least
+_LARGEST_BLOCK = 1 << 28
+_MOST_TOPICS = (1 << 16) - 1
+_LENGTH = struct.Struct("<I")
+_CHUNK = b"op=\x05"
+_REMEDIES = {
+    _DATABASE: "copy it again, or mend it with `sqlite3 {} '.recover' | sqlite3 mended.db3`",
+    _BAG: "copy it again, or mend it with `rosbag reindex {}` of ROS 1",
+}
+
+
+@dataclass(slots=True)
+class Foreign(Contents):
+    """What is known of such a file; a block is all from its first to its last log time.
+
+    `numbers`: connection in the file -> number of its channel; `magic`: first bytes of the file.
+    """
+
+    numbers: dict[int, int] = field(default_factory=dict)
+    magic: bytes = b""
+
+    converted: ClassVar[bool] = True
+
+    def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
+        """Messages of one block as MCAP has them."""
+        convert: dict[int, Callable[[bytes], bytes]] = {}
+        if self.magic == _BAG:
+            convert = {number: self._definition(number).from_ros1 for number in block.channels}
+        pieces: list[bytes] = []
+        try:
+            with _reader(self.path, self.magic) as reader:
+                wanted = [
+                    connection
+                    for connection in reader.connections
+                    if self.numbers[connection.id] in (block.channels if channels is None else channels)
+                ]
+                for connection, time, data in reader.messages(wanted, block.start, block.end + 1) if wanted else ():
+                    number = self.numbers[connection.id]
+                    if _usable(time, data):
+                        message = convert[number](bytes(data)) if convert else data
+                        pieces.append(message_record(number, len(pieces), time, time, message))
+        except Exception as error:  # a library raises whatever the bytes lead it to
+            raise BagError(
+                f"{self.path}: the file changed while it was read ({one_line(error)}); read it again when it is written"
+            ) from None
+        return b"".join(pieces)
+
+    def _definition(self, number: int) -> Definition:
+        schema = self.schemas[self.channels[number].schema_id]
+        return define(schema.name, schema.encoding, schema.data)
+
+
+def scan_foreign(path: Path) -> Foreign | None:
+    """What is in a file that is a ROS 1 bag or a database; None for every other."""
+    with open(path, "rb") as stream:
+        head = stream.read(len(_DATABASE))
+    if head.startswith(b"#ROSBAG V") and not head.startswith(_BAG):
+        raise BagError(
+            f"{path}: a ROS 1 bag of another version than 2.0; convert it with `rosbag fix` of ROS 1, or record again"
+        )
+    if not head.startswith((_DATABASE, _BAG)):
+        return None
+    found: Foreign = aside(_scan, path, "ROS 1 bag" if head.startswith(_BAG) else "database of ROS 2")
+    log = path.with_name(f"{path.name}-wal")
+    if found.magic == _DATABASE and log.exists() and log.stat().st_size:
+        found.warnings.append(
+            f"{path}: messages that were not yet written to it are in {log.name} and are not read; put them in with "
+            f"`sqlite3 {path.name} 'PRAGMA wal_checkpoint'`"
+        )
+    return found
+
+
+@contextmanager
+def _reader(path: Path, magic: bytes) -> Iterator[Any]:
+    from rosbags.rosbag1 import Reader
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    reader = Reader(path) if magic == _BAG else Sqlite3Reader(Path(quote(str(path.resolve()))))
+    reader.open()
+    try:
+        yield reader
+    finally:
+        reader.close()
+
+
+def _scan(path: Path) -> Foreign:
+    with open(path, "rb") as stream:
+        magic = next(known for known in _REMEDIES if stream.read(len(known)) == known or stream.seek(0))
+        found = Foreign(path, path.stat().st_size, magic=magic)
+        chunks = _chunks(stream, found.size) if magic == _BAG else 0
+    try:
+        with _reader(path, magic) as reader:
+            stated = _declare(found, reader, chunks)
+            if magic == _DATABASE and (said := _integrity(reader)) != "ok":
+                found.warnings.append(f"{path}: is damaged ({one_line(said)}); {_remedy(path, magic)}")
+            if trouble := _walk(found, reader):
+                of = f"{found.count} of {count(stated, 'message')} before that count"
+                found.warnings.append(f"{path}: is cut or damaged ({trouble}); {of}; {_remedy(path, magic)}")
+            elif stated != found.count or any(
+                info.msgcount != (found.tally[number].count if number in found.tally else 0)
+                for info in reader.connections
+                for number in [found.numbers[info.id]]
+            ):
+                found.warnings.append(
+                    f"{path}: its index counts {count(stated, 'message')}, and {found.count} could be read, each with "
+                    f"its topic and a log time; {_remedy(path, magic)}"
+                )
+    except (BagError, MemoryError):
+        raise
+    except Exception as error:  # a library raises whatever the bytes lead it to
+        what = "ROS 1 bag" if magic == _BAG else "recording of ROS 2"
+        raise BagError(f"{path}: is cut or damaged or no {what} ({one_line(error)}); {_remedy(path, magic)}") from None
+    return found
+
+
+def _integrity(reader: Any) -> str:
+    """What SQLite finds wrong first: an index that lacks rows hides them from whoever reads in order of time."""
+    return str(reader.dbconn.execute("PRAGMA integrity_check(1)").fetchone()[0])
+
+
+def _remedy(path: Path, magic: bytes) -> str:
+    return _REMEDIES[magic].format(path.name)
+
+
+def _usable(time: object, data: object) -> bool:
+    return isinstance(time, int) and 0 <= time <= LATEST and isinstance(data, bytes)
+
+
+def _chunks(stream: BinaryIO, size: int) -> int:
+    """Count the chunks of a ROS 1 bag from its beginning, to compare with its index."""
+    number, at = 0, stream.seek(len(_BAG))
+    while at < size:
+        header = stream.read(_LENGTH.unpack(head)[0]) if len(head := stream.read(4)) == 4 else b""
+        rest = stream.read(4)
+        if len(rest) < 4:
+            break
+        number += _CHUNK in header
+        at = stream.seek(_LENGTH.unpack(rest)[0], 1)
+    return number
+
+
+def _declare(found: Foreign, reader: Any, chunks: int) -> int:
+    """Channels and schemas of the file; returns how many messages its index states."""
+    if len(reader.connections) > _MOST_TOPICS:
+        raise BagError(f"{found.path}: has more than {_MOST_TOPICS} topics; write those that are needed")
+    encodings, qos, distribution = {}, {}, ""
+    if found.magic == _DATABASE:
+        stated = reader.metadata.message_count
+        encodings = {c.id: c.ext.serialization_format for c in reader.connections}
+        if reader.schema >= 2:
+            qos = dict(reader.dbconn.execute("SELECT id, offered_qos_profiles FROM topics"))
+        if reader.schema >= 3:
+            distribution = next(iter(reader.dbconn.execute("SELECT ros_distro FROM schema")), ("",))[0]
+    else:
+        if chunks != len(reader.chunks):
+            found.warnings.append(
+                f"{found.path}: holds {count(chunks, 'chunk')}, and its index lists {len(reader.chunks)}; "
+                f"{_remedy(found.path, found.magic)}"
+            )
+        stated = sum(sum(info.connection_counts.values()) for info in reader.chunk_infos)
+    schemas: dict[tuple[str, str], int] = {}
+    borrowed = ""
+    for number, connection in enumerate(reader.connections, start=1):
+        kind, text = connection.msgtype, connection.msgdef.data
+        if (schema := schemas.get((kind, text), 0)) == 0:
+            schema = schemas[kind, text] = len(schemas) + 1
+            encoding, data = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg", text.encode()
+            if found.magic == _BAG:
+                data = ros2_text(kind, data)
+            elif not text:
+                text, store = distribution_text(kind, distribution)
+                data, borrowed = text.encode(), borrowed or store
+            found.schemas[schema] = Schema(schema, data, encoding, kind)
+        found.numbers[connection.id] = number
+        metadata = {"offered_qos_profiles": qos[connection.id]} if qos.get(connection.id) else {}
+        found.channels[number] = Channel(
+            number, connection.topic, encodings.get(connection.id) or "cdr", metadata, schema
+        )
+    if borrowed:
+        found.warnings.append(
+            f"{found.path}: the file does not hold the definitions of all its types; those of {borrowed} are used"
+        )
+    return int(stated)
+
+
+def _walk(found: Foreign, reader: Any) -> str:
+    """Blocks of messages in order of time; returns what ended it early."""
+    most = min(max(_BLOCK, found.size >> 4), _LARGEST_BLOCK)
+    rows: list[tuple[int, int]] = []  # channel and time
+    size, trouble = 0, ""
+    messages = iter(reader.messages(reader.connections)) if reader.connections else iter(())
+    while True:
+        try:
+            connection, time, data = next(messages)
+        except StopIteration:
+            break
+        except Exception as error:  # a library raises whatever the bytes lead it to
+            trouble = one_line(error)
+            rows = [row for row in rows if row[1] != rows[-1][1]]  # the next one may be of that time
+            break
+        if not _usable(time, data):
+            continue
+        if size > most and time > rows[-1][1]:
+            _close(found, rows, size)
+            rows, size = [], 0
+        rows.append((found.numbers[connection.id], time))
+        size += len(data)
+    if rows:
+        _close(found, rows, size)
+    return trouble
+
+
+def _close(found: Foreign, rows: list[tuple[int, int]], size: int) -> None:
+    for number, time in rows:
+        tally = found.tally.setdefault(number, Tally(0, time, time))
+        tally.count, tally.last = tally.count + 1, time
+    channels = frozenset(number for number, _ in rows)
+    found.blocks.append(Block(len(found.blocks), size, "", size, rows[0][1], rows[-1][1], channels))
+
 
 _PART = re.compile(r"(?P<stem>.*)_(?P<index>\d+)\.(?:mcap|db3|bag)")
 

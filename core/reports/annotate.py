@@ -39,8 +39,7 @@ from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.bag_files import survey
-from uncertain_lti.recordings.mcap_copy import copy, declare
-from uncertain_lti.recordings.mcap_records import Contents, count
+from uncertain_lti.recordings.mcap_records import Contents, copy, count, declare
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti.recordings.message_types import define, jazzy_text
 from uncertain_lti.recordings.recording import Progress, Recording
