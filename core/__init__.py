@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from uncertain_lti.model.operating_point import OperatingPoint as OperatingPoint
     from uncertain_lti.model.uncertain_lti import UncertainLTI as UncertainLTI
     from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor as EnvelopeMonitor
-    from uncertain_lti.proposal.fitting import fit as fit
+    from uncertain_lti.proposal.public_fit import fit as fit
     from uncertain_lti.proposal.tune import tune as tune
     from uncertain_lti.sampling.reading import read_transients as read_transients
     from uncertain_lti.sampling.transient import Transient as Transient
@@ -43,7 +43,7 @@ _HOME = {
     "SignalMap": "signals.signal_map",
     "Transient": "sampling.transient",
     "UncertainLTI": "model.uncertain_lti",
-    "fit": "proposal.fitting",
+    "fit": "proposal.public_fit",
     "read_transients": "sampling.reading",
     "tune": "proposal.tune",
     "validate": "validation.left_out",

@@ -22,7 +22,7 @@ import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, SignalMap
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import text_of
-from uncertain_lti.proposal.horizons import MOST, choose_horizons, lengths_of
+from uncertain_lti.proposal.search import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.model_text import horizon_blocks
 from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.left_out import validate

@@ -29,7 +29,7 @@ from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
 from uncertain_lti.reports.validation_text import signature_text
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.validation.signatures import learn_signatures
+from uncertain_lti.validation.labelled_faults import learn_signatures
 
 DT, ONSET = 0.02, 500
 A = np.array([[-2.0, 1.0, 0.0], [0.0, -3.0, 2.0], [1.5, 0.0, -4.0]])

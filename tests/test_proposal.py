@@ -23,11 +23,9 @@ from hypothesis import strategies as st
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.main import main
-from uncertain_lti.proposal.candidates import Candidate, Source
+from uncertain_lti.proposal.candidates import Candidate, Source, role_by_name
 from uncertain_lti.proposal.choosing import choose
-from uncertain_lti.proposal.init import propose
-from uncertain_lti.proposal.reading import LONGEST_ARRAY
-from uncertain_lti.proposal.roles import role_by_name
+from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
 JOINT = "sensor_msgs/msg/JointState"
@@ -148,7 +146,7 @@ def test_a_command_that_one_recording_lacks_is_told_by_name(tmp_path):
 
 def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
     """The command and the first of two states fit the limit."""
-    import uncertain_lti.proposal.reading as module
+    import uncertain_lti.proposal.init as module
 
     monkeypatch.setattr(module, "MOST_VALUES", 900)
 

@@ -26,8 +26,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.cli.options import schedule as _schedule
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.free_run import run_over
-from uncertain_lti.proposal.scheduling import EXCESS_FOR_MUCH, Candidate, best_of, choose_knots, decide
-from uncertain_lti.proposal.search import EXCESS
+from uncertain_lti.proposal.search import EXCESS, EXCESS_FOR_MUCH, KnotCandidate, best_of, choose_knots, decide
 from uncertain_lti.proposal.tune import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
 
@@ -110,11 +109,11 @@ def test_recordings_that_visit_different_regimes_keep_one_knot_and_say_why():
 def test_a_recording_unlike_all_others_excuses_nothing():
     """One left-out part that no number of knots covers has so large an error that any difference is within it."""
     judged, one = np.full(10, 2000.0), np.array([900.0, 1, 0, 1, 0, 2, 1, 0, 1, 1])
-    base = Candidate(count=1, judged=judged, outside=one, log_width=np.zeros(10))
+    base = KnotCandidate(count=1, judged=judged, outside=one, log_width=np.zeros(10))
 
     def knots(more, unlike):
         outside = np.array([unlike, *(one[1:] + more)])
-        return Candidate(count=3, judged=judged, outside=outside, log_width=np.full(10, -0.6))
+        return KnotCandidate(count=3, judged=judged, outside=outside, log_width=np.full(10, -0.6))
 
     assert best_of([base, fine := knots(1.0, 1100.0)]) is fine
     for worse in (knots(4.0, 860.0), knots(4.0, 600.0)):
@@ -132,8 +131,10 @@ def test_a_recording_unlike_all_others_excuses_nothing():
 def test_at_most_so_many_times_what_one_knot_leaves_outside(outside, width, taken):
     """Also where that is a small share; not if the bounds are much narrower."""
     judged = np.full(10, 10_000.0)
-    base = Candidate(count=1, judged=judged, outside=np.full(10, 3.0), log_width=np.zeros(10))
-    knots = Candidate(count=2, judged=judged, outside=np.full(10, float(outside)), log_width=np.full(10, np.log(width)))
+    base = KnotCandidate(count=1, judged=judged, outside=np.full(10, 3.0), log_width=np.zeros(10))
+    knots = KnotCandidate(
+        count=2, judged=judged, outside=np.full(10, float(outside)), log_width=np.full(10, np.log(width))
+    )
     assert knots.worst(base) < EXCESS
     assert best_of([base, knots]) is (knots if taken else base)
     few = [replace(c, judged=10.0 * judged) for c in (base, knots)]

@@ -244,7 +244,7 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
         for transient in runs:
             options.progress.note(*transient.notes)
         return [plotted_transient(transient, len(runs)) for transient in runs]
-    from uncertain_lti.proposal.reading import moving_numbers
+    from uncertain_lti.proposal.init import moving_numbers
 
     plotted = []
     for bag in bags:

@@ -78,7 +78,7 @@ def run_signature(options: argparse.Namespace) -> Result:
     """Learn the signatures and write the model with them."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.reports.validation_text import signature_text
-    from uncertain_lti.validation.signatures import learn_signatures
+    from uncertain_lti.validation.labelled_faults import learn_signatures
 
     output = model_target(options.output, options.force)
     pairs = [text.partition("=") for text in options.bags]

@@ -7,19 +7,24 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Candidates: the topics of recordings, and their numbers that could be signals."""
+"""Candidates: the numbers of topics that could be signals, how clearly they show in the next step, and their roles."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.recording import usual_step
+from uncertain_lti.recordings.table import TYPE
 from uncertain_lti.signals.functions import FUNCTIONS, QUATERNION
 
 FEWEST = 20
@@ -130,3 +135,305 @@ class Source:
     def free(self) -> list[Candidate]:
         """Candidates without a reason against them."""
         return [c for c in self.candidates if not c.reason]
+
+
+SHOWS = 20.0
+"""F statistic from which on something counts as visible in the next step."""
+
+
+FAINT = 5.0
+"""F statistic below which a control counts as visible nowhere."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Transitions of some states, with the controls in force.
+
+    `X` (N, n): states, recorded units; `U` (N, m): controls, recorded units; `dX` (N, n): what the states change by.
+    """
+
+    X: Array
+    U: Array
+    dX: Array
+
+    def effect(self, on: Sequence[int], of: Sequence[int] | None = None, given: Sequence[int] | None = None) -> Array:
+        """F statistic in the next step of some states: of the controls, or of other states.
+
+        Given the states `given` (default all), and the controls unless these are what is asked for.
+        """
+        n, m = self.X.shape[1], self.U.shape[1]
+        tested = list(range(n, n + m)) if of is None else list(of)
+        known = [j for j in (range(n) if given is None else given) if j not in tested]
+        if of is not None:
+            known += range(n, n + m)
+        Z, Y = np.hstack([self.X, self.U]), self.dX[:, list(on)]
+        freedom = len(Z) - len(known) - len(tested) - 1
+        if freedom < 5 or not tested:
+            return np.zeros(len(on))
+        without, full = residual(Z[:, known], Y), residual(Z[:, [*known, *tested]], Y)
+        floor = 1e-12 * (Y**2).sum(axis=0) + 1e-300
+        gain = np.maximum(without - full, 0.0) / len(tested)
+        return np.asarray(gain / ((full + floor) / freedom))
+
+    def effect_of_each(self) -> Array:
+        """F statistic of each control, given the others, in the next step of each state (m, n)."""
+        n, m = self.X.shape[1], self.U.shape[1]
+        each = [replace(self, X=np.hstack([self.X, np.delete(self.U, j, 1)]), U=self.U[:, [j]]) for j in range(m)]
+        return np.array([alone.effect(range(n)) for alone in each]).reshape(m, n)
+
+
+def residual(Z: Array, Y: Array) -> Array:
+    """Sum of squares that a least-squares fit on [1, Z] leaves.
+
+    `Z` (N, j): regressors; `Y` (N, k): targets; Returns (k,): units of Y squared.
+    """
+    size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
+    design = np.hstack([np.ones((len(Z), 1)), Z / size])
+    Q, _ = np.linalg.qr(design)
+    rest = Y - Q @ (Q.T @ Y)
+    return np.asarray((rest**2).sum(axis=0))
+
+
+def steps_of(
+    state: Sequence[Candidate], of: dict[str, Source], controls: Sequence[Candidate], lags: Sequence[int] = ()
+) -> Steps:
+    """Samples on the messages of the slowest of the states' topics; of the others, the latest message before."""
+    lags = lags or [0] * len(controls)
+    longest = max(lags, default=0)
+    topics = list(dict.fromkeys(c.topic for c in state))
+    clock = min(topics, key=lambda t: of[t].rate)
+    X, U, dX = [], [], []
+    for number, arrival in enumerate(of[clock].arrival):
+        columns = [held(c, of[c.topic], number, of[clock]) for c in [*state, *controls]]
+        x, u = np.hsplit(np.column_stack(columns), [len(state)])
+        step = np.diff(arrival)
+        if len(step) < 2 + longest:
+            continue
+        positive = step[step > 0]
+        limit = 2.5 * float(np.median(positive)) if len(positive) else 0.0
+        for j, lag in enumerate(lags):
+            u[:, j] = earlier(u[:, j], lag)
+        good = (step > 0) & (step <= limit)
+        good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
+        good[200_000:] = False  # enough to tell
+        X.append(x[:-1][good])
+        U.append(u[:-1][good])
+        dX.append(np.diff(x, axis=0)[good])
+    n, m = np.empty((0, len(state))), np.empty((0, len(controls)))
+    return Steps(np.concatenate([n, *X]), np.concatenate([m, *U]), np.concatenate([n, *dX]))
+
+
+def earlier(values: Array, samples: int) -> Array:
+    """Each value some samples before.
+
+    `values` (N,): one per sample; Returns (N,): naN where there is none.
+    """
+    return np.concatenate([np.full(min(samples, len(values)), np.nan), values[: max(len(values) - samples, 0)]])
+
+
+def held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:
+    """Latest value at each message of the clock.
+
+    Returns (messages of the clock,): naN before the first value, and where it is too old.
+    """
+    if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
+        return np.full(len(clock.arrival[number]), np.nan)
+    mine, at = source.instants(clock, number)
+    position = np.searchsorted(mine, at, side="right") - 1
+    values = candidate.values[number][np.maximum(position, 0)]
+    age = (at - mine[np.maximum(position, 0)]) * 1e-9
+    gone = position < 0 if oldest is None else (position < 0) | (age > oldest)
+    return np.where(gone, np.nan, values)
+
+
+def explained(state: Source, controls: Sequence[Source]) -> float:
+    """How clearly some topics show in the next step of the best of a topic's numbers."""
+    every = {s.topic: s for s in [state, *controls]}
+    steps = steps_of(state.free, every, [c for s in controls for c in s.free])
+    if len(steps.X) < FEWEST:
+        return 0.0
+    return float(np.max(steps.effect(range(len(state.free))), initial=0.0))
+
+
+# Words in the name of a topic or of its type; the last word of a name counts most.
+_COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
+
+
+_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in a table
+
+
+_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
+
+
+_STATE = re.compile(
+    r"(state|odom|pose|twist|imu|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
+    r"depth|pressure|temperature|power|attitude|estimat|log|response|data$)"
+)
+
+
+_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|measur|estimat")
+
+
+_APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
+
+
+FEWEST_SET, MOST_SET = 3, 0.2
+"""A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
+
+
+_PHYSICAL = re.compile(
+    r"^(imu|jointstate|odometry|twist|pose|wrench|accel|vector3|quaternion|transformstamped|ackermann)"
+)
+
+
+_APART_TYPES = {
+    "rcl_interfaces/msg/Log", "rcl_interfaces/msg/ParameterEvent", "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock",
+    "diagnostic_msgs/msg/DiagnosticArray", "diagnostic_msgs/msg/DiagnosticStatus", "sensor_msgs/msg/BatteryState",
+    "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/Image", "sensor_msgs/msg/LaserScan",
+    "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/OccupancyGrid", "nav_msgs/msg/Path",
+    "visualization_msgs/msg/Marker", "visualization_msgs/msg/MarkerArray",
+}  # fmt: skip
+
+
+def is_physical(type_name: str) -> bool:
+    """Whether messages of a type hold how a body or a joint is and moves."""
+    return bool(_PHYSICAL.search(type_name.rpartition("/")[2].lower()))
+
+
+def role_by_name(topic: str, type_name: str) -> str:
+    """What a topic seems to be by its name, the last word first, else by its type."""
+    if type_name in _APART_TYPES:
+        return "apart"
+    name = topic.strip("/").lower()
+    last = name.rpartition("/")[2]
+    kind = type_name.rpartition("/")[2].lower()
+    if not is_physical(type_name) and any(_APART.search(text) for text in (last, name)):
+        return "apart"
+    for text in (last, name, kind):
+        if _ANSWER.search(text):
+            return "state"
+        if _REFERENCE.search(text):
+            return "reference"
+        if _COMMAND.search(text):
+            return "control"
+        if text == last and kind == "twist" and text.endswith("vel"):
+            return "control"  # a bare Twist is what drives a base
+        if _STATE.search(text):
+            return "state"
+    return ""
+
+
+def role_of_column(name: str) -> str:
+    """What a column of a table seems to be by its name."""
+    low = name.lower()
+    if _ANSWER.search(low):
+        return "state"
+    if _REFERENCE.search(low):
+        return "reference"
+    return "control" if _COMMAND.search(low) or _COLUMN.search(low) else "state"
+
+
+def at_rest(sources: Sequence[Source]) -> str:
+    """What to say of recordings in which there are commands and none of them moves."""
+    commands = [s for s in sources if s.role == "control" and s.count and s.candidates]
+    if not commands or any(s.free for s in commands):
+        return ""
+    still = shortlist([f"{s.topic} {c.path} {c.reason}" for s in commands for c in s.candidates[:1]], 3)
+    return (
+        f"no command moves ({still}): the machine is at rest, and what is proposed drifts or is disturbed; record the "
+        "machine at work before you fit a model"
+    )
+
+
+def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
+    """Give the roles that a person asks for in place of those by name."""
+    asked = [("state", p) for p in states] + [("control", p) for p in controls]
+    met: dict[str, set[int]] = {"state": set(), "control": set()}
+    for role, pattern in asked:
+        topic, _, field = pattern.partition(":")
+        found = [
+            c
+            for s in sources
+            for c in s.candidates
+            if fnmatchcase(s.topic, topic) and (not field or fnmatchcase(_plain(c.path), _plain(field)))
+        ]
+        if not any(not c.reason for c in found):
+            fields = [f"{s.topic}:{c.path}" for s in sources for c in s.candidates if pattern == c.path]
+            why = f"; topics there: {_topics(sources)}"
+            if found:
+                why = f"; {found[0].path} is {found[0].reason}"
+            elif fields:
+                why = f"; a field is asked for with its topic, {' or '.join(fields[:3])}"
+            raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
+        met[role] |= {id(c) for c in found}
+    for source in sources:
+        for role, patterns in (("state", states), ("control", controls)):
+            mine, why = {id(c) for c in source.candidates} & met[role], f"not asked for by --{role}s"
+            if mine:
+                source.role, source.reason = role, ""
+            elif patterns and source.role == role:
+                source.role, source.reason = "apart", source.reason or why
+            else:
+                continue
+            for candidate in source.free:
+                if id(candidate) not in mine:
+                    candidate.reason = source.reason or why
+
+
+def _plain(path: str) -> str:
+    """A field path without what a pattern would take for a choice of letters."""
+    return path.replace("[", "(").replace("]", ")")
+
+
+def _topics(sources: Sequence[Source]) -> str:
+    return shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)
+
+
+def _held_columns(table: Source) -> Source | None:
+    """Columns of a table that are held, and set now and then, if they show in the next step of the others.
+
+    They leave the table for a topic of their own, whose role is a guess.
+    """
+    if table.type != TYPE:
+        return None
+    changed = {id(c): np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
+    held = [c for c in table.free if FEWEST_SET <= changed[id(c)].sum() <= MOST_SET * len(changed[id(c)])]
+    rest = replace(table, candidates=[c for c in table.candidates if not any(c is other for other in held)])
+    found = replace(table, candidates=held, role="guess")
+    if not held or not rest.free or explained(rest, [found]) <= SHOWS:
+        return None
+    table.candidates = rest.candidates
+    return found
+
+
+def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
+    """Which topics are controls, and which may be the state."""
+    moving = [s for s in sources if s.free]
+    controls = [s for s in moving if s.role == "control"]
+    references = [s for s in moving if s.role == "reference"]
+    if not controls:
+        controls, references = references, []
+    for source in references:
+        source.reason = "a reference for some controller, and there is a command"
+    states = [s for s in moving if s.role == "state"]
+    unknown = [s for s in moving if s.role == ""]
+    if not states:
+        states, unknown = unknown, []
+    if not states and len(controls) > 1:  # commands everywhere by their names: the one that the others explain best
+        best = max(controls, key=lambda s: explained(s, [c for c in controls if c is not s]))
+        controls, states = [c for c in controls if c is not best], [best]
+    if not controls and len(states) + len(unknown) > 1:
+        by_effect = max(
+            (s for s in [*unknown, *states] if len(states) > 1 or s not in states),
+            key=lambda s: max((explained(o, [s]) for o in states if o is not s), default=0.0),
+            default=None,
+        )
+        if by_effect is not None and max(explained(o, [by_effect]) for o in states if o is not by_effect) > SHOWS:
+            by_effect.role = "guess"
+            controls, states = [by_effect], [s for s in states if s is not by_effect]
+            unknown = [s for s in unknown if s is not by_effect]
+    if not controls:
+        controls = [held for source in states if (held := _held_columns(source)) is not None]
+    for source in unknown:
+        source.reason = "neither state nor control by its name or type"
+    return controls, states

@@ -21,8 +21,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source
-from uncertain_lti.proposal.effects import held
+from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, held
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TOPIC
 from uncertain_lti.sampling.steady_state import resolve_auto

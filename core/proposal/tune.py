@@ -29,7 +29,7 @@ from uncertain_lti.identification.evidence import autocorrelation, late_controls
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.proposal.fitting import fit
+from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import PAYS, Fold
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient

@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from uncertain_lti.base.text import Block, Table, named, number, plural, share, text_of
-from uncertain_lti.validation.signatures import Learnt
+from uncertain_lti.validation.labelled_faults import Learnt
 
 MOST_PARTS = 20
 """Recordings or blocks that the table of each names, those with most alarms first."""

@@ -27,8 +27,7 @@ from uncertain_lti.model.horizon import Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.horizons import choose_horizons, lengths_of
-from uncertain_lti.proposal.scheduling import choose_knots, knots_of
+from uncertain_lti.proposal.search import choose_horizons, choose_knots, knots_of, lengths_of
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.values import Additive, HorizonRule, WidthChoice
