@@ -135,9 +135,9 @@ setup(
     entry_points={
         "console_scripts": [
             "uncertain-lti = uncertain_lti.cli.program:main",
-            "envelope_monitor = uncertain_lti_ros.programs:envelope_monitor",
-            "plant = uncertain_lti_ros.programs:plant",
-            "turbofan = uncertain_lti_ros.programs:turbofan",
+            "envelope_monitor = uncertain_lti_ros.nodes:envelope_monitor",
+            "plant = uncertain_lti_ros.nodes:plant",
+            "turbofan = uncertain_lti_ros.nodes:turbofan",
         ]
     },
 )

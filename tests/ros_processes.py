@@ -50,7 +50,7 @@ try:
 except UncertainLTIError as error:
     sys.exit(f"uncertain-lti: {{error}}")
 """
-_NODES = "import sys; from uncertain_lti_ros.programs import {0}; sys.exit({0}())"
+_NODES = "import sys; from uncertain_lti_ros.nodes import {0}; sys.exit({0}())"
 
 
 def until(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> Any:

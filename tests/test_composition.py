@@ -30,9 +30,9 @@ from ros_processes import Diagnostics, World, open_world, until
 from sensor_msgs.msg import JointState
 from test_live import CONTROL, EPOCH_NS, STATE, by_hand, joint_state, saved, stamp_of, vector
 
-from uncertain_lti_ros.arguments import BAD_USAGE
 from uncertain_lti_ros.envelope_monitor import NAME, EnvelopeMonitorNode
 from uncertain_lti_ros.parameters import DEFAULTS
+from uncertain_lti_ros.process import BAD_USAGE
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -24,7 +24,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import leibov2006, transient
-from uncertain_lti.reports.validation_text import detectable_blocks, detectable_data, detectable_words
+from uncertain_lti.reports.model_text import detectable_blocks, detectable_data, detectable_words
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.validation import detectable as module
 from uncertain_lti.validation.detectable import FEWEST, detectable, typical_within

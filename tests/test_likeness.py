@@ -26,8 +26,7 @@ from uncertain_lti.model.signature import Signature, closeness
 from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part, Pattern
 from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check import check_data, check_text
-from uncertain_lti.reports.model_text import model_text
-from uncertain_lti.reports.validation_text import signature_text
+from uncertain_lti.reports.model_text import model_text, signature_text
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.validation.labelled_faults import learn_signatures
 

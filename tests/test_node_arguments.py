@@ -34,7 +34,7 @@ def start(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
     """Start a node with these arguments and come back when it has ended."""
 
     def call(*arguments: str, node: str = "envelope_monitor", **environment: str) -> subprocess.CompletedProcess:
-        code = f"import sys; from uncertain_lti_ros.programs import {node}; sys.exit({node}())"
+        code = f"import sys; from uncertain_lti_ros.nodes import {node}; sys.exit({node}())"
         own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log")}
         with own_domain() as domain:
             return subprocess.run(
@@ -224,7 +224,7 @@ def test_without_rclpy_a_program_says_what_to_install(node: str) -> None:
         ("rclpy", "None", "the Python package rclpy is not installed"),
         ("sensor_msgs.msg", "type(sys)('empty')", "cannot import name 'JointState'"),
     ):
-        code = f"import sys; sys.modules[{module!r}] = {fake}; from uncertain_lti_ros.programs import {node} as run"
+        code = f"import sys; sys.modules[{module!r}] = {fake}; from uncertain_lti_ros.nodes import {node} as run"
         done = subprocess.run([sys.executable, "-c", f"{code}; sys.exit(run())"], capture_output=True, text=True)
         (line,) = done.stderr.splitlines()
         assert done.returncode == 2 and line.startswith(f"{node}: {says}")

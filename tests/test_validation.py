@@ -28,7 +28,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.alarm import back_and_restarts
-from uncertain_lti.reports.validation_text import validation_text
+from uncertain_lti.reports.model_text import validation_text
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.left_out import cut, remaining_spans, validate
 from uncertain_lti.validation.panel import learn
@@ -318,7 +318,7 @@ def test_groups_of_one_recording_are_single_recordings(runs, validation):
 
 
 def test_the_condition_stands_beside_every_interval(days):
-    from uncertain_lti.reports.validation_text import validation_text
+    from uncertain_lti.reports.model_text import validation_text
 
     runs, names = days
     for groups, what in ((None, "recordings"), (names, "groups")):

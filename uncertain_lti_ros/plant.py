@@ -24,8 +24,7 @@ from sensor_msgs.msg import JointState
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
 from uncertain_lti.plants.turbofan_runs import KINDS
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti_ros.arguments import Declared, declare, run_node
-from uncertain_lti_ros.process import Life, living
+from uncertain_lti_ros.process import Declared, Life, declare, living, run_node
 
 _SETTLE = 0.5  # s from the first subscriber on, for the others to come
 

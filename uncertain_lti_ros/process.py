@@ -7,30 +7,294 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""How every process here runs: rclpy started, one executor, an orderly end by signal, and what a terminal shows."""
+"""How every process here runs: its command line, rclpy started, one executor, an orderly end, what a terminal shows."""
 
 from __future__ import annotations
 
 import argparse
 import math
 import os
+import re
 import signal
 import sys
+import textwrap
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import rclpy
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy.exceptions import InvalidHandle, InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.executors import Executor, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
-from uncertain_lti_ros.arguments import ArgumentError, hold_domain, hold_overrides, in_words
+from uncertain_lti.base.errors import UncertainLTIError
+
+BAD_USAGE = 2
+_LAST_DOMAIN = 232
+_PARAMETER, _REMAP, _FILE = "-p NAME:=VALUE", "-r FROM:=TO", "--params-file FILE"
+_LEVEL, _ENCLAVE, _LOG = "--log-level LEVEL", "--enclave ENCLAVE", "--log-config-file FILE"
+_FORMS = {
+    "-p": _PARAMETER, "--param": _PARAMETER, "-r": _REMAP, "--remap": _REMAP, "--params-file": _FILE,
+    "--log-level": _LEVEL, "-e": _ENCLAVE, "--enclave": _ENCLAVE, "--log-config-file": _LOG,
+}  # fmt: skip
+"""How each ROS argument that takes a value reads."""
+_LOGGING = [f"--{how}able-{what}-logs" for how in ("en", "dis") for what in ("rosout", "stdout", "external-lib")]
+_TYPES = {str: "text", bool: "true or false", int: "a whole number", float: "a number"}
+_WIDTH = 100
+
+
+class ArgumentError(UncertainLTIError):
+    """A node was started with arguments or parameters that it cannot use."""
+
+
+@dataclass(frozen=True)
+class Declared:
+    """One parameter of a node.
+
+    `name`: its name; `default`: its default, which gives the type; `text`: what it means, for `--help` and `ros2 param
+    describe`; `fixed`: it can be given at the start only; `low`: least value; None without a range; `high`: greatest
+    value; None without a range.
+    """
+
+    name: str
+    default: str | bool | int | float
+    text: str
+    fixed: bool = False
+    low: float | None = None
+    high: float | None = None
+
+    def descriptor(self) -> ParameterDescriptor:
+        """What `ros2 param describe` shows."""
+        descriptor = ParameterDescriptor(description=self.text, read_only=self.fixed)
+        if self.low is not None and self.high is not None:
+            if isinstance(self.default, int):
+                limits = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=0)
+                descriptor.integer_range = [limits]
+            else:
+                descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
+        return descriptor
+
+    @property
+    def wanted(self) -> str:
+        """The type in words, with the range if there is one."""
+        low, high = (f"{limit:.12g}" for limit in (self.low or 0.0, self.high or 0.0))
+        limits = "" if self.low is None else f" from {low} to {high}"
+        return f"{_TYPES[type(self.default)]}{limits}"
+
+    @property
+    def example(self) -> str:
+        """What a shell takes for the default."""
+        if isinstance(self.default, bool):
+            return str(self.default).lower()
+        return repr(self.default) if self.default != "" else "TEXT"
+
+
+def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
+    """Declare the parameters of a node."""
+    values = {}
+    for parameter in parameters:
+        given = node._parameter_overrides.get(parameter.name)
+        if given is not None:
+            node._parameter_overrides[parameter.name] = whole_to_real(given, parameter.default)
+        try:
+            values[parameter.name] = node.declare_parameter(
+                parameter.name, parameter.default, parameter.descriptor()
+            ).value
+        except (InvalidParameterTypeException, InvalidParameterValueException):
+            given = node._parameter_overrides[parameter.name].value
+            shown = repr(given) if isinstance(given, str) else _shown(given)
+            remedy = f"for example -p {parameter.name}:={parameter.example}"
+            if isinstance(parameter.default, str):
+                remedy = f"if it looks like something else, quote it twice: -p \"{parameter.name}:='{shown}'\""
+            raise ArgumentError(
+                f"parameter {parameter.name} is {shown}, and {parameter.wanted} is wanted; {remedy}"
+            ) from None
+    return values
+
+
+def whole_to_real(given: Parameter, default: object) -> Parameter:
+    """A parameter with its whole number as a real one, if a real one is meant; rclpy takes 2.0 there, and refuses 2."""
+    if isinstance(default, float) and type(given.value) is int:
+        return Parameter(given.name, value=float(given.value))
+    return given
+
+
+def run_node(
+    name: str,
+    summary: str,
+    parameters: Sequence[Declared],
+    run: Callable[[list[str]], int],
+    args: Sequence[str] | None,
+) -> int:
+    """Run a node on some arguments.
+
+    `--help` prints what the node is and its parameters.
+    """
+    given = list(sys.argv[1:] if args is None else args)
+    if "--help" in given or "-h" in given:
+        print(_help(name, summary, parameters))
+        return 0
+    try:
+        _check(given, name)
+        return run(given)
+    except UncertainLTIError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        if args is None:
+            _leave(BAD_USAGE)
+        return BAD_USAGE
+
+
+def _leave(status: int) -> NoReturn:
+    """End the process at once.
+
+    Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            with suppress(OSError, ValueError):
+                stream.flush()
+    os._exit(status)
+
+
+def hold_domain(number: str) -> None:
+    """Refuse a domain without ports, for which Fast DDS would end the process with status 1."""
+    if number.isdecimal() and int(number) > _LAST_DOMAIN:
+        raise ArgumentError(f"ROS_DOMAIN_ID is {number}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
+
+
+def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
+    lines = [
+        f"usage: {name} [--ros-args [{_PARAMETER}]... [{_FILE}]... [{_REMAP}]... [{_LEVEL}]]",
+        "",
+        *textwrap.wrap(summary, _WIDTH),
+        "",
+        "Parameters (* cannot be set while the node runs):",
+    ]
+    for parameter in parameters:
+        star = "*" if parameter.fixed else " "
+        lines.append(f" {star}{parameter.name} = {_shown(parameter.default)}   {parameter.wanted}")
+        lines += textwrap.wrap(parameter.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    lines += [
+        "",
+        f"Example: {name} --ros-args -p {parameters[0].name}:={_example(parameters[0])} -r __node:=my_{name}",
+        f"Exit status: 0 ended by a signal or done, {BAD_USAGE} bad usage.",
+    ]
+    return "\n".join(lines)
+
+
+def _shown(default: object) -> str:
+    return "''" if default == "" else str(default).lower() if isinstance(default, bool) else str(default)
+
+
+def _example(parameter: Declared) -> str:
+    return "machine.model.json" if parameter.name == "model" else parameter.example
+
+
+def _check(given: Sequence[str], name: str) -> None:
+    """Raise ArgumentError for what is no ROS argument, or half of one."""
+    inside, at = False, 0
+    while at < len(given):
+        word, at = given[at], at + 1
+        if word in ("--ros-args", "--"):
+            inside = word == "--ros-args"
+        elif not inside:
+            _refuse(word, given[at : at + 1], name)
+        elif word in _FORMS:
+            value = given[at] if at < len(given) else ""
+            at += 1
+            _hold_value(word, value)
+        elif word not in _LOGGING:
+            remedy = "--help lists what there is"
+            if ":=" in word:
+                remedy = f"write -p {word}"
+            elif name == "envelope_monitor" and not word.startswith("-"):
+                remedy = f"if it is the model file, write -p model:={word}"
+            raise ArgumentError(f"{word} is no ROS argument; {remedy}")
+
+
+def _refuse(word: str, after: Sequence[str], name: str) -> None:
+    if ":=" in word:
+        remedy = f"write --ros-args {'-r' if word.startswith('_') else '-p'} {word}"
+    elif word in _FORMS:
+        remedy = f"write --ros-args {' '.join([word, *after]) if after else _FORMS[word]}"
+    elif word.startswith("-"):
+        remedy = "a parameter is given as --ros-args -p NAME:=VALUE, and --help lists them"
+    elif name == "envelope_monitor":
+        remedy = f"if it is the model file, write --ros-args -p model:={word}"
+    else:
+        remedy = "--help lists what there is"
+    raise ArgumentError(f"argument {word} has no meaning here; {remedy}")
+
+
+def _hold_value(flag: str, value: str) -> None:
+    form = _FORMS[flag]
+    if not value or value in _FORMS or value in ("--ros-args", "--"):
+        raise ArgumentError(f"{flag} has nothing after it; write {form}")
+    if ":=" in form:
+        left, found, right = value.partition(":=")
+        if not (left and found):
+            raise ArgumentError(f"{flag} {value} cannot be read; write {form}")
+        if not right:
+            empty = f"; an empty text is -p \"{left}:=''\"" if form == _PARAMETER else ""
+            raise ArgumentError(f"{flag} {value} has nothing after :=; write {form}{empty}")
+    if form == _FILE and not Path(value).is_file():
+        raise ArgumentError(f"{flag} {value} is not a file; check the path")
+
+
+def in_words(error: Exception) -> str:
+    """One sentence from an error of rcl, which names lines of its own source."""
+    text = re.sub(r",? at /\S+:\d+", "", " ".join(str(error).split()))
+    text = re.sub(r"Error: error not set\W*", "", text).removeprefix("failed to initialize rcl: ").rstrip(". ")
+    if typed := re.search(r"parameter '(\S+)' to '(.*)' of type '\w+', expecting type '(\w+)'", text):
+        return f"parameter {typed[1]} is {typed[2]!r}, and {typed[3].lower()} is wanted"
+    text = text.replace("error not set", "rcl gives no reason")
+    quoted = re.search(r"'(-\S+) ([^']*)'\W*(?:Error: )?(.*)", text)
+    if quoted is None or quoted[1] not in _FORMS:
+        return f"rclpy cannot start: {text}; check the ROS arguments and the environment variables of ROS"
+    flag, value, why = quoted.groups()
+    form = _FORMS[flag]
+    if form == _FILE:
+        return f"parameter file {value} cannot be read: {why}; it reads NODE: ros__parameters: NAME: VALUE"
+    if form == _LEVEL:
+        return f"{flag} {value} is no log level; choose debug, info, warn, error or fatal"
+    text = f"{flag} {value} cannot be read; write {form}"
+    if form == _PARAMETER:
+        return f"{text}, with a name of letters, digits, _ and . and a value as in YAML"
+    return f"{text}, with names of letters, digits, _ and /" + ", and a namespace from / on" * value.startswith("__ns")
+
+
+def hold_overrides(node: Node, args: Sequence[str]) -> None:
+    """Refuse parameters that were given and that the node does not have; log what may be meant for others.
+
+    A name in a file that resembles none of this node's may belong to another node that shares the file.
+    """
+    overrides = node._parameter_overrides
+    known = sorted(node._parameters)
+    words = [args[i + 1] for i, word in enumerate(args[:-1]) if word in ("-p", "--param")]
+    at_command_line = {word.partition(":=")[0].rpartition(":")[2] for word in words}
+    for name in overrides:
+        if name in known:
+            continue
+        near = get_close_matches(name, known, 1, 0.75)
+        if near or name in at_command_line:
+            remedy = f"did you mean {near[0]}?" if near else "--help lists those there are"
+            raise ArgumentError(f"there is no parameter {name}; {remedy}")
+        node.get_logger().warning(f"parameter {name} is ignored: this node has none of that name; --help lists them")
+    files = [args[i + 1] for i, word in enumerate(args[:-1]) if word == "--params-file"]
+    if files and not overrides:
+        node.get_logger().warning(
+            f"{', '.join(files)}: nothing in it is for this node; name the section {node.get_name()} or /**"
+        )
+
 
 _LATENCY = 0.1  # s that a signal waits at most
 _SPIN = 30.0  # s between two checks whether rclpy has been shut down from elsewhere

@@ -24,9 +24,8 @@ from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.command import print_json
-from uncertain_lti_ros.arguments import ArgumentError
 from uncertain_lti_ros.messages import definition, message_class
-from uncertain_lti_ros.process import Life, Progress, hush, living, say, seconds, tell
+from uncertain_lti_ros.process import ArgumentError, Life, Progress, hush, living, say, seconds, tell
 from uncertain_lti_ros.topics import POLL, MatchedSubscription
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process

@@ -26,12 +26,12 @@ from typing import Any, NoReturn
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError, absent
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import delegated, fit, judge, start, validate
+from uncertain_lti.cli import delegated, fit, judge, start
 from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output, run
 
 COMMANDS: tuple[Command, ...] = (
     start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, delegated.LAYOUT,
-    validate.VALIDATE, validate.SIGNATURE, delegated.INFO, delegated.REPRODUCE, delegated.PLAY, delegated.RECORD,
+    fit.VALIDATE, fit.SIGNATURE, delegated.INFO, delegated.REPRODUCE, delegated.PLAY, delegated.RECORD,
     delegated.WATCH, delegated.DEMO, delegated.COMPLETION,
 )  # fmt: skip
 """Every command, in the order of the help."""

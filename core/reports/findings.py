@@ -24,8 +24,7 @@ from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import UNVOUCHED, check_data
-from uncertain_lti.reports.model_text import blocks_in_words
-from uncertain_lti.reports.validation_text import readable_validation
+from uncertain_lti.reports.model_text import blocks_in_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
 """Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What `fit` and `info` print of a model, and what a report has of it."""
+"""Texts of a model, and of what was left out of its fit: what all commands print that make or show a model."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.overview import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.reports.validation_text import condition_text, detectable_data, detectable_words, left_out_text
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.validation.labelled_faults import Learnt
 
 MOST_SHOWN = 20
 """Signals whose elements, and discarded transitions that are printed."""
@@ -238,3 +238,232 @@ def blocks_in_words(model: UncertainLTI) -> list[str]:
     if any(data.transitions is None for data in model.block_data):
         found.append("the model file does not say how much data each regime had")
     return found
+
+
+MOST_PARTS = 20
+"""Recordings or blocks that the table of each names, those with most alarms first."""
+COLUMNS: Mapping[str, tuple[tuple[str, str], ...]] = {
+    "sensor": (("bias", "off by"), ("drift", "drifts, per s"), ("scale", "scaled by"), ("noise", "noise")),
+    "sensor ": (("spike", "one sample off by"), ("freeze", "frozen, s"), ("dropout", "reads 0, s"),
+                ("sensor_delay", "late, s")),
+    "actuator": (("offset", "off by"), ("loss", "loses"), ("stuck", "stuck, s"), ("actuator_delay", "late, s")),
+    "dynamics": (("time_constant", "time constant"), ("gain", "gain")),
+}  # fmt: skip
+"""Kinds of faults that share a table, and heads of their columns."""
+_SHARES = ("scale", "loss", "time_constant", "gain")
+_UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+
+
+def validation_text(data: Mapping[str, Any]) -> str:
+    """Summary of `Validation.to_dict()` for a person."""
+    return text_of(validation_blocks(data))
+
+
+def readable_validation(data: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """A model's section on validation where it says what `validate` writes; anything may be written in a file."""
+    try:
+        validation_blocks(data)
+    except _UNREADABLE:
+        return None
+    return data
+
+
+def validation_blocks(data: Mapping[str, Any]) -> list[Block]:
+    """How the model does on what was left out, its false alarms, and the faults that it sees."""
+    what, states = _part(data), data["states"].items()
+    gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
+    under = f", {short}" if (short := data.get("condition_short")) else ""  # older files have none
+    percent = f"{data['confidence']:.0%}"
+    rows = [
+        [
+            named(name, s["unit"]),
+            share(s["inside"]),
+            f"{s['parts_inside']:d}/{data['parts']:d}",
+            number(s["mean_width_left_out"]),
+            number(s["mean_width_full"]),
+        ]
+        for name, s in states
+    ]
+    blocks: list[Block] = [
+        f"left out one {_unit(data)} at a time ({_how_many(data)}{gap}): {plural(data['verdicts'], 'verdict')}, "
+        f"{number(data['hours'])} h",
+        Table(("left out", "inside", f"{what}s inside", "mean width", "mean width fitted"), rows, most=200),
+    ]
+    if data["inside"] is not None:
+        low, high = data["inside_interval"]
+        blocks.append(
+            f"inside all bounds: {data['inside']:.3%} of the verdicts "
+            f"({percent} interval {low:.3%} to {high:.3%}{under})"
+        )
+        low, high = data["parts_inside_interval"]
+        blocks.append(
+            f"whole {what}s inside all bounds: {data['parts_inside']:d} of {data['parts']:d} "
+            f"({percent} interval {low:.1%} to {high:.1%}{under})"
+        )
+        if groups := data.get("groups"):
+            blocks.append(f"whole groups inside all bounds: {groups['inside']} of {groups['count']}")
+        rows = [_alarm_row(alarm) for alarm in data["false_alarms"]]
+        blocks.append(Table(("alarm rule", "alarms", "per hour", f"{percent} interval{under}", "time in alarm"), rows))
+    if parts := [p for p in data.get("part", []) if "alarms" in p]:  # older files did not count them
+        worst = sorted(parts, key=lambda p: (-p["alarms"], -p["violated"] / max(p["verdicts"], 1)))
+        header = (what, "verdicts", "inside", "outside domain", "alarms", "time in alarm", "farthest, in half-widths")
+        blocks.append(Table(header, [_part_row(p) for p in worst], most=MOST_PARTS))
+    if "condition" in data:
+        blocks.append(data["condition"])
+    blocks.append(data["scenario"]["words"])
+    if (faults := detectable_data(data)) is not None:
+        blocks += detectable_blocks(faults)
+    return [*blocks, *data.get("promises", []), *(f"note: {note}" for note in data["notes"])]
+
+
+def _alarm_row(alarm: Mapping[str, Any]) -> list[str]:
+    if "rule" not in alarm:  # an older file
+        rule = f"{alarm['violations']} of {alarm['window']}, margin {number(alarm['margin'])}"
+    else:
+        rule = "the model's" if "; or " in alarm["rule"] else str(alarm["rule"])
+    low, high = alarm["interval"]
+    least = "unknown" if high is None else f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"
+    return [rule, f"{alarm['alarms']:d}", number(alarm["per_hour"]), least, share(alarm.get("raised_share"))]
+
+
+def _part_row(part: Mapping[str, Any]) -> list[str]:
+    judged = part["verdicts"]
+    return [
+        part["name"],
+        str(judged),
+        share(1 - part["violated"] / judged if judged else None),
+        share(part["outside_domain"] / judged if judged else None, 2),
+        str(part["alarms"]),
+        share(part["alarm_share"]),
+        "-" if part["farthest"] is None else f"{part['farthest_state']}, {part['farthest']:.3g} x",
+    ]
+
+
+def left_out_text(data: Mapping[str, Any]) -> str:
+    """One line for a fit, and the hint that recordings may come in groups."""
+    if "not_done" in data:
+        return f"not validated, so how it does on other recordings is unknown: {data['not_done']}"
+    ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
+    inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} of the verdicts inside"
+    line = (
+        f"left out one {_unit(data)} at a time ({_how_many(data)}): {inside}, "
+        f"{plural(data['parts_inside'], f'whole {_part(data)}')}, widths at most {ratio:.3g} times those above; more: "
+        f"uncertain-lti validate"
+    )
+    return f"{line}\nnote: {data['hint']}" if data["hint"] else line
+
+
+def _part(data: Mapping[str, Any]) -> str:
+    return "recording" if data["kind"] == "transients" else "block"
+
+
+def _unit(data: Mapping[str, Any]) -> str:
+    """What was left out at a time."""
+    return "group" if data.get("groups") else _part(data)
+
+
+def _how_many(data: Mapping[str, Any]) -> str:
+    """How many there are of it."""
+    parts, groups = plural(data["parts"], _part(data)), data.get("groups")
+    return f"{parts} in {plural(groups['count'], 'group')}, by {groups['key']}" if groups else parts
+
+
+# --- smallest detectable faults ----------------------------------------------------------------------------------
+
+
+def detectable_data(validation: Mapping[str, Any]) -> Mapping[str, Any] | None:
+    """The section on detectable faults of a model's validation, if it is one."""
+    try:
+        data: Mapping[str, Any] = validation["detectable"]
+        detectable_blocks(data)
+        detectable_words(data)
+    except _UNREADABLE:
+        return None
+    return data
+
+
+def condition_text(data: Mapping[str, Any]) -> str:
+    """What the sizes hold for."""
+    out = data["left_out"]
+    without = f"; {plural(out, 'case')} with an alarm without a fault left out" if out else ""
+    return (
+        f"smallest fault seen in {data['share']:.0%} of the cases within {number(data['within'])} s "
+        f"({data['confidence']:.0%} interval; put into what was left out at {plural(data['cases'], 'instant')}"
+        f"{without})"
+    )
+
+
+def detectable_blocks(data: Mapping[str, Any]) -> list[Block]:
+    """The smallest detectable faults, a table for kinds that are alike."""
+    if data.get("refused"):
+        return [f"which faults are seen is not known: {data['refused']}"]
+    blocks: list[Block] = [condition_text(data)]
+    for of, columns in COLUMNS.items():
+        faults = {(f["signal"], f["kind"]): f for f in data["faults"] if f["kind"] in dict(columns)}
+        there = [(kind, head) for kind, head in columns if any(kind == k for _, k in faults)]
+        rows = []
+        for signal in dict.fromkeys(signal for signal, _ in faults):
+            mine = [faults.get((signal, kind)) for kind, _ in there]
+            unit = next((f["unit"] for f in mine if f and f["kind"] in ("bias", "offset")), "")
+            rows.append([named(signal, unit), *("-" if f is None else _size_text(f) for f in mine)])
+        if rows:
+            blocks.append(Table((of.strip(), *(head for _, head in there)), rows, most=200))
+    return blocks + list(dict.fromkeys(f"unknown: {f['refused']}" for f in data["faults"] if f.get("refused")))
+
+
+def detectable_words(data: Mapping[str, Any]) -> list[str]:
+    """A short clause for each state and control, those of a first screen."""
+    words: dict[str, list[str]] = {}
+    for fault in data["faults"]:
+        verb = {"bias": "off by", "drift": "drifts by", "offset": "off by", "loss": "loses"}.get(fault["kind"])
+        if verb is not None and not fault.get("refused"):
+            no, size = ("", fault["size"]) if fault["size"] is not None else ("not even if it ", fault["largest"])
+            words.setdefault(fault["signal"], []).append(f"{no}{verb} {_size(fault, size)} {fault['unit']}".rstrip())
+    return [f"{signal}: {', '.join(parts)}" for signal, parts in words.items()]
+
+
+def _size_text(fault: Mapping[str, Any]) -> str:
+    """The smallest detectable size of one fault."""
+    if fault.get("refused"):
+        return "unknown"
+    if fault["size"] is None:
+        return f"not seen ({fault['share']:.0%} at {_size(fault, fault['largest'])})"
+    low, high = fault["size_interval"]
+    return f"{_size(fault, fault['size'])} ({_size(fault, low)} to {_size(fault, high)})"
+
+
+def _size(fault: Mapping[str, Any], value: float | None) -> str:
+    if value is None:
+        return "more than tried"
+    return f"{100 * value:.3g}%" if fault["kind"] in _SHARES else f"{value:.3g}"
+
+
+# --- tune and signature ------------------------------------------------------------------------------------------
+
+
+def tune_text(data: Mapping[str, Any]) -> str:
+    """What `tune` prints: every way that was tried, and what was chosen."""
+    header = ("way", "jumps seen, over those of fit", "width/range", "false alarms per hour at most")
+    rows = [
+        [t["way"], number(t["size"]), share(t["width_over_range"], 2), number(t["limit_per_hour"])]
+        for t in data["trials"]
+        if "refused" not in t
+    ]
+    refused = [f"  {t['way']}: {t['refused']}" for t in data["trials"] if "refused" in t]
+    return text_of([Table(header, rows), *refused, f"chosen: {data['reason']}"])
+
+
+def signature_text(learnt: Learnt) -> str:
+    """What `signature` prints."""
+    rows = [[s.label, str(s.recordings), str(s.verdicts), ", ".join(map(str, s.steps))] for s in learnt.signatures]
+    blocks: list[Block] = [Table(("signature", "recordings", "verdicts", "steps"), rows)]
+    labels = [label for _, label, _ in learnt.named]
+    tried = [(label, found) for _, label, found in learnt.named if labels.count(label) > 1]
+    if tried:
+        right, unknown = sum(label == found for label, found in tried), sum(not found for _, found in tried)
+        blocks.append(
+            f"left out in turn, {right} of {plural(len(tried), 'recording')} named as labelled, "
+            f"{len(tried) - right - unknown} as another fault, {unknown} unknown"
+        )
+    blocks += [f"'{a}' and '{b}' look alike (match {match:.2f}), so neither is named" for a, b, match in learnt.alike]
+    return text_of(blocks)

@@ -43,8 +43,7 @@ from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Spans
 from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
-from uncertain_lti.reports.model_text import model_blocks
-from uncertain_lti.reports.validation_text import detectable_data, detectable_words, validation_blocks
+from uncertain_lti.reports.model_text import detectable_data, detectable_words, model_blocks, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 
 MOST_NUMBERS = 330_000
