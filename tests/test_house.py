@@ -99,6 +99,13 @@ def test_every_command_has_a_file_and_is_registered():
     assert declared == {command.name for command in COMMANDS}
 
 
+def test_no_two_modules_differ_by_a_plural():
+    files = [*(ROOT / "core").rglob("*.py*"), *(ROOT / "uncertain_lti_ros").glob("*.py")]
+    names = [path.stem for path in {path.with_suffix("") for path in files} if path.stem != "__init__"]
+    names.remove("envelope_monitor")  # the node, and what it wires
+    assert len(names) == len({name.removesuffix("s") for name in names})
+
+
 def test_help_imports_nothing_heavy():
     code = "import sys; from uncertain_lti.cli.main import build_parser; build_parser(); print(*sys.modules)"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()

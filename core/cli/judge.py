@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> DeployedMonitor:
     """The monitor that the options `DEPLOYED` describe."""
     from uncertain_lti import EnvelopeMonitor
-    from uncertain_lti.model.file import read_rules
+    from uncertain_lti.model.model_file import read_rules
     from uncertain_lti.monitor.alarm import Condition
     from uncertain_lti.monitor.deployed import DeployedMonitor, listed_states
 

@@ -24,7 +24,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import written
 from uncertain_lti.base.text import plural
-from uncertain_lti.model.file import FORMATS
+from uncertain_lti.model.model_file import FORMATS
 from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES

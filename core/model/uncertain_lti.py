@@ -37,8 +37,8 @@ from uncertain_lti.model.alarm_rule import (
 )
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.envelope import Envelope
-from uncertain_lti.model.file import arguments, read, structure, write
 from uncertain_lti.model.horizon import Horizon, Residuals, Run, checked_horizons
+from uncertain_lti.model.model_file import arguments, read, structure, write
 from uncertain_lti.model.operating_point import OperatingPoint, normalised
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import BlockData, Schedule
