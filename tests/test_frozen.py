@@ -33,9 +33,9 @@ from uncertain_lti.monitor.frozen import needs, repeat_words
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.sampling.status import Status
 
 DT = 0.01
 MS = 1_000_000

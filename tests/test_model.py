@@ -28,11 +28,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.base.limits import LARGEST, LONGEST_S
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.model.file import FORMATS
+from uncertain_lti.model.model_file import FORMATS
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
