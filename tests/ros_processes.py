@@ -39,17 +39,6 @@ from std_srvs.srv import Trigger
 
 PATIENCE = 300.0  # s; costs nothing where all is well
 MONITOR = "/envelope_monitor"
-_COMMANDS = """
-import argparse, sys
-from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti_ros import {0} as command
-parser = argparse.ArgumentParser()
-command.add_arguments(parser)
-try:
-    sys.exit(command.run(parser.parse_args()))
-except UncertainLTIError as error:
-    sys.exit(f"uncertain-lti: {{error}}")
-"""
 _NODES = "import sys; from uncertain_lti_ros.nodes import {0}; sys.exit({0}())"
 
 
@@ -187,9 +176,8 @@ class World:
         return self.start(module, "-c", _NODES.format(module), "--ros-args", *given, *more)
 
     def command(self, name: str, *arguments: Any) -> Process:
-        """`play`, `record` or `watch`."""
-        module = {"play": "player", "record": "recorder"}.get(name, name)
-        return self.start(name, "-c", _COMMANDS.format(module), *(str(a) for a in arguments))
+        """`play`, `record`, `watch` or `demo`."""
+        return self.start(name, "-m", "uncertain_lti.cli.main", name, *(str(a) for a in arguments))
 
     def monitor(self, model: Path | str, *more: str, name: str = MONITOR, **parameters: Any) -> Process:
         """An envelope_monitor that is active."""

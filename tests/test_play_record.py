@@ -248,14 +248,14 @@ def test_what_cannot_be_recorded_is_said_in_a_sentence(world: World, tmp_path: P
     ]
     for arguments, sentence in refused:
         process = world.command("record", *arguments)
-        assert process.wait() == 1 and sentence in process.output, process.output
+        assert process.wait() == 2 and sentence in process.output, process.output
         assert "Traceback" not in process.output
     assert (tmp_path / "there.mcap").read_bytes() == b"old"
     silent = world.publisher(Float64, "/silent")
     process = recorder(world, ["/silent"], tmp_path / "x.mcap")
     world.subscribed(silent)
     process.signal(signal.SIGINT)
-    assert process.wait() == 1 and "no message came on /silent" in process.output
+    assert process.wait() == 2 and "no message came on /silent" in process.output
     assert sorted(p.name for p in tmp_path.glob("*.mcap*")) == ["there.mcap"]
 
 
@@ -392,7 +392,7 @@ def test_what_cannot_be_played_is_said(world: World, tmp_path: Path) -> None:
     ]
     for arguments, sentence in refused:
         process = world.command("play", *arguments)
-        assert process.wait() == 1 and sentence in process.output, process.output
+        assert process.wait() == 2 and sentence in process.output, process.output
         assert "Traceback" not in process.output
 
 
@@ -488,7 +488,7 @@ def test_the_demo_prints_its_numbers_as_json(
     monkeypatch.setattr(demo, "living", lambda _: nullcontext(SimpleNamespace(node=None, alive=True)))
     monkeypatch.setattr(demo, "_watch", lambda *_: {})
     monkeypatch.setattr(demo, "save", lambda *_: None)
-    status = demo.run(SimpleNamespace(output=str(tmp_path / "out"), rate=4.0, json=True))  # type: ignore[arg-type]
+    status = main(["demo", "--output", str(tmp_path / "out"), "--json"])
     data = json.loads(capsys.readouterr().out)
     assert status == 2 and (data["verdicts"], data["equal_live_and_offline"]) == (1400, 0)
     assert data["fault"]["t"] == 24.0 and data["first_alarm_t"] == pytest.approx(24.025)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import io
 import os
 import subprocess
 import sys
@@ -29,14 +28,14 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
-from uncertain_lti.cli.command import print_json
+from uncertain_lti.cli.command import BAD_INPUT, DONE, Result
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
 from uncertain_lti.reports.model_text import fit_text
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.messages import stamp_ns
-from uncertain_lti_ros.process import Life, living, say, speed
+from uncertain_lti_ros.process import Life, living, speed
 
 FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
 CHECK = "turbofan_fan_damage.mcap"
@@ -53,55 +52,46 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print what came out as JSON")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> Result:
     """Run the demo."""
-    if args.json:
-        with contextlib.redirect_stdout(io.StringIO()):
-            status, data = _demo(args)
-        print_json(data)
-        return status
-    return _demo(args)[0]
-
-
-def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
-    bags = _bags()
+    say, bags = args.say, _bags()
     output = Path(args.output)
     output.mkdir(parents=True, exist_ok=True)
     model_file = output / "turbofan.model.json"
 
-    print("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways,")
-    print(f"   and a run under control: {', '.join(FIT)}")
+    say("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways,")
+    say(f"   and a run under control: {', '.join(FIT)}")
     transients = read_transients([bags / name for name in FIT], turbofan_signals())
     model = fit(transients, additive="noise")
     model.save(model_file)
-    print(fit_text(model))
-    print(f"   model: {model_file}")
+    say(fit_text(model))
+    say(f"   model: {model_file}")
 
-    print(f"\n2. Playing {CHECK} at {args.rate:g} times real time to a live envelope_monitor node")
+    say(f"\n2. Playing {CHECK} at {args.rate:g} times real time to a live envelope_monitor node")
     offline = EnvelopeMonitor(model).check(read_as_fitted(bags / CHECK, model.signals))
     with living(lambda: Node("uncertain_lti_demo")) as life:
-        live = _watch(life, model_file, bags / CHECK, args.rate, offline.transient.t_ns)
+        live = _watch(life, args, model_file, bags / CHECK, offline.transient.t_ns)
         if not life.alive:
             raise KeyboardInterrupt
 
-    print("\n3. The same recording checked offline")
-    print(check_text(check_data(model, offline, samples=False)))
+    say("\n3. The same recording checked offline")
+    say(check_text(check_data(model, offline, samples=False)))
     expected = offline.flags[offline.judged]
     same = sum(
         np.array_equal(flags, live.get(t_ns, ()))
         for t_ns, flags in zip(offline.transient.t_ns[offline.judged].tolist(), expected, strict=True)
     )
-    print(f"live and offline verdicts: {same} of {len(expected)} equal")
+    say(f"live and offline verdicts: {same} of {len(expected)} equal")
     t, what = _fault(bags / CHECK)
     left = offline.transient.t_ns[0] + t * 1e9
     after = offline.judged & (offline.transient.t_ns > left)
-    print(
+    say(
         f"at {t:.2f} s {what}: violated in {int((offline.violated & ~after).sum())} of "
         f"{int((offline.judged & ~after).sum())} verdicts before and {int((offline.violated & after).sum())} of "
         f"{int(after.sum())} after"
     )
     raised = offline.transient.t[offline.alarm]
-    print(
+    say(
         "the alarm is raised "
         + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
     )
@@ -114,7 +104,7 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
     }
     for name, figure in figures.items():
         save(figure, output / name)
-        print(f"figure: {output / name}")
+        say(f"figure: {output / name}")
     data = {
         "model": str(model_file),
         "verdicts": len(expected),
@@ -125,7 +115,7 @@ def _demo(args: argparse.Namespace) -> tuple[int, dict[str, Any]]:
         "first_alarm_t": float(raised[0]) if len(raised) else None,
         "figures": [str(output / name) for name in figures],
     }
-    return (0 if same == len(expected) and len(raised) and raised[0] >= t else 2), data
+    return Result(DONE if same == len(expected) and len(raised) and raised[0] >= t else BAD_INPUT, data)
 
 
 def _bags() -> Path:
@@ -155,7 +145,7 @@ def _fault(bag: Path) -> tuple[float, str]:
     raise BagError(f"{bag}: its metadata does not state when a fault begins; make it with bags/make.py")
 
 
-def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> dict[int, Any]:
+def _watch(life: Life, args: argparse.Namespace, model: Path, bag: Path, expected: Any) -> dict[int, Any]:
     """Start monitor and player as processes, show the flags as they come; {t_ns: flags}."""
     flags: dict[int, Any] = {}
     names: list[str] = []
@@ -166,7 +156,7 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
 
     subscription = life.node.create_subscription(JointState, _FLAGS, take, QoSProfile(depth=1000))
     monitor = [sys.executable, "-m", "uncertain_lti_ros.envelope_monitor", "--ros-args", "-p", f"model:={model}"]
-    player = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--rate", str(rate)]
+    player = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--rate", str(args.rate)]
     _refuse_others(life, 0)
     with _process([*monitor, "--log-level", "warn"]):
         _until(life, lambda: life.node.count_publishers(_FLAGS) > 0, "the envelope_monitor node did not start")
@@ -181,10 +171,10 @@ def _watch(life: Life, model: Path, bag: Path, rate: float, expected: Any) -> di
                 elif time.monotonic() - silent_since > _PATIENCE or (
                     playing.poll() is not None and time.monotonic() - silent_since > 2.0
                 ):
-                    say(f"no more flags after {len(flags)} of {len(expected)}")
+                    args.progress.note(f"no more flags after {len(flags)} of {len(expected)}")
                     break
                 if len(flags) - shown >= 100 or len(flags) == len(expected):
-                    _show(flags, shown, names, int(expected[0]))
+                    args.say(_shown(flags, shown, names, int(expected[0])))
                     shown = len(flags)
             confirmed_by = time.monotonic() + _PATIENCE  # the player ends once its messages are confirmed
             while life.alive and playing.poll() is None and time.monotonic() < confirmed_by:
@@ -209,7 +199,7 @@ def _refuse_others(life: Life, own: int) -> None:
         life.spin_once(0.1)
 
 
-def _show(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -> None:
+def _shown(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -> str:
     """One line for the flags that came since the last one."""
     stamps = list(flags)[since:]
     recent = np.array([flags[t] for t in stamps])
@@ -217,10 +207,9 @@ def _show(flags: dict[int, Any], since: int, names: list[str], start_ns: int) ->
     violated = int((recent == 1.0).any(axis=1).sum())
     where = [f"{n} {int((recent[:, i] == 1.0).sum())}" for i, n in enumerate(names) if (recent[:, i] == 1.0).any()]
     word = f"VIOLATED {violated}: {', '.join(where)}" if violated else "contained"
-    print(
+    return (
         f"   t = {(stamps[0] - start_ns) * 1e-9:6.2f} to {(stamps[-1] - start_ns) * 1e-9:6.2f} s: "
-        f"{int(judged.sum())} verdicts, {word}",
-        flush=True,
+        f"{int(judged.sum())} verdicts, {word}"
     )
 
 

@@ -31,12 +31,12 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
-from uncertain_lti.cli.command import print_json
+from uncertain_lti.cli.command import DONE, Result
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import TypeFields
 from uncertain_lti_ros.messages import live_fields, message_class
-from uncertain_lti_ros.process import Life, Progress, hush, living, say, seconds, speed, tell
+from uncertain_lti_ros.process import Life, living, seconds, speed
 
 CLOCK = "/clock"
 _DEPTH = 1000
@@ -78,52 +78,55 @@ class _Played:
     sent: int = field(default=0)
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> Result:
     """Play a recording to its end, or until a signal."""
-    hush(args.quiet)
+    note = args.progress.note
     if args.lockstep and args.rate is not None:
         raise UncertainLTIError("--lockstep goes as fast as the node takes messages; leave out --rate")
     bag = Bag(args.bag)
     with living(lambda: Node(f"uncertain_lti_player_{os.getpid()}")) as life:
-        played = _offer(life.node, bag, args.topics, args.clock)
+        played = _offer(life.node, bag, args.topics, args.clock, note)
         clock = life.node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH)) if args.clock else None
-        for warning in bag.warnings:
-            say(warning)
+        note(*bag.warnings)
         unstamped = [topic for topic in played if "header" not in live_fields(bag.topics[topic].type)]
         if unstamped and not args.clock and args.rate not in (None, 1.0):
-            say(
+            note(
                 f"no header stamps: {', '.join(unstamped)}; a node that uses the time of receipt sees steps "
                 f"{args.rate:g} times as fast; play with --clock, and start the listeners with use_sim_time"
             )
-        _wait(life, played, args.wait)
+        _wait(life, played, args.wait, note)
         messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
+        if args.progress.shown:
+            messages = args.progress.iterate("playing")(messages, sum(p.count for p in played.values()))
         began = time.monotonic()
         if args.lockstep:
             _lockstep(life, played, clock, args.lockstep, messages, args.wait)
         else:
-            _paced(life, played, clock, args.rate or 1.0, messages, _crowd(bag, played))
+            behind = _paced(life, played, clock, args.rate or 1.0, messages, crowd := _crowd(bag, played))
+            if behind > 1.0 and life.alive:
+                note(
+                    f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
+                    f"{1e3 / crowd:.2g} ms apart"
+                )
         took = time.monotonic() - began
         missed = _unconfirmed(life, played)
         if missed:
-            say(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
+            note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
     ended = f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s"
-    if args.json:
-        topics = {p.topic: p.sent for p in played.values()}
-        stopped = life.signal is not None
-        print_json(
-            {"bag": str(bag.path), "messages": sent, "topics": topics, "seconds": took, "unconfirmed": missed}
-            | {"interrupted": stopped}
-        )
     if life.signal is not None:
-        say(f"{ended}, then interrupted" if sent else f"{bag.path}: interrupted before a message was played")
-        return _SIGNALLED + life.signal
-    if not args.json:
-        tell(ended)
-    return 0
+        ended = f"{ended}, then interrupted" if sent else f"{bag.path}: interrupted before a message was played"
+    args.say(ended)
+    data = {
+        "bag": str(bag.path), "messages": sent, "topics": {p.topic: p.sent for p in played.values()}, "seconds": took,
+        "unconfirmed": missed, "interrupted": life.signal is not None,
+    }  # fmt: skip
+    return Result(_SIGNALLED + life.signal if life.signal is not None else DONE, data)
 
 
-def _offer(node: Node, bag: Bag, topics: list[str] | None, clock: bool) -> dict[str, _Played]:
+def _offer(
+    node: Node, bag: Bag, topics: list[str] | None, clock: bool, note: Callable[[str], None]
+) -> dict[str, _Played]:
     """Publishers of what can be played; reports for each other topic why it cannot."""
     asked = list(bag.topics) if topics is None else list(dict.fromkeys(topics))
     for topic in asked:
@@ -140,7 +143,7 @@ def _offer(node: Node, bag: Bag, topics: list[str] | None, clock: bool) -> dict[
             kind = message_class(info.type)
             _hold_layout(info.type, bag.type_fields(topic), live_fields)
         except SignalError as error:
-            say(f"{topic} is not played: {error}")
+            note(f"{topic} is not played: {error}")
             continue
         qos = QoSProfile(depth=_DEPTH, durability=_durability(bag, topic))
         publisher = node.create_publisher(kind, topic, qos)
@@ -188,7 +191,7 @@ def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
     return max(_CROWD, 1.5 * count / (span * 1e-9)) if span > 1e9 else _CROWD
 
 
-def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
+def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[str], None]) -> None:
     """Wait until every subscription that the graph shows is connected, and no new one appears for a while."""
     began = changed = time.monotonic()
     connected: dict[str, int] = {}
@@ -207,9 +210,9 @@ def _wait(life: Life, played: dict[str, _Played], limit: float) -> None:
         return
     unmet = [t for t in played if wanted[t] > counts[t]]
     if not any(wanted.values()):
-        say(f"there is no subscriber to {', '.join(played)} after {limit:g} s; playing nevertheless")
+        note(f"there is no subscriber to {', '.join(played)} after {limit:g} s; playing nevertheless")
     elif unmet:
-        say(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
+        note(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
 
 
 def when_due(
@@ -237,22 +240,15 @@ def when_due(
 def _paced(
     life: Life, played: dict[str, _Played], clock: Publisher | None, rate: float, messages: Iterator[RawMessage],
     crowd: float,
-) -> None:  # fmt: skip
-    progress, total, sent = Progress(), sum(p.count for p in played.values()), 0
+) -> float:  # fmt: skip
+    """Send each message at its time; by how many seconds it fell behind."""
     behind = 0.0
     for message, late in when_due(messages, rate, crowd, lambda: life.alive):
         behind = max(behind, late)
         if clock is not None:
             clock.publish(_clock(message.log_time_ns))
         _send(played, message)
-        sent += 1
-        progress.show(f"{sent} of {total} messages")
-    progress.clear()
-    if behind > 1.0 and life.alive:
-        say(
-            f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
-            f"{1e3 / crowd:.2g} ms apart"
-        )
+    return behind
 
 
 def _unconfirmed(life: Life, played: dict[str, _Played]) -> list[str]:
@@ -285,7 +281,6 @@ def _lockstep(
         raise UncertainLTIError(
             f"{node}: does not follow /clock; start it with -p use_sim_time:=true, or leave out --clock"
         )
-    progress, total = Progress(), sum(p.count for p in played.values())
     for sent, message in enumerate(messages, start=1):
         if clock is not None:
             follower.reach(clock, message.log_time_ns)
@@ -295,8 +290,6 @@ def _lockstep(
         before = follower.received(topic)
         _send(played, message)
         follower.take(topic, before, sent)
-        progress.show(f"{sent} of {total} messages")
-    progress.clear()
 
 
 class _Follower:

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""How every process here runs: its command line, rclpy started, one executor, an orderly end, what a terminal shows."""
+"""How every process here runs: its command line, rclpy started, one executor, an orderly end."""
 
 from __future__ import annotations
 
@@ -422,27 +422,6 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-_hushed = False
-
-
-def hush(wanted: bool) -> None:
-    """Suppress messages to the terminal from here on, or allow them again."""
-    global _hushed
-    _hushed = wanted
-
-
-def say(text: str) -> None:
-    """Remark to the person who waits, apart from the result."""
-    if not _hushed:
-        print(text, file=sys.stderr, flush=True)
-
-
-def tell(text: str) -> None:
-    """Part of the result."""
-    if not _hushed:
-        print(text, flush=True)
-
-
 def seconds(text: str) -> float:
     """Parse an argument that is a time: a finite number, 0 or more."""
     value = _number(text)
@@ -464,22 +443,3 @@ def _number(text: str) -> float:
         return float(text)
     except ValueError:
         return math.nan
-
-
-class Progress:
-    """One line on standard error that is written over, where that is a terminal."""
-
-    def __init__(self) -> None:
-        self._terminal = sys.stderr.isatty() and not _hushed
-        self._shown = 0.0
-
-    def show(self, text: str) -> None:
-        """Show the text, at most five times a second."""
-        if self._terminal and time.monotonic() - self._shown > 0.2:
-            self._shown = time.monotonic()
-            print(f"\r\x1b[K{text}", end="", file=sys.stderr, flush=True)
-
-    def clear(self) -> None:
-        """Take the line away."""
-        if self._terminal and self._shown:
-            print("\r\x1b[K", end="", file=sys.stderr, flush=True)

@@ -14,6 +14,8 @@ from __future__ import annotations
 import argparse
 import os
 import time
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -23,9 +25,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.cli.command import print_json
+from uncertain_lti.cli.command import Result
 from uncertain_lti_ros.messages import definition, message_class
-from uncertain_lti_ros.process import ArgumentError, Life, Progress, hush, living, say, seconds, tell
+from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
 from uncertain_lti_ros.topics import POLL, MatchedSubscription
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
@@ -47,34 +49,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="print errors only (and with --json the data)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> Result:
     """Record until SIGINT, SIGTERM or the end of the duration; the file is whole or not there.
 
     While recording it is called BAG.part, with all but the last seconds readable.
     """
-    hush(args.quiet)
     output = Path(args.output)
     if output.suffix != ".mcap":
         output = output.with_name(f"{output.name}.mcap")
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
         topics = list(dict.fromkeys(_resolved(life.node, topic) for topic in args.topics))
-        types = _wait_for(life, topics, args.wait)
+        types = _wait_for(life, topics, args.wait, args.progress.note)
         subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
         if subscriptions:
-            (say if args.json else tell)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
-            _record(life, subscriptions, file, args.duration)
+            (args.progress.note if args.json else args.say)(
+                f"recording {', '.join(topics)} to {output}; stop with Ctrl-C"
+            )
+            stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
+            with stage as step:
+                _record(life, subscriptions, file, args.duration, step)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
-    if args.json:
-        counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost}
-        print_json({"bag": str(output), **counts})
-        return 0
-    tell(
+    args.say(
         f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s"
         + (f", {lost} lost on the way" if lost else "")
     )
-    return 0
+    counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost}
+    return Result(data={"bag": str(output), **counts})
 
 
 def _resolved(node: Node, topic: str) -> str:
@@ -86,7 +88,7 @@ def _resolved(node: Node, topic: str) -> str:
         ) from None
 
 
-def _wait_for(life: Life, topics: list[str], limit: float | None) -> dict[str, str]:
+def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable[[str], None]) -> dict[str, str]:
     """Type of each topic, as soon as all are there; {} when a signal came first."""
     began, told = time.monotonic(), False
     while life.alive:
@@ -101,7 +103,7 @@ def _wait_for(life: Life, topics: list[str], limit: float | None) -> dict[str, s
         if limit is not None and waited > limit:
             raise BagError(f"{', '.join(missing)}: not there after {limit:g} s; start what publishes it")
         if waited > 1.0 and not told:
-            say(f"waiting for {', '.join(missing)}")
+            note(f"waiting for {', '.join(missing)}")
             told = True
         life.spin_once()
     return {}
@@ -116,8 +118,10 @@ def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSu
     )
 
 
-def _record(life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None) -> None:
-    progress = Progress()
+def _record(
+    life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None,
+    step: Callable[[str], None],
+) -> None:  # fmt: skip
     looked = flushed = polled = time.monotonic()
     while life.alive:
         now = time.monotonic()
@@ -134,9 +138,8 @@ def _record(life: Life, subscriptions: list[MatchedSubscription], file: _File, d
             file.flush()
         if duration is not None and file.began is not None and now - file.began >= duration:
             break
-        progress.show(f"{file.count} messages, {file.span:.1f} s")
+        step(f"{file.count} messages, {file.span:.1f} s")
         life.spin_once(0.05)
-    progress.clear()
 
 
 class _File:

@@ -33,10 +33,11 @@ from std_msgs.msg import Bool, String
 
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.text import plural
+from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.outputs import NODE
 from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
 from uncertain_lti_ros.messages import stamp_ns
-from uncertain_lti_ros.process import living, seconds, tell
+from uncertain_lti_ros.process import living, seconds
 
 _EVERY = 1000  # ms between two looks of the page
 _MOST = 100_000  # samples kept
@@ -196,11 +197,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=seconds, default=120.0, metavar="S", help="time that it shows (default 120)")
 
 
-def run(args: argparse.Namespace) -> int:
+def run(args: argparse.Namespace) -> Result:
     """Serve the page until SIGINT or SIGTERM."""
     with living(lambda: Node("uncertain_lti_watch")) as life:
         with serving(Watched(life.node, args.monitor, args.seconds), args.host, args.port) as address:
-            tell(f"watching {args.monitor} at {address}; stop with Ctrl-C")
+            args.say(f"watching {args.monitor} at {address}; stop with Ctrl-C")
             while life.alive:
                 life.spin_once()
-    return 0
+    return Result()

@@ -84,11 +84,9 @@ class Command:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Run the command of parsed options and print what came of it; a module of ROS prints by itself."""
+    """Run the command of parsed options and print what came of it."""
     options.say = partial(_print_summary, options)
-    result = options.run(options)
-    if isinstance(result, int):
-        return result
+    result: Result = options.run(options)
     if getattr(options, "json", False):
         if result.data is not None:
             print_json(result.data)
@@ -102,7 +100,7 @@ def _print_summary(options: argparse.Namespace, text: str) -> None:
 
     What is to be written is written also when `| head` has read enough; only a check has nothing more to do.
     """
-    if not options.json:
+    if not getattr(options, "json", False):
         try:
             options.progress.say(text)
         except BrokenPipeError:

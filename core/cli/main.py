@@ -41,9 +41,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     command = next((a for a in given if not a.startswith("-")), "")
+    live = any(c.of_ros for c in COMMANDS if c.name == command)
     for stream in (sys.stdout, sys.stderr):  # a name that the terminal has no letters for ends nothing
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+            stream.reconfigure(errors="backslashreplace", line_buffering=live or None)
     sys.unraisablehook = _keep_interrupt
     try:
         try:
