@@ -197,8 +197,10 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
         judge.judge(["a", "b", "c"], [0.0, 0.0], 0.1)  # type: ignore[list-item]
     with pytest.raises(ValueError, match="fit"):
         arithmetic.centre_and_half((one, one, two), np.zeros((3, 5)), np.zeros(4), np.zeros((2, 5)), np.zeros((2, 5)))
-    with pytest.raises(ValueError, match="fit"):
-        judge.judge_rows(*samples, [0], [0.1], 0, np.empty((5, 3, 3)), np.empty(4, np.uint8))
-    for k in ([-1], [4]):
+    marks, two = np.empty(4, np.uint8), [None, np.empty((4, 2)), None, None, None]
+    for numbers, some in (([np.empty((4, 3)), *two[1:]], marks), (two[:4], marks), (two, marks[:3])):
+        with pytest.raises(ValueError, match="fit"):
+            judge.judge_rows(*samples, [0], [0.1], numbers, some)
+    for k in ([-1], [3], [4]):
         with pytest.raises(ValueError, match="fit the recording"):
-            judge.judge_rows(*samples, k, [0.1], 0, np.empty((5, 4, 2)), np.empty(4, np.uint8))
+            judge.judge_rows(*samples, k, [0.1], two, marks)

@@ -23,6 +23,8 @@ VIOLATION: int
 OUTSIDE: int
 UNKNOWN: int
 UNLISTED: int
+LEFT: int
+REPEATS: int
 LOWER: int
 UPPER: int
 RESIDUAL: int
@@ -73,8 +75,7 @@ class Judge:
         s: Array,
         k: NDArray[np.intp],
         dt: Array,
-        first: int,
-        numbers: Array,
+        numbers: Sequence[Array | None],
         marks: NDArray[np.uint8],
     ) -> None: ...
     def advance(
@@ -118,6 +119,7 @@ class Statistics:
     def push(self, dt: float, table: Any) -> bool: ...
     def values(self) -> array[float]: ...
 
+def all_carried(values: Sequence[float]) -> bool: ...
 def some_beyond(table: Any, places: Any, limit: float) -> int: ...
 def blended(blocks: Any, places: Any, weights: Any) -> Array: ...
 def centre_and_half(

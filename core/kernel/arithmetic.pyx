@@ -14,11 +14,15 @@ from array import array
 
 import numpy as np
 
+from uncertain_lti.base.arrays import LARGEST
+
 cimport cython
 from cpython cimport array as arrays
 from libc.math cimport INFINITY, NAN, fabs
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
+
+cdef double _LARGEST = LARGEST
 
 include "equations.pxi"
 include "elements.pxi"

@@ -61,6 +61,11 @@ cdef inline bint is_outside(double z, double least, double greatest) noexcept no
     return (z < least) | (z > greatest)
 
 
+cdef inline bint is_carried(double value) noexcept nogil:
+    """Whether a recorded number is one that the arithmetic carries."""
+    return (-_LARGEST <= value) & (value <= _LARGEST)
+
+
 cdef inline double utilisation_of(double difference, double half) noexcept nogil:
     """(x_next - centre) / half; where half is 0, 0 for no difference and otherwise infinite with its sign."""
     return 0.0 if difference == 0.0 else difference / half

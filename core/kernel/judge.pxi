@@ -7,13 +7,14 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""One transition after another, judged as it comes."""
+"""Transitions, judged one after another as they come, or many of a recording at once."""
 
 LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION = range(5)
 """What a `Judgement` holds of each state."""
-JUDGED, VIOLATION, OUTSIDE, UNKNOWN, UNLISTED = 1, 4, 8, 16, 32
-"""Bits of what is said of a transition: there is a verdict; some state that counts left its bounds; it leaves the
-fitted domain; its regime is unknown; its mode is not listed, so that there is no verdict."""
+JUDGED, LEFT, VIOLATION, OUTSIDE, UNKNOWN, UNLISTED, REPEATS = 1, 2, 4, 8, 16, 32, 64
+"""Bits of what is said of a transition: there is a verdict; some state left its bounds; one that counts did; it leaves
+the fitted domain; its regime is unknown; its mode is not listed, so that there is no verdict; some state did not
+change at all."""
 cdef enum:
     _JUDGED = 1
     _LEFT = 2
@@ -21,6 +22,8 @@ cdef enum:
     _OUTSIDE = 8
     _UNKNOWN = 16
     _UNLISTED = 32
+    _REPEATS = 64
+    _BEYOND = 128  # what the arithmetic does not carry: no verdict either
 
 
 @cython.final
@@ -69,7 +72,7 @@ cdef class Judge:
     cdef const unsigned char* counted
     cdef const unsigned char* occupied
     cdef Py_ssize_t cells
-    cdef int* place
+    cdef int* cell
     cdef int positions[2]
     cdef double s[2]
     cdef Py_ssize_t places[_CORNERS]
@@ -100,17 +103,17 @@ cdef class Judge:
             np.concatenate([steady, scale, least, greatest, cells_per_unit(least, greatest, self.cells)])
         )
         cdef arrays.array room = doubles(np.ones(p + self.total + n + n * _TOGETHER))  # beyond z the regressors are 1
-        cdef arrays.array place = array("i", bytes(4 * (size or 1)))
+        cdef arrays.array cell = array("i", bytes(4 * (size or 1)))
         cdef bytes flags = np.asarray(counted, dtype=np.uint8).tobytes()
         cdef bytes cells = b"" if occupied is None else np.ascontiguousarray(occupied, dtype=np.uint8).tobytes()
-        self._keep = [numbers, room, place, flags, cells]
+        self._keep = [numbers, room, cell, flags, cells]
         self.steady = numbers.data.as_doubles
         self.scale, self.least = self.steady + self.total, self.steady + 2 * self.total
         self.greatest, self.per_unit = self.least + size, self.least + 2 * size
         self.phi = room.data.as_doubles
         self.z, self.end = self.phi + p, self.phi + p + self.total
         self.rates = self.end + n
-        self.place, self.counted, self.occupied = place.data.as_ints, flags, cells
+        self.cell, self.counted, self.occupied = cell.data.as_ints, flags, cells
         for i, position in enumerate(positions):
             self.positions[i] = position
 
@@ -126,86 +129,151 @@ cdef class Judge:
         found._values = arrays.clone(array_of_doubles, 5 * n, False)
         for i in range(n):
             self.end[i] = normalised(after[i], self.steady[i], self.scale[i])
-        cdef int marks = self.compare(dt, regime, found._values.data.as_doubles, n)
+        cdef int marks = self.compare(dt, regime, found._values.data.as_doubles)
         found.contained, found.violation = not marks & _LEFT, (marks & _VIOLATION) != 0
         found.outside_domain, found.unknown_regime = (marks & _OUTSIDE) != 0, (marks & _UNKNOWN) != 0
         return found
 
-    def judge_rows(self, x, u, s, k, dt, Py_ssize_t first, numbers, marks):
-        """Judge the transitions that arrive at rows `first` and on of a recording.
+    def judge_rows(self, x, u, s, k, dt, numbers, marks):
+        """Judge some transitions of a recording; what is found goes to the rows at which they arrive.
 
         `x, u, s`: states, controls and further scheduling signals of its samples, recorded units; `k` (K,): samples
-        that the transitions begin with, increasing; `dt` (K,): s; `numbers` (5, rows, n): takes what a `Judgement`
-        holds, NaN without a transition; `marks` (rows,): takes the bits above.
+        that the transitions begin with, increasing; `dt` (K,): s; `numbers`: of each kind that a `Judgement` holds an
+        array (samples, n), or None if nobody reads it; what it holds without a verdict has no meaning; `marks`
+        (samples,): take the bits above.
         """
         cdef const double[:, :] states = x
         cdef const double[:, :] controls = u
         cdef const double[:, :] others = s
         cdef const Py_ssize_t[::1] begins = np.ascontiguousarray(k, dtype=np.intp)
         cdef const double[::1] steps = np.ascontiguousarray(dt, dtype=np.float64)
-        cdef double[:, :, :] values = numbers
-        cdef unsigned char[:] flags = marks
-        cdef Py_ssize_t i, j, at, row, n = self.n, m = self.size - self.n, count = flags.shape[0], begin = 0
-        cdef Py_ssize_t samples = states.shape[0]
-        fits = states.shape[1] == n and controls.shape[1] == m and others.shape[1] == self.total - self.size
-        fits = fits and controls.shape[0] == others.shape[0] == samples >= first + count and first >= 0
-        rows = values.shape[0] == 5 and values.shape[1] == count and values.shape[2] == n and values.strides[2] == 8
-        if not (fits and rows and begins.shape[0] == steps.shape[0]):
+        cdef unsigned char[::1] flags = marks
+        cdef double[:, ::1] values
+        cdef double* to[5]
+        cdef Py_ssize_t i, j, q, at, low, n = self.n, p = self.elements.p, count = begins.shape[0]
+        cdef Py_ssize_t samples = states.shape[0], lead = self.total
+        fits = states.shape[1] == n and controls.shape[1] == self.size - n and others.shape[1] == lead - self.size
+        fits = fits and controls.shape[0] == others.shape[0] == flags.shape[0] == samples and steps.shape[0] == count
+        if not (fits and len(numbers) == 5):
             raise ValueError("the transitions do not fit the model")
-        if len(begins) and (begins[0] < 0 or begins[len(begins) - 1] >= samples):
+        if count and not 0 <= begins[0] <= begins[count - 1] < samples - 1:
             raise ValueError("the transitions do not fit the recording")
-        cdef Py_ssize_t apart = values.strides[0] // 8 if count else 0
-        cdef int regime
+        for j, given in enumerate(numbers):
+            to[j] = NULL
+            if given is not None:
+                values = given
+                if not (values.shape[0] == samples and values.shape[1] == n):
+                    raise ValueError("the numbers do not fit the recording")
+                to[j] = &values[0, 0] if samples else NULL
+        z, after, times = np.empty((lead, _SORTED)), np.empty((n, _SORTED)), np.empty(_SORTED)
+        at_schedule = z[[self.positions[i] for i in range(self.blocks.axes)]]
+        cdef double[:, ::1] normal = z
+        cdef double[:, ::1] ends = after
+        cdef double[:, ::1] scheduling = at_schedule
+        cdef double[::1] lasts = times
+        cdef Tiles tiles = Tiles(n, p, z[: self.size], times, None, after, self.blocks, at_schedule)
+        cdef unsigned char beyond[_SORTED]  # bits of what makes the numbers of a transition none, and of repeats
+        cdef unsigned char out[_TOGETHER]
+        cdef double* psi = room_for(p + 2)
+        cdef double* centre = psi + p * _TOGETHER
+        cdef double* half = centre + _TOGETHER
         with nogil:
-            for row in range(count):
-                at = first + row - 1
-                while begin < begins.shape[0] and begins[begin] < at:
-                    begin += 1
-                flags[row], regime = 0, -1
-                if begin < begins.shape[0] and begins[begin] == at:
-                    for i in range(n):
-                        self.z[i] = normalised(states[at, i], self.steady[i], self.scale[i])
-                    for i in range(n, self.size):
-                        self.z[i] = normalised(controls[at, i - n], self.steady[i], self.scale[i])
-                    for i in range(self.size, self.total):
-                        self.z[i] = normalised(others[at, i - self.size], self.steady[i], self.scale[i])
-                    regime = self.take(self.z, 1)
-                    if regime < 0:
-                        flags[row] = _UNLISTED
-                if regime < 0:
-                    for j in range(5):
-                        for i in range(n):
-                            values[j, row, i] = NAN
-                    continue
+            for low from 0 <= low < count by _SORTED:
+                tiles.begin(count - low if count - low < _SORTED else _SORTED)
+                for q in range(tiles.count):
+                    beyond[q], lasts[q] = 0, steps[low + q]
                 for i in range(n):
-                    self.end[i] = normalised(states[at + 1, i], self.steady[i], self.scale[i])
-                flags[row] = self.compare(steps[begin], regime, &values[0, row, 0], apart)
+                    self.column(states, begins, low, tiles.count, i, i, beyond, &normal[i, 0])
+                for i in range(n, self.size):
+                    self.column(controls, begins, low, tiles.count, i - n, i, beyond, &normal[i, 0])
+                for i in range(self.size, lead):
+                    self.column(others, begins, low, tiles.count, i - self.size, i, beyond, &normal[i, 0])
+                for i in range(n):
+                    for q in range(tiles.count):
+                        at = begins[low + q]
+                        ends[i, q] = normalised(states[at + 1, i], self.steady[i], self.scale[i])
+                        beyond[q] |= _REPEATS if states[at, i] == states[at + 1, i] else 0
+                for i in range(self.blocks.axes):
+                    memcpy(&scheduling[i, 0], &normal[self.positions[i], 0], tiles.count * sizeof(double))
+                while tiles.take():
+                    tiles.sizes(p, psi)
+                    self.leave_domain(tiles.phi, _TOGETHER, tiles.many, out)
+                    for q in range(tiles.many):
+                        flags[begins[low + tiles.index[q]] + 1] = self.marks_of(tiles.regimes[q], out[q])
+                    for i in range(n):
+                        tiles.bounds(self.elements, i, psi, centre, half)
+                        for q in range(tiles.many):
+                            at = begins[low + tiles.index[q]] + 1
+                            flags[at] |= self.place(i, centre[q], half[q], tiles.end[i * _TOGETHER + q], to, at * n + i)
+                for q in range(tiles.count):
+                    at = begins[low + q] + 1
+                    if beyond[q] & _BEYOND:
+                        flags[at] = 0
+                    flags[at] |= beyond[q] & _REPEATS
+        free(psi)
 
-    cdef int compare(self, double dt, int regime, double* values, Py_ssize_t apart) noexcept nogil:
+    cdef void column(
+        self, const double[:, :] rows, const Py_ssize_t[::1] begins, Py_ssize_t low, Py_ssize_t count, Py_ssize_t j,
+        Py_ssize_t i, unsigned char* beyond, double* to
+    ) noexcept nogil:
+        """Column j of some rows of a recording, which are signal i, normalised."""
+        cdef Py_ssize_t q
+        cdef double value, steady = self.steady[i], scale = self.scale[i]
+        for q in range(count):
+            value = rows[begins[low + q], j]
+            beyond[q] |= _BEYOND if not is_carried(value) else 0
+            to[q] = normalised(value, steady, scale)
+
+    cdef inline int marks_of(self, int regime, bint outside) noexcept nogil:
+        """The bits of a transition before its states are looked at; regime: of `Blocks.find`."""
+        if regime < 0:
+            return _UNLISTED
+        return _JUDGED | (_UNKNOWN | _OUTSIDE if regime > 0 else 0) | (_OUTSIDE if outside else 0)
+
+    cdef inline int place(
+        self, Py_ssize_t i, double centre, double half, double end, double** to, Py_ssize_t at
+    ) noexcept nogil:
+        """What the bounds say of the end of a state, into numbers that are not NULL, and in bits."""
+        cdef double lower = lower_of(centre, half, self.margin), upper = upper_of(centre, half, self.margin)
+        cdef bint inside = is_contained(lower, end, upper)
+        if to[0] != NULL:
+            to[0][at] = recorded(lower, self.steady[i], self.scale[i])
+        if to[1] != NULL:
+            to[1][at] = recorded(upper, self.steady[i], self.scale[i])
+        if to[2] != NULL:
+            to[2][at] = end - centre
+        if to[3] != NULL:
+            to[3][at] = 0.0 if inside else 1.0
+        if to[4] != NULL:
+            to[4][at] = utilisation_of(end - centre, half)
+        return 0 if inside else _LEFT | (_VIOLATION if self.counted[i] else 0)
+
+    cdef int compare(self, double dt, int regime, double* values) noexcept nogil:
         """Compare the arrival `end` with the bounds of the transition that was taken; one kind of number after another.
         """
-        cdef Py_ssize_t i
-        cdef double centre, half, lower, upper
-        cdef int marks = _JUDGED | (_UNKNOWN if regime > 0 else 0)
-        if regime > 0 or self.left_domain():
-            marks |= _OUTSIDE
+        cdef Py_ssize_t i, j, n = self.n
+        cdef unsigned char out
+        cdef double* to[5]
+        self.leave_domain(self.phi, 1, 1, &out)
+        cdef int marks = self.marks_of(regime, out)
         self.elements.sum(self.phi, self.places, self.weights, self.blocks.corners)
-        cdef const double* rate = self.elements.rate
-        cdef const double* spread = self.elements.spread
-        cdef const double* still = self.elements.still
-        for i in range(self.n):
-            centre = centre_of(self.phi[i], dt, rate[i])
-            half = half_of(dt, spread[i], still[i])
-            lower, upper = lower_of(centre, half, self.margin), upper_of(centre, half, self.margin)
-            values[i] = recorded(lower, self.steady[i], self.scale[i])
-            values[apart + i] = recorded(upper, self.steady[i], self.scale[i])
-            values[2 * apart + i] = self.end[i] - centre
-            values[3 * apart + i] = 0.0
-            values[4 * apart + i] = utilisation_of(self.end[i] - centre, half)
-            if not is_contained(lower, self.end[i], upper):
-                values[3 * apart + i] = 1.0
-                marks |= _LEFT | (_VIOLATION if self.counted[i] else 0)
+        for j in range(5):
+            to[j] = values + j * n
+        for i in range(n):
+            marks |= self.place(
+                i, centre_of(self.phi[i], dt, self.elements.rate[i]),
+                half_of(dt, self.elements.spread[i], self.elements.still[i]), self.end[i], to, i,
+            )
         return marks
+
+    cdef void leave_domain(
+        self, const double* z, Py_ssize_t stride, Py_ssize_t count, unsigned char* out
+    ) noexcept nogil:
+        """`left_domain` of [x; u] in columns a stride wide."""
+        left_domain(
+            z, stride, count, self.least, self.greatest, self.per_unit, self.occupied, self.size, self.cells,
+            self.cell, out,
+        )
 
     cdef int read(self, before) except -2:
         """Normalise [x; u; s] and find the blocks that hold there: -1 for no mode that is listed, 1 if unknown."""
@@ -222,16 +290,6 @@ cdef class Judge:
         for i in range(self.blocks.axes):
             self.s[i] = z[self.positions[i] * stride]
         return self.blocks.find(self.s, self.places, self.weights)
-
-    cdef bint left_domain(self) noexcept nogil:
-        """Whether [x; u] leaves the box in some element, or is a combination that was not fitted."""
-        cdef Py_ssize_t i
-        for i in range(self.size):
-            if is_outside(self.phi[i], self.least[i], self.greatest[i]):
-                return True
-        return self.cells > 0 and not pairs_visited(
-            self.phi, self.least, self.per_unit, self.occupied, self.size, self.cells, self.place
-        )
 
     def advance(
         self, double[:, ::1] x, double[::1] time, double[:, ::1] control, z, dt, const long long[::1] begin,

@@ -99,6 +99,15 @@ def arrivals(x, centre, half):
     return found[0], found[1]
 
 
+def all_carried(values):
+    """Whether the arithmetic carries all of some recorded numbers."""
+    cdef double value
+    for value in values:
+        if not is_carried(value):
+            return False
+    return True
+
+
 def pair_count(Py_ssize_t size):
     """Pairs of signals whose combinations a domain knows, in the order 01, 02, 12, ...; of one signal alone, itself."""
     return size * (size - 1) // 2 if size > 1 else 1
@@ -110,53 +119,65 @@ def cells_per_unit(least, greatest, Py_ssize_t cells):
     return np.divide(cells, span, out=np.zeros_like(span), where=(span > 0) & np.isfinite(span))
 
 
-cdef inline bint pairs_visited(
+cdef void left_domain(
     const double* z,
+    Py_ssize_t stride,
+    Py_ssize_t count,
     const double* least,
+    const double* greatest,
     const double* per_unit,
     const unsigned char* occupied,
     Py_ssize_t size,
     Py_ssize_t cells,
-    int* place,
+    int* cell,
+    unsigned char* out,
 ) noexcept nogil:
-    """Whether every pair of signals lies in an occupied cell (`domain.Occupancy`)."""
-    cdef Py_ssize_t i, j
+    """Whether each [x; u], in columns a stride wide, leaves the box in some element, or is a combination not fitted.
+
+    `occupied`: of `domain.Occupancy`, with so many cells, 0 for none; `cell` (size,): room.
+    """
+    cdef Py_ssize_t i, j, q
+    cdef const unsigned char* pair
+    for q in range(count):
+        out[q] = 0
     for i in range(size):
-        place[i] = cell_of(z[i], least[i], per_unit[i], <int>cells - 1)
-    if size == 1:
-        return occupied[place[0] * cells + place[0]]
-    for i in range(size):
-        for j in range(i + 1, size):
-            if not occupied[place[i] * cells + place[j]]:
-                return False
-            occupied += cells * cells
-    return True
+        for q in range(count):
+            out[q] |= is_outside(z[i * stride + q], least[i], greatest[i])
+    for q in range(count if cells and size else 0):
+        if out[q]:
+            continue
+        for i in range(size):
+            cell[i] = cell_of(z[i * stride + q], least[i], per_unit[i], <int>cells - 1)
+        if size == 1:
+            out[q] = not occupied[cell[0] * cells + cell[0]]
+        pair = occupied
+        for i in range(size):
+            for j in range(i + 1, size):
+                out[q] |= not pair[cell[i] * cells + cell[j]]
+                pair += cells * cells
 
 
 def outside_domain(z, least, greatest, occupied=None):
     """Whether each of z (n + m, K) leaves the box in some element, or is a combination that was not fitted."""
-    cdef const double[:, :] columns = z
-    cdef arrays.array low = doubles(least), high = doubles(greatest), sample = doubles(least)
-    cdef Py_ssize_t i, k, size = columns.shape[0], cells = 0 if occupied is None else occupied.shape[1]
+    cdef const double[:, ::1] columns = np.ascontiguousarray(z)
+    cdef arrays.array low = doubles(least), high = doubles(greatest)
+    cdef Py_ssize_t size = columns.shape[0], count = columns.shape[1]
+    cdef Py_ssize_t cells = 0 if occupied is None else occupied.shape[1]
     cdef arrays.array per_unit = doubles(cells_per_unit(np.asarray(least), np.asarray(greatest), cells))
     cdef const unsigned char[::1] flags = np.ascontiguousarray(
         np.zeros(1, np.uint8) if occupied is None else occupied
     ).view(np.uint8).reshape(-1)
-    cdef arrays.array place = array("i", bytes(4 * (size or 1)))
-    cdef double* here = sample.data.as_doubles
-    found = np.zeros(columns.shape[1], dtype=bool)
+    cdef arrays.array cell = array("i", bytes(4 * (size or 1)))
+    found = np.zeros(count, dtype=bool)
     cdef unsigned char[::1] left = found.view(np.uint8)
     if len(least) != size or len(greatest) != size:
         raise ValueError("the domain does not fit the samples")
-    with nogil:
-        for k in range(columns.shape[1]):
-            for i in range(size):
-                here[i] = columns[i, k]
-                left[k] |= is_outside(here[i], low.data.as_doubles[i], high.data.as_doubles[i])
-            if cells and size and not left[k]:
-                left[k] = not pairs_visited(
-                    here, low.data.as_doubles, per_unit.data.as_doubles, &flags[0], size, cells, place.data.as_ints
-                )
+    if count and size:
+        with nogil:
+            left_domain(
+                &columns[0, 0], count, count, low.data.as_doubles, high.data.as_doubles, per_unit.data.as_doubles,
+                &flags[0], size, cells, cell.data.as_ints, &left[0],
+            )
     return found
 
 

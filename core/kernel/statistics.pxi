@@ -123,7 +123,8 @@ cdef class Statistic:
         `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. NaN
         is no verdict on that state, and changes nothing of it, nor of any state if all are seen together; `judged`
         (K,): where there is a verdict, default everywhere. Returns (K,): the alarm after each; Returns (K, size):
-        `values` after each, NaN without a verdict; both in `raised` and `found` where these are given.
+        `values` after each, NaN without a verdict; both in `raised` and `found` where these are given. A `found` of
+        no columns takes none.
         """
         cdef Py_ssize_t k, count = len(dt)
         rows = np.asarray(rows, dtype=np.float64)
@@ -141,15 +142,15 @@ cdef class Statistic:
         cdef double[:, :] values = found
         cdef unsigned char[:] alarm = raised.view(np.uint8)
         fits = alarm.shape[0] == values.shape[0] == times.shape[0] == given.shape[0] == count
-        if not fits or values.shape[1] != self.size:
+        if not fits or values.shape[1] not in (0, self.size):
             raise ValueError("the numbers of the verdicts do not fit the states")
-        cdef Py_ssize_t i, q, many, apart = table.strides[0] // 8
+        cdef Py_ssize_t i, q, many, apart = table.strides[0] // 8, kept = values.shape[1]
         with nogil:
             for k from 0 <= k < count by _TOGETHER:
                 many = count - k if count - k < _TOGETHER else _TOGETHER
                 self.push(&times[k], &table[k, 0], apart, &given[k], many)
                 for q in range(many):
-                    for i in range(self.size):
+                    for i in range(kept):
                         values[k + q, i] = self.after[i * _TOGETHER + q] if given[k + q] else NAN
                     alarm[k + q] = self.raises(q)
         return raised, found

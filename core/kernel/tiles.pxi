@@ -32,11 +32,13 @@ cdef class Tiles:
     cdef Py_ssize_t* order  # (_SORTED,): transitions, those of the same blocks side by side
     cdef Py_ssize_t* first  # (_SORTED,): the first block that holds, of each transition
     cdef Py_ssize_t* held  # (_SORTED, _CORNERS): all of them
+    cdef Py_ssize_t* found  # (_SORTED,): what `Blocks.find` says
     cdef Py_ssize_t* ends  # (blocks + 2,)
     cdef double* shares  # (_SORTED, _CORNERS): their weights
     # of this tile:
     cdef Py_ssize_t many, whole  # transitions, and with what it is filled up
     cdef Py_ssize_t* index  # (_TOGETHER,): positions of its transitions
+    cdef Py_ssize_t* regimes  # (_TOGETHER,): what `Blocks.find` says of them
     cdef Py_ssize_t places[_CORNERS]
     cdef double* weights  # (_CORNERS, _TOGETHER)
     cdef double* phi  # (columns, _TOGETHER): z, then 1
@@ -60,8 +62,8 @@ cdef class Tiles:
         cdef arrays.array numbers = doubles(
             np.ones((columns + 2 * n + _CORNERS + 3) * _TOGETHER + (_SORTED * _CORNERS if self.corners else 0))
         )
-        cdef Py_ssize_t places = (_SORTED * (2 + _CORNERS) if self.corners else 0) + self.blocks.count + 2
-        cdef arrays.array positions = array("q", bytes(8 * (_TOGETHER + places)))
+        cdef Py_ssize_t places = (_SORTED * (3 + _CORNERS) if self.corners else 0) + self.blocks.count + 2
+        cdef arrays.array positions = array("q", bytes(8 * (2 * _TOGETHER + places)))
         self._keep = [numbers, positions]
         self.phi = numbers.data.as_doubles
         self.step = self.phi + columns * _TOGETHER
@@ -71,9 +73,13 @@ cdef class Tiles:
         self.ones = self.weights + _CORNERS * _TOGETHER
         self.still, self.shares = self.ones + _TOGETHER, self.ones + 2 * _TOGETHER
         self.index = <Py_ssize_t*>positions.data.as_longlongs
-        self.ends = self.index + _TOGETHER
+        self.regimes, self.ends = self.index + _TOGETHER, self.index + 2 * _TOGETHER
         self.order = self.ends + self.blocks.count + 2
-        self.first, self.held = self.order + _SORTED, self.order + 2 * _SORTED
+        self.first, self.found, self.held = self.order + _SORTED, self.order + 2 * _SORTED, self.order + 3 * _SORTED
+
+    cdef void begin(self, Py_ssize_t count) noexcept nogil:
+        """Walk the first transitions again, after others were put there."""
+        self.count, self.at, self.sorted, self.gone = count, 0, 0, 0
 
     cdef bint take(self) noexcept nogil:
         """Fill in the next tile; False at the end."""
@@ -94,7 +100,7 @@ cdef class Tiles:
                 self.many += 1
             for q in range(self.many):
                 k = self.order[a + q]
-                self.index[q] = self.at - self.sorted + k
+                self.index[q], self.regimes[q] = self.at - self.sorted + k, self.found[k]
                 for i in range(self.corners):
                     self.places[i] = self.held[k * _CORNERS + i]
                     self.weights[i * _TOGETHER + q] = self.shares[k * _CORNERS + i]
@@ -123,7 +129,8 @@ cdef class Tiles:
         for k in range(self.sorted):
             for axis in range(self.blocks.axes):
                 here[axis] = self.s[axis, self.at + k]
-            if self.blocks.find(here, self.held + k * _CORNERS, self.shares + k * _CORNERS) < 0:
+            self.found[k] = self.blocks.find(here, self.held + k * _CORNERS, self.shares + k * _CORNERS)
+            if self.found[k] < 0:
                 for r in range(self.corners):  # a mode that is not listed: nothing is known
                     self.held[k * _CORNERS + r], self.shares[k * _CORNERS + r] = 0, NAN
                 self.first[k] = count

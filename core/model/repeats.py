@@ -28,7 +28,7 @@ it, if hardly a value of the state came twice in a recording.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -209,22 +209,26 @@ def _over(size: float, half: float) -> float:
 
 
 def walk(
-    model: Any, t_ns: NDArray[np.int64], steps: Any, lower: Array, upper: Array
+    model: Any,
+    t_ns: NDArray[np.int64],
+    steps: Any,
+    repeats: NDArray[np.bool_],
+    bounds: Callable[[Any], Iterable[Array]],
 ) -> Iterator[tuple[int, bool, Transition]]:
     """Transitions in which some state repeats, and those right after: where each begins, and whether it follows on.
 
-    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `lower, upper` (K, n): bounds, recorded units.
+    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `repeats` (K,): whether some state repeats; `bounds`:
+    lower and upper bounds (K, n) of some transitions, recorded units.
     """
-    repeats = changes(steps.transient.x, steps.k)[0]
     follows = np.concatenate([[False], np.diff(steps.k) == 1])[: len(steps.k)]
     rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
     if not len(rows):
         return
-    z = model.normalised_columns(steps.take(rows))
+    steps = steps.take(rows)
+    z, at = model.normalised_columns(steps), steps.k
     outside = model.domain.beyond(z) | model.unknown(z)
-    given = steps.dt[rows], steps.x[rows], steps.x_next[rows], lower[rows], upper[rows], model.own_rates(z).T, outside
-    on = np.append(False, np.diff(steps.k[rows]) == 1) if len(rows) else rows
-    at = steps.k[rows]
+    given = steps.dt, steps.x, steps.x_next, *bounds(steps), model.own_rates(z).T, outside
+    on = np.append(False, np.diff(at) == 1)
     for k, after, t, *each in zip(
         at.tolist(), on.tolist(), t_ns[at + 1].tolist(), *(a.tolist() for a in given), strict=True
     ):
@@ -251,14 +255,14 @@ def repeats_in(model: Any, transient: Any) -> Found:
     most, point, steps = np.zeros((4, model.n)), model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
     some, largest = changes(transient.x, steps.k)
-    if not some.any():
-        return Found(most, windows, noisy, largest)
-    steps = steps.take(some)
-    with np.errstate(over="ignore", invalid="ignore"):
-        centre, half = model.columns_centre_and_half(model.normalised_columns(steps), steps.dt)
-        lower, upper = (point.recorded_x(bound.T) for bound in edges(centre, half, 1.0))
     follow = Repeating(model.n)
-    for _, follows, step in walk(model, transient.t_ns, steps, lower, upper):
+
+    def bounds(some: Any) -> Iterable[Array]:
+        with np.errstate(over="ignore", invalid="ignore"):
+            centre, half = model.columns_centre_and_half(model.normalised_columns(some), some.dt)
+            return [point.recorded_x(bound.T) for bound in edges(centre, half, 1.0)]
+
+    for _, follows, step in walk(model, transient.t_ns, steps, some, bounds):
         if not follows:
             follow.forget()
         for moved in follow.push(step):

@@ -117,7 +117,7 @@ class AlarmWindow:
         return self.alarm
 
     def push_all(
-        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Array], judged: NDArray[np.bool_],
+        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Any], judged: NDArray[np.bool_],
         after: NDArray[np.bool_], values: Array,
     ) -> None:  # fmt: skip
         """As `Alarm.over`, from a cleared alarm; `after` (K,) takes the alarm after each, `values` (K, 0) nothing."""
@@ -166,7 +166,7 @@ class AlarmOverThreshold:
         self.statistic.reset()
 
     def push_all(
-        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Array], judged: NDArray[np.bool_],
+        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Any], judged: NDArray[np.bool_],
         after: NDArray[np.bool_], values: Array,
     ) -> None:  # fmt: skip
         """As `Alarm.over`; `after` (K,) takes the alarm after each, `values` (K, n) takes `values` after each."""
@@ -289,28 +289,28 @@ class Alarm:
         self,
         dt: Array,
         violated: NDArray[np.bool_],
-        rows: Sequence[Array],
+        rows: Sequence[Any],
         judged: NDArray[np.bool_] | None = None,
         each: NDArray[np.bool_] | None = None,
         values: Array | None = None,
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Array]:
+    ) -> NDArray[np.bool_]:
         """Many verdicts from a cleared alarm; after each what `push` gives.
 
-        `dt` (K,): steps, s; `violated` (K,): as for `push`; `rows`: of the table of `push`, (K, n) each; `judged` (K,):
-        where there is a verdict, default everywhere; without one the alarm stays as it was. Returns (K,): the alarm
-        after each; (K, rules): which rules raise it; (K, statistics): `values` after each, NaN without a verdict; the
-        latter two in `each` and `values` where these are given.
+        `dt` (K,): steps, s; `violated` (K,): as for `push`; `rows`: of the table of `push`, (K, n) each, None for one
+        that no rule looks at; `judged` (K,): where there is a verdict, default everywhere; without one the alarm stays
+        as it was; `each` (K, rules): takes which rules raise the alarm after each; `values` (K, statistics): takes
+        `values` after each, NaN without a verdict. Returns (K,): the alarm after each.
         """
         self.reset()
         count = len(dt)
         judged = np.ones(count, dtype=bool) if judged is None else judged
         each = np.empty((count, len(self.parts)), dtype=bool) if each is None else each
-        values = np.empty((count, len(self.names))) if values is None else values
+        values = np.empty((count, 0)) if values is None else values
         parts = list(zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True))
         together = count >= WORTH_THREADS
         on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), parts, together)
         self.reset()
-        return np.asarray(np.logical_or.reduce(list(each.T))), each, values
+        return np.asarray(np.logical_or.reduce(list(each.T)))
 
 
 def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:
@@ -396,11 +396,12 @@ class Armed(NamedTuple):
     """Which samples of a recording may raise the alarm.
 
     `counts` (N+1,): whether the verdict on the sample counts; otherwise there is no alarm after it; `cleared` (N+1,):
-    whether the alarm starts over before the verdict on the sample.
+    whether the alarm starts over before the verdict on the sample; `asked`: samples that are judged, default all.
     """
 
     counts: NDArray[np.bool_]
     cleared: NDArray[np.bool_]
+    asked: slice | None = None
 
 
 class Arming:

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Arming, Condition
+from uncertain_lti.monitor.alarm import Armed, Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.sampling.clock import to_ns
@@ -107,15 +107,16 @@ class DeployedMonitor:
                 raise ModelError(f"{transient.name}: no sample lies between the times asked for; it has {t[-1]:g} s")
             chosen = np.flatnonzero(inside)
             a, b = int(chosen[0]), int(chosen[-1]) + 1
-        part = transient if (a, b) == (0, count) else transient.replace(slice(a, b))
         arming = Arming(self.condition, to_ns(self.grace))
         came, heard = np.asarray(before, dtype=np.intp) - a, np.asarray(values, dtype=np.float64)
         for value in heard[came < 0][-1:].tolist():
             arming.learn(value)
         later = came >= 0
-        verdicts = self.monitor.check(part, arming.over(part.t_ns, came[later], heard[later]))
-        if part is not transient:
-            verdicts = _padded(verdicts, transient, a, b)
+        armed = arming.over(transient.t_ns[a:b], came[later], heard[later])
+        if (a, b) != (0, count):
+            around = a, count - b
+            armed = Armed(np.pad(armed.counts, around), np.pad(armed.cleared, around), slice(a, b))
+        verdicts = self.monitor.check(transient, armed)
         if self.latch:
             verdicts = dataclasses.replace(verdicts, alarm=np.logical_or.accumulate(verdicts.alarm))
         return verdicts
@@ -139,18 +140,3 @@ def condition_words(condition: Condition | None, grace: float, latch: bool) -> l
         *([f"grace {grace:g} s"] if grace else []),
         *(["latched"] if latch else []),
     ]
-
-
-def _padded(verdicts: Verdicts, whole: Transient, start: int, stop: int) -> Verdicts:
-    """Verdicts on samples start..stop-1 as rows of the whole recording, without a verdict elsewhere."""
-    changes: dict[str, object] = {"transient": whole}
-    for field in dataclasses.fields(verdicts):
-        values = getattr(verdicts, field.name)
-        if isinstance(values, np.ndarray):
-            full = np.full((len(whole), *values.shape[1:]), np.nan if values.dtype.kind == "f" else 0, values.dtype)
-            full[start:stop] = values
-            changes[field.name] = full
-    asked = np.zeros(len(whole), dtype=bool)
-    asked[start:stop] = True
-    changes["asked"] = asked
-    return dataclasses.replace(verdicts, **changes)  # type: ignore[arg-type]

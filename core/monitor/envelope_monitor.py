@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
-from functools import partial
+from functools import cache, partial
 from itertools import pairwise
 from typing import Any
 
@@ -21,14 +21,17 @@ import cython
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import LARGEST, Array
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import (
+    FLAGS,
     JUDGED,
+    LEFT,
     LOWER,
     OUTSIDE,
+    REPEATS,
     RESIDUAL,
     UNKNOWN,
     UNLISTED,
@@ -36,6 +39,7 @@ from uncertain_lti.kernel.arithmetic import (
     UTILISATION,
     VIOLATION,
     Judgement,
+    all_carried,
 )
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
@@ -65,16 +69,6 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
 _BEYOND_NS = 2**63 - 1  # later than any instant
 _PIECE = 100_000  # rows that one thread takes at a time
-
-
-@cython.cfunc
-def _beyond(values: Sequence[float], most: cython.double) -> cython.bint:
-    """Whether some value lies outside -most to most; NaN does."""
-    value: cython.double
-    for value in values:
-        if not -most <= value <= most:
-            return True
-    return False
 
 
 @cython.cclass
@@ -355,7 +349,7 @@ class EnvelopeMonitor:
         if status is _OK:
             if not self._shortest <= step.dt <= self._longest:
                 status = Status.STEP
-            elif _beyond(step.before, LARGEST):  # the bounds would be no numbers
+            elif not all_carried(step.before):  # the bounds would be no numbers
                 status = Status.MISSING
             elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
                 status = Status.MODE
@@ -432,64 +426,90 @@ class EnvelopeMonitor:
         if transient.step != step:
             transient = transient.replace(step=step or "recorded")
         steps = transient.transitions()
-        count, n = len(transient), model.n
+        count, n, asked = len(transient), model.n, None
+        if armed is not None and armed.asked is not None:
+            asked = np.zeros(count, dtype=bool)
+            asked[armed.asked] = True
+            steps = steps.take(asked[steps.k] & asked[steps.k + 1])
         fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)
         unfitted_step = np.zeros(count, dtype=bool)
         if not fitted.all():
             unfitted_step[steps.k[~fitted] + 1] = True
             steps = steps.take(fitted)
-        given = steps.x, steps.u, steps.s
-        if any(max(values.max(initial=0.0), -values.min(initial=0.0)) > LARGEST for values in given):
-            steps = steps.take(np.max([np.abs(values).max(axis=1, initial=0.0) for values in given], axis=0) <= LARGEST)
-        numbers, marks = np.empty((5, count, n)), np.empty(count, dtype=np.uint8)
-        self._judge_rows(transient, steps, numbers, marks)
-        lower, upper, residual, flags, utilisation = numbers
-        unlisted_mode = (marks & UNLISTED) > 0
-        steps = steps.take((marks[steps.k + 1] & JUDGED) > 0) if unlisted_mode.any() else steps
-        frozen, withheld, repeating, why = self._look_all(transient, steps, lower, upper)
-        longer, longer_residual = np.full((2, len(model.horizons), count, n), np.nan)
-        judged, violated, whole = (marks & JUDGED) > 0, (marks & VIOLATION) > 0, steps
+        marks = np.zeros(count, dtype=np.uint8)
+        first = (RESIDUAL, UTILISATION) if self.alarms.needs_residual else (UTILISATION,)
+        seen = self._numbers(transient, steps, first, marks)
+        judged, left, violated, unlisted_mode = ((marks & mark) > 0 for mark in (JUDGED, LEFT, VIOLATION, UNLISTED))
+        if np.count_nonzero(judged) < len(steps.k):
+            steps = steps.take(judged[steps.k + 1])
+        frozen, withheld, repeating, why = self._look_all(transient, steps, marks)
+        whole = steps
         if withheld.any():
+            part = np.asarray(withheld.any(axis=1))
+            rows = np.flatnonzero(part)
+            flags = np.asarray(self._numbers(transient, steps.take(part[steps.k + 1]), (FLAGS,))[FLAGS][rows] == 1.0)
             judged &= ~withheld[:, self._counted].all(axis=1)
-            numbers[:, withheld | ~judged[:, None]] = np.nan
-            violated = ((flags == 1.0) & self._counted).any(axis=1)
-            whole = steps.take((judged & ~withheld.any(axis=1))[steps.k + 1])  # the run of a horizon needs every state
+            flags &= ~withheld[rows] & judged[rows, None]
+            left[rows], violated[rows] = flags.any(axis=1), (flags & self._counted).any(axis=1)
+            whole = steps.take((judged & ~part)[steps.k + 1])  # the run of a horizon needs every state
+        _blank(seen, judged, withheld)
+
+        @cache
+        def numbers() -> list[Array]:
+            later = self._numbers(transient, steps, [kind for kind in range(UTILISATION + 1) if kind not in first])
+            _blank(later, judged, withheld)
+            return [one if other is None else other for one, other in zip(seen, later, strict=True)]
+
+        longer, longer_residual = np.full((2, len(model.horizons), count, n), np.nan)
         if model.horizons:
             arrival, x_next = whole.k + 1, np.empty((n, len(whole.k)))
             normalise_columns(transient.x[1:], whole.k, point.x_s, point.X, x_next)
             found = model.over_horizons(whole.k, model.normalised_columns(whole), whole.dt, x_next.T)
-            for over, one in zip((longer, longer_residual), found, strict=True):
-                over[:, arrival] = one.transpose(1, 0, 2)
+            for values, one in zip((longer, longer_residual), found, strict=True):
+                values[:, arrival] = one.transpose(1, 0, 2)
         outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (OUTSIDE, UNKNOWN))
-        alarms = Alarm(self.alarms.rules, model, self._counted)
-        statistics = np.empty((count, len(alarms.names)))
-        alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(alarms.rules)), dtype=bool)
-        if armed is not None:
-            statistics[~armed.counts] = np.nan
+        alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(self.alarms.rules)), dtype=bool)
         dt = np.zeros(count)
         dt[steps.k + 1] = steps.dt
-        rows = [utilisation, *longer, residual, *longer_residual]
-        for start, stop in _alarm_spans(transient.t_ns, armed):
-            on = slice(start, stop)
-            span = [row[on] for row in rows]
-            alarm[on] = alarms.over(dt[on], violated[on], span, judged[on], each[on], statistics[on])[0]
+        rows_of = [seen[UTILISATION], *longer, seen[RESIDUAL], *longer_residual]
+        spans = _alarm_spans(transient.t_ns, armed)
+
+        def over(alarm: NDArray[np.bool_], each: NDArray[np.bool_], values: Array) -> None:
+            alarms = Alarm(self.alarms.rules, model, self._counted)
+            for start, stop in spans:
+                on = slice(start, stop)
+                some = [None if row is None else row[on] for row in rows_of]
+                alarm[on] = alarms.over(dt[on], violated[on], some, judged[on], each[on], values[on])
+
+        @cache
+        def statistics() -> Array:
+            values = np.full((count, len(self.alarms.names)), np.nan)
+            over(np.empty(count, dtype=bool), np.empty_like(each), values)
+            return values
+
+        over(alarm, each, np.empty((count, 0)))
         alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(
-            transient, flags, lower, upper, utilisation, judged, outside, alarm, unfitted_step, unlisted_mode,
-            unknown_regime, frozen, withheld, repeating, statistics, each, alarms, longer.transpose(1, 0, 2), residual,
-            longer_residual.transpose(1, 0, 2), why,
+            transient, numbers, seen[UTILISATION], judged, left, outside, alarm, unfitted_step, unlisted_mode,
+            unknown_regime, frozen, withheld, repeating, statistics, each, self.alarms, longer.transpose(1, 0, 2),
+            longer_residual.transpose(1, 0, 2), why, asked,
         )  # fmt: skip
 
     def _look_all(
-        self, transient: Transient, steps: Transitions, lower: Array, upper: Array
+        self, transient: Transient, steps: Transitions, marks: NDArray[np.uint8]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], dict[tuple[int, int], str]]:
         """`frozen`, `withheld`, `repeating`, `why_frozen` of `Verdicts`, by the watch of `judge`."""
-        frozen, withheld, repeating = (np.zeros(lower.shape, dtype=bool) for _ in range(3))
+        frozen, withheld, repeating = (np.zeros((len(transient), self.model.n), dtype=bool) for _ in range(3))
         why: dict[tuple[int, int], str] = {}
         watch = self._watch()
         if watch is None:
             return frozen, withheld, repeating, why
-        for k, follows, step in walk(self.model, transient.t_ns, steps, steps.rows(lower, 1), steps.rows(upper, 1)):
+
+        def bounds(some: Transitions) -> list[Array]:
+            found = self._numbers(transient, some, (LOWER, UPPER))
+            return [found[kind][some.k + 1] for kind in (LOWER, UPPER)]
+
+        for k, follows, step in walk(self.model, transient.t_ns, steps, steps.rows(marks, 1) & REPEATS > 0, bounds):
             if not follows:
                 watch.forget()
             looked = watch.take(step)
@@ -501,13 +521,24 @@ class EnvelopeMonitor:
                 repeating[k + 1, moved.state] = True
         return frozen, withheld, repeating, why
 
-    def _judge_rows(self, transient: Transient, steps: Transitions, numbers: Array, marks: NDArray[np.uint8]) -> None:
-        """What `Judge.judge_rows` says of every row, on all cores."""
-        rows = np.linspace(0, len(marks), max(len(marks) // _PIECE, 1) + 1).astype(int).tolist()
-        given = []
-        for a, b in pairwise(rows):
-            some = slice(*np.searchsorted(steps.k, [a - 1, b - 1]).tolist())
-            judge = self.model.judge_of(self.rule.margin, self._counted)  # each has room of its own
-            given.append((judge, steps.k[some], steps.dt[some], a, numbers[:, a:b], marks[a:b]))
+    def _numbers(
+        self, transient: Transient, steps: Transitions, kinds: Sequence[int], marks: NDArray[np.uint8] | None = None
+    ) -> list[Any]:
+        """Arrays of some kinds of numbers, None of the others, that `Judge.judge_rows` fills in on all cores."""
+        count = len(transient)
+        numbers = [np.empty((count, self.model.n)) if kind in kinds else None for kind in range(UTILISATION + 1)]
+        marks = np.empty(count, dtype=np.uint8) if marks is None else marks
+        ends = np.linspace(0, len(steps.k), len(steps.k) // _PIECE + 2).astype(int).tolist()
+        judges = [self.model.judge_of(self.rule.margin, self._counted) for _ in ends[1:]]  # each has room of its own
+        given = [(judge, steps.k[a:b], steps.dt[a:b]) for judge, (a, b) in zip(judges, pairwise(ends), strict=True)]
         x, u, s = transient.x, transient.u, transient.s
-        on_cores(lambda judge, *some: judge.judge_rows(x, u, s, *some), given)
+        on_cores(lambda judge, k, dt: judge.judge_rows(x, u, s, k, dt, numbers, marks), given)
+        return numbers
+
+
+def _blank(numbers: Sequence[Any], judged: NDArray[np.bool_], withheld: NDArray[np.bool_]) -> None:
+    """NaN in place of numbers without a verdict."""
+    for values in numbers:
+        if values is not None:
+            values[~judged] = np.nan
+            values[withheld] = np.nan

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.text import html_table, named, number_text, plural, times
-from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, UPPER, UTILISATION
+from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
 from uncertain_lti.monitor.alarm import Alarm, Raised
 from uncertain_lti.monitor.frozen import Looked
 from uncertain_lti.sampling.clock import Status
@@ -316,16 +316,14 @@ class Verdicts:
     ----------
     transient : Transient
         What was judged.
-    flags : array (N+1, n)
-        0 contained, 1 violated, NaN no verdict.
-    lower : array (N+1, n)
-        Lower bounds, recorded units; NaN without a verdict.
-    upper : array (N+1, n)
-        Upper bounds, recorded units; NaN without a verdict.
+    numbers : callable
+        Computes what a `Judgement` holds of each state, five arrays (N+1, n), when one of them is first asked for.
     utilisation : array (N+1, n)
         (x_next - centre) / half, with half before the margin.
     judged : array (N+1,) of bool
         Whether there is a verdict on some state that counts.
+    violated : array (N+1,) of bool
+        Whether some state left its bounds.
     outside_domain : array (N+1,) of bool
         z(t_{k-1}) lies outside the ranges seen in the fit.
     alarm : array (N+1,) of bool
@@ -343,18 +341,16 @@ class Verdicts:
         There is no verdict on the state, as its row needs one that is frozen here or was one sample before.
     repeating : array (N+1, n) of bool
         The state repeats exactly for longer than ever in the fit, and is not frozen.
-    statistics : array (N+1, S)
-        Each statistic of the alarm over its threshold: beyond 1 and -1 it raises the alarm; NaN without a verdict.
+    over_thresholds : callable
+        Computes `statistics` when they are first asked for.
     rule_alarms : array (N+1, rules) of bool
         Which rules raise the alarm after each sample.
     alarms : Alarm
         The rules, with their `labels` and the `names` of the statistics.
     longer_utilisation : array (N+1, horizons, n)
         Utilisation by each of the model's horizons; NaN where its window is broken.
-    residual : array (N+1, n)
-        x_next - centre, normalised; NaN without a verdict.
     longer_residual : array (N+1, horizons, n)
-        The same by each of the model's horizons.
+        x_next - centre, normalised, by each of them.
     why_frozen : dict, optional
         Of each sample and number of a state that is frozen there, in words why it is.
     asked : array (N+1,) of bool, optional
@@ -362,11 +358,10 @@ class Verdicts:
     """
 
     transient: Transient
-    flags: Array
-    lower: Array
-    upper: Array
+    numbers: Callable[[], list[Array]]
     utilisation: Array
     judged: NDArray[np.bool_]
+    violated: NDArray[np.bool_]
     outside_domain: NDArray[np.bool_]
     alarm: NDArray[np.bool_]
     unfitted_step: NDArray[np.bool_]
@@ -375,11 +370,10 @@ class Verdicts:
     frozen: NDArray[np.bool_]
     withheld: NDArray[np.bool_]
     repeating: NDArray[np.bool_]
-    statistics: Array
+    over_thresholds: Callable[[], Array]
     rule_alarms: NDArray[np.bool_]
     alarms: Alarm
     longer_utilisation: Array
-    residual: Array
     longer_residual: Array
     why_frozen: dict[tuple[int, int], str] = field(default_factory=dict)
     asked: NDArray[np.bool_] | None = None
@@ -473,7 +467,26 @@ class Verdicts:
         return self.transient.x
 
     @property
-    def violated(self) -> NDArray[np.bool_]:
-        """Whether some state left its bounds, (N+1,)."""
-        left: NDArray[np.bool_] = (self.flags == 1.0).any(axis=1)
-        return left
+    def flags(self) -> Array:
+        """0 contained, 1 violated, NaN no verdict (N+1, n)."""
+        return self.numbers()[FLAGS]
+
+    @property
+    def lower(self) -> Array:
+        """Lower bounds, recorded units; NaN without a verdict (N+1, n)."""
+        return self.numbers()[LOWER]
+
+    @property
+    def upper(self) -> Array:
+        """Upper bounds, recorded units; NaN without a verdict (N+1, n)."""
+        return self.numbers()[UPPER]
+
+    @property
+    def residual(self) -> Array:
+        """x_next - centre, normalised; NaN without a verdict (N+1, n)."""
+        return self.numbers()[RESIDUAL]
+
+    @property
+    def statistics(self) -> Array:
+        """Each statistic over its threshold (N+1, S): beyond 1 and -1 it raises the alarm; NaN without a verdict."""
+        return self.over_thresholds()

@@ -139,7 +139,8 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     values = np.zeros((part.judged, len(alarm.names)))
     for start, stop in part.spans:
         span = slice(start, stop)
-        values[span] = alarm.over(part.dt[span], np.zeros(stop - start, dtype=bool), part.rows(span))[2]
+        nothing = np.zeros(stop - start, dtype=bool)
+        alarm.over(part.dt[span], nothing, part.rows(span), values=values[span])
     sizes = np.abs(values, out=values)
     sizes[np.isnan(sizes)] = 0.0
     np.minimum(sizes, LARGEST, out=sizes)

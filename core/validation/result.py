@@ -39,7 +39,7 @@ def raised_on(rules: Sequence[Rule], part: Part) -> NDArray[np.bool_]:
     for start, stop in part.spans:
         span = slice(start, stop)
         alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
-        found[span] = alarm.over(part.dt[span], violated[span], part.rows(span))[0]
+        found[span] = alarm.over(part.dt[span], violated[span], part.rows(span))
     return found
 
 
