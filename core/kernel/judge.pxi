@@ -103,7 +103,7 @@ cdef class Judge:
             np.concatenate([steady, scale, least, greatest, cells_per_unit(least, greatest, self.cells)])
         )
         cdef arrays.array room = doubles(np.ones(p + self.total + n + n * _TOGETHER))  # beyond z the regressors are 1
-        cdef arrays.array cell = array("i", bytes(4 * (size or 1)))
+        cdef arrays.array cell = array("i", bytes(4 * (size or 1) * _TOGETHER))
         cdef bytes flags = np.asarray(counted, dtype=np.uint8).tobytes()
         cdef bytes cells = b"" if occupied is None else np.ascontiguousarray(occupied, dtype=np.uint8).tobytes()
         self._keep = [numbers, room, cell, flags, cells]

@@ -134,26 +134,29 @@ cdef void left_domain(
 ) noexcept nogil:
     """Whether each [x; u], in columns a stride wide, leaves the box in some element, or is a combination not fitted.
 
-    `occupied`: of `domain.Occupancy`, with so many cells, 0 for none; `cell` (size,): room.
+    `occupied`: of `domain.Occupancy`, with so many cells, 0 for none; `cell` (size, _TOGETHER): room.
     """
-    cdef Py_ssize_t i, j, q
+    cdef Py_ssize_t i, j, q, low, many
+    cdef int* first
+    cdef int* second
     cdef const unsigned char* pair
     for q in range(count):
         out[q] = 0
     for i in range(size):
         for q in range(count):
             out[q] |= is_outside(z[i * stride + q], least[i], greatest[i])
-    for q in range(count if cells and size else 0):
-        if out[q]:
-            continue
+    for low from 0 <= low < (count if cells else 0) by _TOGETHER:
+        many = count - low if count - low < _TOGETHER else _TOGETHER
         for i in range(size):
-            cell[i] = cell_of(z[i * stride + q], least[i], per_unit[i], <int>cells - 1)
-        if size == 1:
-            out[q] = not occupied[cell[0] * cells + cell[0]]
+            for q in range(many):
+                cell[i * _TOGETHER + q] = cell_of(z[i * stride + low + q], least[i], per_unit[i], <int>cells - 1)
         pair = occupied
         for i in range(size):
-            for j in range(i + 1, size):
-                out[q] |= not pair[cell[i] * cells + cell[j]]
+            first = cell + i * _TOGETHER
+            for j in range(i + 1 if size > 1 else i, size):
+                second = cell + j * _TOGETHER
+                for q in range(many):
+                    out[low + q] |= not pair[first[q] * cells + second[q]]
                 pair += cells * cells
 
 
@@ -167,7 +170,7 @@ def outside_domain(z, least, greatest, occupied=None):
     cdef const unsigned char[::1] flags = np.ascontiguousarray(
         np.zeros(1, np.uint8) if occupied is None else occupied
     ).view(np.uint8).reshape(-1)
-    cdef arrays.array cell = array("i", bytes(4 * (size or 1)))
+    cdef arrays.array cell = array("i", bytes(4 * (size or 1) * _TOGETHER))
     found = np.zeros(count, dtype=bool)
     cdef unsigned char[::1] left = found.view(np.uint8)
     if len(least) != size or len(greatest) != size:

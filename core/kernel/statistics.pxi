@@ -145,28 +145,26 @@ cdef class Statistic:
         if not fits or values.shape[1] not in (0, self.size):
             raise ValueError("the numbers of the verdicts do not fit the states")
         cdef Py_ssize_t i, q, many, apart = table.strides[0] // 8, kept = values.shape[1]
+        cdef unsigned char over[_TOGETHER]
         with nogil:
             for k from 0 <= k < count by _TOGETHER:
                 many = count - k if count - k < _TOGETHER else _TOGETHER
                 self.push(&times[k], &table[k, 0], apart, &given[k], many)
+                self.raises(many, over)
                 for q in range(many):
                     for i in range(kept):
                         values[k + q, i] = self.after[i * _TOGETHER + q] if given[k + q] else NAN
-                    alarm[k + q] = self.raises(q)
+                    alarm[k + q] = over[q]
         return raised, found
 
     cdef int push(
         self, const double* dt, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count
     ) except -1 nogil:
-        """Take some verdicts, of which `after` holds the statistic; `raises` then takes one after the other."""
+        """Take some verdicts, of which `after` holds the statistic; `raises` takes them then."""
         cdef Py_ssize_t i, q
         for q in range(count):
             self.step_ns[q] = <long long>(dt[q] * 1e9 + 0.5)
-            if given[q]:
-                self.take(rows + q * apart, self.terms + q)
-            else:
-                for i in range(self.n):
-                    self.terms[i * _TOGETHER + q] = NAN
+        self.take(rows, apart, given, count)
         if self.kind == _MEWMA:
             self.average_together(dt, count)
         for i in range(self.size):
@@ -176,46 +174,66 @@ cdef class Statistic:
                 self.slide(i, dt, count)
         return 0
 
-    cdef bint raises(self, Py_ssize_t q) noexcept nogil:
-        """The alarm after verdict q; without a number it stays as it was."""
-        cdef Py_ssize_t i
+    cdef void raises(self, Py_ssize_t count, unsigned char* raised) noexcept nogil:
+        """The alarm after each of some verdicts; without a number it stays as it was."""
+        cdef Py_ssize_t i, q
         cdef double value
-        cdef bint over = False, there = False
+        cdef unsigned char there[_TOGETHER]
+        for q in range(count):
+            there[q] = raised[q] = 0
         for i in range(self.size):
-            value = self.after[i * _TOGETHER + q]
-            there |= self.terms[i * _TOGETHER + q] == self.terms[i * _TOGETHER + q]
-            over |= (self.counted[i] != 0) & ((value > 1.0) | (value < -1.0))
-        if there:
-            self.alarm = over
-        return self.alarm
+            for q in range(count):
+                there[q] |= self.terms[i * _TOGETHER + q] == self.terms[i * _TOGETHER + q]
+            for q in range(count if self.counted[i] else 0):
+                value = self.after[i * _TOGETHER + q]
+                raised[q] |= (value > 1.0) | (value < -1.0)
+        for q in range(count):
+            if not there[q]:
+                raised[q] = self.alarm
+            self.alarm = raised[q]
 
-    cdef void take(self, const double* row, double* terms) noexcept nogil:
-        """What a verdict adds of each state, `_TOGETHER` apart; NaN where it adds nothing."""
-        cdef Py_ssize_t i, j, n = self.n
-        cdef double value, total, limit, square = 0.0
-        if self.kind == _CHI2 or self.kind == _MEWMA:
-            for i in range(n):
-                value = row[i]
-                if value != value:
-                    terms[0] = NAN
-                    return
-            for i in range(n):
-                total = 0.0
-                for j in range(i + 1):
-                    value = row[j]  # infinite where half is 0
-                    value = _MOST if value > _MOST else -_MOST if value < -_MOST else value
-                    total += self.whitening[i * n + j] * (value - self.mean[j])
-                if self.kind == _MEWMA:
-                    terms[i * _TOGETHER] = -_LIMIT if total < -_LIMIT else total if total <= _LIMIT else _LIMIT
-                square += total * total
-            if self.kind == _CHI2:
-                terms[0] = square if square <= _MOST else _MOST
-            return
-        limit = _LIMIT if self.kind == _EWMA or self.kind == _CUSUM else _MOST
+    cdef void take(
+        self, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count
+    ) noexcept nogil:
+        """What each of some verdicts adds of each state; NaN where it adds nothing."""
+        cdef Py_ssize_t i, j, q, n = self.n
+        cdef bint joint = self.kind == _CHI2 or self.kind == _MEWMA
+        cdef double value, weight, mean, limit = _LIMIT if self.kind == _EWMA or self.kind == _CUSUM else _MOST
+        cdef double* values
+        cdef double* term = self.terms
+        cdef double total[_TOGETHER]
+        cdef double square[_TOGETHER]
+        cdef unsigned char missing[_TOGETHER]
         for i in range(n):
-            value = row[i]
-            value = limit if value > limit else -limit if value < -limit else value
-            terms[i * _TOGETHER] = value * value if self.kind == _ENERGY else value
+            values = (self.after if joint else self.terms) + i * _TOGETHER
+            for q in range(count):
+                value = rows[q * apart + i]  # infinite where half is 0
+                value = limit if value > limit else -limit if value < -limit else value
+                values[q] = value if given[q] else NAN
+            if self.kind == _ENERGY:
+                for q in range(count):
+                    values[q] *= values[q]
+        if not joint:
+            return
+        for q in range(count):
+            square[q], missing[q] = 0.0, 0
+        for i in range(n):
+            term = self.terms + i * _TOGETHER
+            for q in range(count):
+                total[q] = 0.0
+                missing[q] |= self.after[i * _TOGETHER + q] != self.after[i * _TOGETHER + q]
+            for j in range(i + 1):
+                values, weight, mean = self.after + j * _TOGETHER, self.whitening[i * n + j], self.mean[j]
+                for q in range(count):
+                    total[q] += weight * (values[q] - mean)
+            for q in range(count):
+                square[q] += total[q] * total[q]
+                term[q] = -_LIMIT if total[q] < -_LIMIT else total[q] if total[q] <= _LIMIT else _LIMIT
+        for q in range(count):
+            if self.kind == _CHI2:
+                self.terms[q] = square[q] if square[q] <= _MOST else _MOST
+            if missing[q]:
+                self.terms[q] = NAN
 
     cdef void average(self, Py_ssize_t i, const double* dt, Py_ssize_t count) noexcept nogil:
         """Moving average of a state, or its sums upwards and downwards, after each of some verdicts."""
@@ -330,12 +348,13 @@ cdef class Statistics:
         cdef Statistic part
         cdef Py_ssize_t begin
         cdef bint raised = False
-        cdef unsigned char given = True
+        cdef unsigned char over, given = True
         for part, begin in zip(self.parts, self.begins):
             if begin < 0 or begin + part.n > row.shape[0]:
                 raise ValueError("the numbers of the verdict do not fit the states")
             part.push(&dt, &row[begin], part.n, &given, 1)
-            raised |= part.raises(0)
+            part.raises(1, &over)
+            raised |= over
         return raised
 
     def values(self):

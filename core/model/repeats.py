@@ -220,10 +220,10 @@ def walk(
     `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `repeats` (K,): whether some state repeats; `bounds`:
     lower and upper bounds (K, n) of some transitions, recorded units.
     """
-    follows = np.concatenate([[False], np.diff(steps.k) == 1])[: len(steps.k)]
-    rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
-    if not len(rows):
+    if not repeats.any():
         return
+    follows = np.append(False, np.diff(steps.k) == 1)
+    rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
     steps = steps.take(rows)
     z, at = model.normalised_columns(steps), steps.k
     outside = model.domain.beyond(z) | model.unknown(z)

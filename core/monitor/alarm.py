@@ -385,9 +385,11 @@ def steps_back(instant: int, last: int, before: int) -> bool:
 
 def back_and_restarts(t_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """`steps_back` at each sample (N+1,), and whether time has stepped back to the one before and stays there."""
-    back = np.diff(t_ns, prepend=t_ns[:1]) < 0
+    back, restarts = np.zeros((2, len(t_ns)), dtype=bool)
+    np.less(t_ns[1:], t_ns[:-1], out=back[1:])
+    if not back.any():
+        return back, restarts
     back[2:] &= t_ns[2:] <= t_ns[:-2]
-    restarts = np.zeros(len(t_ns), dtype=bool)
     restarts[2:] = back[1:-1] & (t_ns[2:] <= t_ns[:-2])
     return back, restarts
 
