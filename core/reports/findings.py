@@ -24,7 +24,7 @@ from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import UNVOUCHED, check_data
-from uncertain_lti.reports.model_text import blocks_in_words, readable_validation
+from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
 """Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""
@@ -71,8 +71,8 @@ def findings(
     -------
     dict
         `rely`: an answer (yes, with care, unknown, no) and its reasons, what weighs most first; `happened`: a sentence
-        per recording; `model`, `validation` and `recordings` what they rest on. `recordings` holds what `check --json`
-        says, and the files with their checksums.
+        per recording; `sees`: which faults it would see, an answer and sentences; `model`, `validation` and
+        `recordings` what they rest on. `recordings` holds what `check --json` says, and the files with their checksums.
 
     Raises
     ------
@@ -103,6 +103,7 @@ def findings(
             "reasons": [dict(zip(("weight", "about", "text"), reason, strict=True)) for reason in reasons],
         },
         "happened": [_happened(r) for r in recordings],
+        "sees": _sees(model, validation),
         "alarm": any(r["alarm"] for r in recordings),
         "rule": {
             "words": "; or ".join(one.words for one in rules),
@@ -135,7 +136,9 @@ def findings_text(facts: Mapping[str, Any]) -> str:
     lines = [f"may I rely on it? {facts['rely']['answer']}"]
     lines += [f"  {r['weight']}: {r['text']}" for r in facts["rely"]["reasons"]]
     lines.append("what happened?")
-    return "\n".join(lines + [f"  {h['recording']}: {h['text']}" for h in facts["happened"]])
+    lines += [f"  {h['recording']}: {h['text']}" for h in facts["happened"]]
+    lines.append(f"which faults would it see? {facts['sees']['answer']}")
+    return "\n".join(lines + [f"  {text}" for text in facts["sees"]["texts"]])
 
 
 def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
@@ -159,6 +162,26 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     if frozen := [f"{repeat['text']}, {repeat['why']}" for repeat in recording["frozen"]]:
         text = f"frozen: {shortlist(frozen, 1)}. {text}"
     return {"recording": recording["recording"], "state": state, "text": text}
+
+
+def _sees(model: UncertainLTI, validation: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Which faults it would see: those of the validation, else the jumps that the alarm promises to see."""
+    faults, validate = detectable_data(validation or {}), "run uncertain-lti validate MODEL --output MODEL"
+    if faults is not None and not faults.get("refused"):
+        answer = f"within {number(faults['within'])} s, from these sizes on"
+        return {"answer": answer, "texts": detectable_words(faults)}
+    if faults is None and (jumps := [text for text in _promises(model) if _is_jump(text)]):
+        return {"answer": "jumps of these sizes", "texts": [*jumps, f"of others: {validate}"]}
+    return {"answer": "unknown", "texts": [faults["refused"] if faults else validate]}
+
+
+def _promises(model: UncertainLTI) -> list[str]:
+    alarm = model.fit_summary.get("alarm")
+    return [str(text) for text in list_of(alarm.get("promises"))] if isinstance(alarm, Mapping) else []
+
+
+def _is_jump(promise: str) -> bool:
+    return promise.startswith("sees within")
 
 
 # --- reasons for and against relying on a model ------------------------------------------------------------------
@@ -199,7 +222,11 @@ def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | Non
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, Mapping) and alarm.get("headline"):
         weight = {"good": YES, "some": CARE}.get(str(alarm.get("worth")), NO)
-        yield weight, "alarm", "; ".join(map(str, [alarm["headline"], *list_of(alarm.get("promises"))]))
+        yield (
+            weight,
+            "alarm",
+            "; ".join([str(alarm["headline"]), *(text for text in _promises(model) if not _is_jump(text))]),
+        )
     elif validation is None or validation["inside"] is None:
         how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"
         why = f" ({why})" if (why := model.validation.get("not_done")) else ""

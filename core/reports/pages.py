@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, written
-from uncertain_lti.base.text import Block, Table, list_of, number, plural, share
+from uncertain_lti.base.text import Block, Table, number, plural, share
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
@@ -43,7 +43,7 @@ from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Spans
 from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
-from uncertain_lti.reports.model_text import detectable_data, detectable_words, model_blocks, validation_blocks
+from uncertain_lti.reports.model_text import model_blocks, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 
 MOST_NUMBERS = 330_000
@@ -141,7 +141,7 @@ def html_report(
         charts.base_name(facts["model"]["file"] or "model"),
         plotted,
         about=f"Alarm: {facts['rule']['words']}{conditions}.",
-        cards=list(_cards(model, facts)),
+        cards=list(_cards(facts)),
         sections=[
             _what_happened(facts, drawn),
             ("model", "The model", model_blocks(model)),
@@ -152,34 +152,26 @@ def html_report(
     )
 
 
-def _cards(model: UncertainLTI, facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
+def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     rely, reasons = facts["rely"], facts["rely"]["reasons"]
-    items = [{"lead": r["weight"], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons[:6]]
-    if len(reasons) > 6:
-        items.append({"text": f"and {len(reasons) - 6} more", "to": "trust"})
+    items = [{"lead": r["weight"], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons]
     answer = rely["answer"]
-    yield {"title": "May I rely on it?", "tone": _TONE[answer], "answer": answer.capitalize(), "list": items}
+    yield _card("May I rely on it?", _TONE[answer], answer, items, 6, "trust")
     what, look = _headline(facts)
     order = sorted(facts["happened"], key=lambda h: OUTCOMES.index(h["state"]))
-    items = [{"lead": charts.base_name(h["recording"]), "text": f"{h['text']}."} for h in order[:5]]
-    if len(order) > 5:
-        items.append({"text": f"and {len(order) - 5} more recordings", "to": "recordings"})
+    items = [{"lead": charts.base_name(h["recording"]), "text": f"{h['text']}."} for h in order]
+    card = _card("What happened?", look, what, items, 5, "recordings")
     if answer == NO and look == "bad":
-        items.append({"text": "The model is not to be relied on: the machine may be well, and the model wrong."})
-    yield {"title": "What happened?", "tone": look, "answer": what, "list": items}
-    faults = detectable_data(facts["validation"] or {})
-    alarm = model.fit_summary.get("alarm")
-    promises = list_of(alarm.get("promises")) if isinstance(alarm, Mapping) else []
-    if faults is None and promises:
-        others = "of others: run uncertain-lti validate MODEL --output MODEL"
-        seen, items = "Jumps of these sizes", [{"text": _cut(str(text))} for text in (*promises[:6], others)]
-    elif faults is None or faults.get("refused"):
-        why = faults["refused"] if faults else "run uncertain-lti validate MODEL --output MODEL"
-        seen, items = "Unknown", [{"text": why}]
-    else:
-        seen = f"Within {number(faults['within'])} s, from these sizes on"
-        items = [*({"text": text} for text in detectable_words(faults)[:6]), {"text": "and more", "to": "trust"}]
-    yield {"title": "Which faults would it see?", "tone": "wide", "answer": seen, "list": items}
+        card["list"].append({"text": "The model is not to be relied on: the machine may be well, and the model wrong."})
+    yield card
+    items = [{"text": _cut(text)} for text in facts["sees"]["texts"]]
+    yield _card("Which faults would it see?", "wide", facts["sees"]["answer"], items, 6, "trust")
+
+
+def _card(title: str, tone: str, answer: str, items: list[dict[str, Any]], most: int, to: str) -> dict[str, Any]:
+    """One answer, with the first of its reasons and a link to the others."""
+    more = [{"text": f"and {len(items) - most} more", "to": to}] if len(items) > most else []
+    return {"title": title, "tone": tone, "answer": answer[:1].upper() + answer[1:], "list": items[:most] + more}
 
 
 def _headline(facts: Mapping[str, Any]) -> tuple[str, str]:
