@@ -257,3 +257,46 @@ def test_a_value_is_known_to_another_condition_on_the_same_field() -> None:
     for text, known in (("/machine/mode data > 1", 3.0), ("/machine/mode other == 3", None), ("/a data == 3", None)):
         assert arming.said_on(Condition.parse(text)) == known
     assert arming.said_on(None) is None and Arming(None, 0).said_on(arming.condition) is None
+
+
+def test_a_verdict_counts_while_the_condition_holds_and_its_grace_is_over() -> None:
+    arming = Arming(Condition.parse("/machine/mode data >= 3"), 20)
+    assert arming.why_off() == "alarms are off: it is not known whether /machine/mode data >= 3"
+    arming.learn(float("nan"))
+    assert arming.why_off() == "alarms are off: /machine/mode comes without a number in data" and arming.on is None
+    arming.learn(2.5)
+    assert arming.why_off() == "alarms are off until /machine/mode data >= 3" and not arming.at(90)
+    arming.learn(3.0)
+    assert arming.why_off() == "" and [arming.at(t) for t in (100, 119, 120)] == [False, False, True]
+    arming.learn(4.0)  # it held already: the grace does not start over
+    assert arming.at(121) and arming.at(110, steps_back=True), "a step back, perhaps alone, counts as the last one did"
+    arming.learn(1.0)
+    assert not arming.at(130) and not arming.at(125, steps_back=True)
+    arming.learn(3.0)
+    assert [arming.at(t) for t in (140, 159, 160)] == [False, False, True]
+    arming.restart(200)
+    assert [arming.at(t) for t in (201, 219, 220)] == [False, False, True]
+    arming.restart()
+    assert [arming.at(t) for t in (300, 319, 320)] == [False, False, True]
+
+
+def test_without_a_condition_alarms_count_from_the_first_verdict_or_after_the_grace() -> None:
+    assert Arming(None, 0).at(5) and Arming(None, 0).why_off() == ""
+    arming = Arming(None, 20)
+    arming.restart(100)  # nothing was judged yet: the grace begins with the first verdict
+    assert [arming.at(t) for t in (110, 129, 130)] == [False, False, True]
+    known = Arming(Condition.parse("/machine/mode data == true"), 0, 1.0)
+    assert known.on and known.at(7) and str(known.condition) == "/machine/mode data == 1"
+
+
+def test_each_rule_names_the_states_that_it_blames() -> None:
+    """Containment by the flags or its horizon's margin, a statistic beyond its threshold; masked ones never."""
+    rules = [AlarmRule(1, 1), AlarmRule(1, 1, 2.0, horizon=4), StatisticRule("mean", 0.0, 1.0), RULES[4]]
+    sizes, flags, values = np.array([[1.5, 0.5], [-2.0, 2.1]]), np.array([1.0, 0.0]), [1.0, -1.1, 7.0]
+    alarm = Alarm(rules, two_states(), np.ones(2, dtype=bool))
+    found = [(r.label, r.horizon, r.state, r.value) for r in alarm.reasons(range(4), values, sizes, flags)]
+    assert found == [
+        ("containment", 1, "x1", 1.0), ("containment@4", 4, "x2", 1.0), ("mean", 1, "x2", -1.1), ("chi2", 1, "", 7.0),
+    ]  # fmt: skip
+    masked = Alarm(rules, two_states(), np.array([False, True])).reasons(range(3), values, sizes, flags)
+    assert [(r.label, r.state) for r in masked] == [("containment", ""), ("containment@4", "x2"), ("mean", "x2")]

@@ -105,6 +105,7 @@ def same_as_live(model: UncertainLTI, transient: Transient, **rule: Any) -> None
         assert [m.state for m in verdict.frozen] == np.flatnonzero(whole.frozen[k]).tolist()
         assert [m.state for m in verdict.repeating] == np.flatnonzero(whole.repeating[k]).tolist()
         assert list(verdict.withheld) == np.flatnonzero(whole.withheld[k]).tolist()
+        assert verdict.violated == whole.violated[k] and verdict.raised == whole.raised(k)
         if verdict.judged:
             assert np.array(verdict.statistics).tobytes() == whole.statistics[k].tobytes()
         for name in ("flags", "lower", "upper", "utilisation"):
@@ -485,6 +486,16 @@ def test_a_parked_machine_is_not_frozen_by_its_noise() -> None:
         assert np.flatnonzero(verdicts.frozen.any(axis=1)).tolist() == frozen
         assert verdicts.repeating[299].any() or frozen
         same_as_live(model, transient)
+
+
+@pytest.mark.parametrize(("dt", "known", "first"), [(0.5, 5000.0, 1), (0.25, 5000.0, 2), (0.25, 4999.0, 3)])
+def test_half_a_second_is_enough_of_a_noisy_state_that_is_slow(dt: float, known: float, first: int) -> None:
+    """If 5000 steps have shown the noise; else three steps are."""
+    repeats = Repeats([0.0], [0.0], [0.0], [LARGEST], [known])
+    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
+    x = np.concatenate([np.linspace(1.0, 1.5, 10), np.full(10, 1.5)])[:, None]
+    transient = Transient(dt * np.arange(20), x, np.zeros((20, 1)))
+    assert np.flatnonzero(EnvelopeMonitor(model).check(transient).frozen).tolist() == list(range(9 + first, 20))
 
 
 @pytest.mark.parametrize("recur", [False, True])
