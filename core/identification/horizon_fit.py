@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
+from uncertain_lti.base.cores import one_thread_each
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.columns import Columns, Regimes
@@ -53,6 +54,7 @@ def run_of(problem: Problem, structure: Structure | None = None) -> Run:
     return Run(found["A"], found["B"], found.get("c", np.zeros(found["A"].shape[:-1])))
 
 
+@one_thread_each()
 def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None) -> Run | None:
     """What is to be run over the windows: the least squares of one step where nearer than the model, which is None.
 
@@ -89,6 +91,7 @@ def _in_order(problem: Problem) -> tuple[NDArray[np.intp], Array]:
     return problem.k + problem.source * (int(problem.k.max(initial=0)) + 2), signals
 
 
+@one_thread_each()
 def fit_horizons(
     model: UncertainLTI,
     problem: Problem,

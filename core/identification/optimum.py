@@ -18,7 +18,6 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import one_thread_each
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import formulation
@@ -142,7 +141,6 @@ class Optimum(Generic[E]):
         }
 
 
-@one_thread_each()
 def optimum(
     engine: WorkingSet,
     criterion: str,
