@@ -284,7 +284,8 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["fit", "a.mcap", "--signls", "s.yaml", "--output", "m"], "there is no --signls (is --signals meant?)"),
+        (["fit", "a.mcap", "--signals", "s.yaml", "--outptu", "m"], "there is no --outptu (is --output meant?)"),
+        (["fit", "a.mcap", "--signls", "s.yaml", "--output", "m"], "--signls s.yaml (is --signals meant?)"),
         (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
         (["check", "m", "a.mcap", "--discard", "1"], "--discard 1 (an option of fit)"),
         (["chek", "m", "b"], "(is check meant?)"),

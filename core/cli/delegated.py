@@ -27,7 +27,7 @@ def run_info(options: argparse.Namespace) -> Result:
     model = load_model(options.model)
     if options.json:
         regimes = finite_data(block_facts(model))
-        return Result(data=model.to_dict() | ({"regimes": regimes} if regimes else {}))
+        return Result(data=model.replace(memory=None).to_dict() | ({"regimes": regimes} if regimes else {}))
     try:
         return Result(text=model_text(model))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:

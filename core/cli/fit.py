@@ -39,8 +39,13 @@ def run_fit(options: argparse.Namespace) -> Result:
     output = model_target(options.output, options.force)
     if options.workers is not None and options.workers < 1:
         raise FitError(f"--workers is {options.workers}; give 1 or more")
-    archive = options.cache or options.scheduler or options.workers
-    model = _fit_archive(options) if archive else _fit_in_memory(options)
+    if options.update is not None:
+        model = _updated(options)
+    elif options.signals is None:
+        raise FitError("no --signals; give the signals file, which says which field is which signal")
+    else:
+        archive = options.cache or options.scheduler or options.workers
+        model = _fit_archive(options) if archive else _fit_in_memory(options)
     model.save(output)
     options.say(f"{fit_text(model)}\nmodel written to {output}\n{next_text(model, shlex.quote(str(output)))}")
     data = model.to_dict()
@@ -64,6 +69,28 @@ def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
     with options.progress.stage("fitting") as step:
         model = fit(transients, options.criterion, **given, seek_carriers=True, progress=step)
     return _with_sources(model, _files(transients), options.group)
+
+
+def _updated(options: argparse.Namespace) -> UncertainLTI:
+    from uncertain_lti import read_transients
+    from uncertain_lti.reports.model_text import recording_text
+
+    known = {"bags", "update", "output", "force", "json"}
+    for name in (option if isinstance(option, str) else option[0] for option in FIT.options):
+        word = name.removeprefix("--").replace("-", "_")
+        if word not in known and getattr(options, word) not in (None, OPTIONS[name].get("default")):
+            raise FitError(f"{name} is given, and an update keeps what the model was fitted with; leave it out")
+    model = load_model(options.update)
+    transients = read_transients(options.bags, model.signals, options.progress.iterate("reading"), processes=None)
+    for transient in transients:
+        if not options.json:
+            options.progress.note(*transient.notes)
+        options.say(recording_text(transient))
+    with options.progress.stage("fitting") as step:
+        updated = model.update(transients, step)
+    there = model.fit_summary["sources"]
+    new = [file for file in _files(transients) if file["file"] not in [source["file"] for source in there]]
+    return _with_sources(updated, [*there, *new])
 
 
 def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
@@ -134,7 +161,8 @@ def _with_sources(model: UncertainLTI, sources: Iterable[dict[str, Any]], group:
     """The model with the checksums of the files that it was fitted to, and the key of their groups."""
     from uncertain_lti.base.files import sha256
 
-    facts = {**model.fit_summary, "sources": [{**s, "sha256": sha256(s["file"])} for s in sources]}
+    marked = [s if "sha256" in s else {**s, "sha256": sha256(s["file"])} for s in sources]
+    facts = {**model.fit_summary, "sources": marked}
     return model.replace(fit_summary=facts | ({} if group is None else {"group": group}))
 
 
@@ -183,7 +211,8 @@ FIT = Command(
     "fit a model to recordings",
     (
         helped("bags", f"{RECORDINGS}; parts of a split bag are one recording"),
-        "--signals",
+        helped("--signals", "signals file (YAML): which field is which signal; not with --update", required=False),
+        "--update",
         ("--output", {"required": True}),
         *("--force", "--criterion", "--additive", "--alarm", "--false-alarms", "--schedule", "--horizons", "--widths"),
         *("--json", "--discard", "--count", "--group", "--cache", "--scheduler", "--workers"),

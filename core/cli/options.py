@@ -96,6 +96,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
         choices=("bash", "zsh"),
     ),
     "--signals": _takes("signals file (YAML): which field is which signal", "FILE", required=True),
+    "--update": _takes(
+        "fit to what this model was fitted to and to these recordings, without the former; it keeps its signals, "
+        "criterion and terms",
+        "MODEL",
+    ),
     "--output": _takes("model file to write (*.model.json)", "MODEL"),
     "--force": _flag("write over a model that is there already"),
     "--json": _flag("print JSON"),

@@ -31,6 +31,7 @@ from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
+from uncertain_lti.identification.memory import Recording, remembered
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
@@ -88,7 +89,7 @@ def fit(
         raise FitError("method cvxpy states one step; leave horizons out, or use the working-set method")
     if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
         raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
-    signals = _common_signals(transients)
+    signals = common_signals(transients)
     on = signals_of(asked_by(signals) if schedule is None else schedule, [s.name for s in signals.signals])
     if operating_point is not None:
         operating_point = operating_point.scheduled_on([s.name in on for s in signals.scheduling])
@@ -182,7 +183,9 @@ def fit(
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
     if not horizons:
-        return model.replace(fit_summary=facts)
+        model = model.replace(fit_summary=facts)
+        plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
+        return model.replace(memory=_memory(model, problem, transients)) if plain and describe_data else model
     lengths = [int(h) for h in horizons]
     model = model.replace(run=better_run(model, problem, lengths, structure))
     over, facts["horizons"], dropped, solvers = fit_horizons(model, problem, lengths, widths, criterion, progress)
@@ -192,6 +195,14 @@ def fit(
         facts["messages"] = [*facts.get("messages", []), *dropped]
     facts["versions"] = versions({*facts["solver"]["names"], *solvers})
     return model.replace(fit_summary=facts, horizons=over, run=model.run if over else None)
+
+
+def _memory(model: UncertainLTI, problem: Problem, transients: Sequence[Transient]) -> dict[str, Any] | None:
+    """What the file of a plain model keeps of its recordings."""
+    edges = np.searchsorted(problem.source, np.arange(len(transients) + 1)).tolist()
+    each = zip(transients, edges[:-1], edges[1:], strict=True)
+    recordings = [Recording.of(t.name, problem.subset(slice(a, b))) for t, a, b in each]
+    return remembered(model, problem, recordings)
 
 
 @one_thread_each()
@@ -267,7 +278,7 @@ def fit_fleet(
         rank, messages = describe(
             model, describe_on, sums, found.mean_width, transients, few, discarded if criterion == "qp" else None
         )
-        return rank, messages + _distance(found.gap)
+        return rank, messages + distance_in_words(found.gap)
 
     afterwards = (said, partial(fleet.residuals, model, judged), *(partial(repeats_in, model, t) for t in transients))
     words, residuals, *seen = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)
@@ -295,7 +306,7 @@ def _block_facts(
     ]
 
 
-def _distance(gap: float) -> list[str]:
+def distance_in_words(gap: float) -> list[str]:
     """What the user should know if the answer is not proven to be the optimum."""
     remedy = (
         "the containment holds; the signals may be nearly collinear or exact, so leave one out, or fix what is known "
@@ -341,7 +352,8 @@ def _budget(discard: float, transitions: int) -> int:
     return int(discard) if whole else int(discard * transitions)
 
 
-def _common_signals(transients: Sequence[Transient]) -> SignalMap:
+def common_signals(transients: Sequence[Transient]) -> SignalMap:
+    """Signals of recordings, which must all be read alike."""
     if not transients:
         raise FitError("no transients; give at least one recording")
     first = transients[0]

@@ -71,6 +71,11 @@ class Moments:
             self.visits + other.visits,
         )
 
+    def __sub__(self, other: Moments) -> Moments:
+        """The sums without those over some of the transitions; ranges stay."""
+        names = ("plain_gram", "centre", "target", "rate_square", "width_sum", "count", "visits")
+        return replace(self, **{name: getattr(self, name) - getattr(other, name) for name in names})
+
     def one_block(self) -> Moments:
         """The sums of the same transitions with one block for all: the weights of a schedule add up to 1."""
         count = len(self.visits)

@@ -16,6 +16,7 @@ import reprlib
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -76,6 +77,24 @@ class Occupancy:
         cells = visited.shape[1]
         near = [wide[:, i : i + cells, j : j + cells] for i in range(3) for j in range(3)]
         return cls(cells, np.logical_or.reduce(near))
+
+    def within(self, before: Domain, low: Array, high: Array) -> NDArray[np.bool_]:
+        """The same combinations on a grid of as many cells over larger ranges; every cell that a cell lies in.
+
+        `before`: whose ranges the grid has now; `low`, `high` (n + m,): the larger ones.
+        """
+        span, edges = np.maximum(high - low, 1e-300), np.arange(self.cells) / self.cells
+        own = before.greatest - before.least
+        begin = ((before.least - low) / span)[:, None] + (own / span)[:, None] * edges
+        end = begin + (own / span / self.cells)[:, None]
+        first, last = (
+            np.clip(((at + shift) * self.cells).astype(int), 0, self.cells - 1)
+            for at, shift in ((begin, 1e-9), (end, -1e-9))
+        )
+        cells = np.arange(self.cells)[:, None]
+        lies = (cells >= first[:, None]) & (cells <= np.maximum(first, last)[:, None])  # (n + m, larger, own)
+        pairs = list(combinations(range(len(low)), 2)) or [(0, 0)]
+        return np.array([lies[i] @ held @ lies[j].T for (i, j), held in zip(pairs, self.occupied, strict=True)])
 
     def to_dict(self) -> dict[str, Any]:
         """As it stands in a model file."""

@@ -44,7 +44,7 @@ _SCHEDULING = (*_STATE, "max_hold")
 _CONTROL = (*_SCHEDULING, "delay")
 _STEPS = ("dt_median", "dt_min", "dt_max")
 _SAMPLING = {"clock", "clock_type", "time", *_STEPS, "max_gap", "min_step", "max_skew"}
-_NEWER = {"schedule", "scheduling", "blocks", "horizons", "run", "residuals", "frozen", "signatures"}
+_NEWER = {"schedule", "scheduling", "blocks", "horizons", "run", "residuals", "frozen", "signatures", "memory"}
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
@@ -89,6 +89,7 @@ def structure(model: Any) -> dict[str, Any]:
         "signatures": [signature.to_dict() for signature in model.signatures] or None,
         "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
         "validation": _plain(model.validation),
+        "memory": model.memory or None,
     }
     whole = _known(whole, whole)
     newer = (
@@ -180,6 +181,7 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         "repeats": Repeats.from_dict(data["frozen"]) if data.get("frozen") is not None else None,
         "fit_summary": {_IN_PYTHON.get(k, k): v for k, v in object_of(data.get("fit", {}), "fit").items()},
         "validation": object_of(data.get("validation", {}), "validation"),
+        "memory": object_of(data.get("memory", {}), "memory"),
     }
 
 

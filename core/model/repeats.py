@@ -106,6 +106,24 @@ class Repeats:
     def __repr__(self) -> str:
         return f"Repeats(longest {', '.join(f'{s:.3g} s' for s in self.longest_repeat_s)})"
 
+    def and_of(self, other: Repeats) -> Repeats:
+        """Those of both: where a share of all windows would decide, the more active of the two.
+
+        Parameters
+        ----------
+        other : Repeats
+            Of other recordings.
+
+        Returns
+        -------
+        Repeats
+            No state is called frozen that one of the two does not call so.
+        """
+        longest, run, total, beyond = (np.maximum(getattr(self, name), getattr(other, name)) for name in _KEYS[:-1])
+        noisy = np.where((self.noisy_steps > 0) & (other.noisy_steps > 0), self.noisy_steps + other.noisy_steps, 0.0)
+        run, total, beyond = (values if np.isfinite(values).all() else None for values in (run, total, beyond))
+        return Repeats(longest, run, total, beyond, noisy)
+
     def to_dict(self) -> dict[str, list[float]]:
         """As it is in a model file."""
         found = {name: getattr(self, name).tolist() for name in _KEYS}

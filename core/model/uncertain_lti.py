@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -44,10 +45,11 @@ from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature, checked_signatures
 from uncertain_lti.model.terms import ARRAYS
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 _PARTS = ("schedule", "block_data", "horizons", "run", "signals", "sampling", "domain", "alarm", "residuals", "repeats",
-          "signatures", "fit_summary", "validation")  # fmt: skip
+          "signatures", "fit_summary", "validation", "memory")  # fmt: skip
 """What a model is made of beside its arrays, by the arguments of the constructor."""
 
 
@@ -107,6 +109,8 @@ class UncertainLTI(Envelope):
         How the model was fitted; plain data that goes to the file as it is.
     validation : mapping, optional
         How it was validated, likewise.
+    memory : mapping, optional
+        What the fit keeps of its recordings for `update`, likewise.
 
     Raises
     ------
@@ -138,6 +142,7 @@ class UncertainLTI(Envelope):
         signatures: Sequence[Signature] = (),
         fit_summary: Mapping[str, Any] | None = None,
         validation: Mapping[str, Any] | None = None,
+        memory: Mapping[str, Any] | None = None,
     ) -> None:
         lead = () if schedule is None else (schedule.blocks,)
         super().__init__({"A": A, "B": B, "dA": dA, "dB": dB, "c": c, "dc": dc, "v": v}, lead=lead)
@@ -177,6 +182,7 @@ class UncertainLTI(Envelope):
             raise ModelError(f"field 'frozen' has {len(repeats.longest_repeat_s)} numbers for {plural(n, 'state')}")
         self.fit_summary = dict(fit_summary or {})
         self.validation = dict(validation or {})
+        self.memory = dict(memory or {})
 
     def _alarm(self, alarm: Sequence[Rule] | None, alarm_rule: AlarmRule | None) -> tuple[Rule, ...]:
         rules = (alarm_rule or AlarmRule(),) if alarm is None else checked_rules(alarm)
@@ -443,6 +449,38 @@ class UncertainLTI(Envelope):
         if not {*ARRAYS, "schedule", "horizons"}.isdisjoint(changes):
             arguments["signatures"] = ()  # they are of the utilisation by these bounds
         return UncertainLTI(**{**arguments, **changes})
+
+    def update(
+        self, transients: Iterable[Transient] | Transient, progress: Callable[[str], None] | None = None
+    ) -> UncertainLTI:
+        """The fit to the recordings of this model and further ones, without the former.
+
+        The model keeps what that takes: sums, the transitions that decide, and of all others how far they are from
+        mattering. For plain models: one block, one step, every sample of the same weight, nothing discarded.
+
+        Parameters
+        ----------
+        transients : Transient or iterable of Transient
+            New recordings; earlier ones that are given again are recognised, and not counted twice.
+        progress : callable, optional
+            Called with one line of text per pass over the data.
+
+        Returns
+        -------
+        UncertainLTI
+            Elements, objective and ranges as of one fit of all recordings at this operating point, by the same
+            criterion and terms. Its alarm stays; residuals of `chi2` and exact repeats are those of the earlier
+            recordings by the model of then, with those of the new ones by the model of now.
+
+        Raises
+        ------
+        FitError
+            What the model keeps does not prove the optimum of all recordings: names those to give again. Or the model
+            is not plain, keeps nothing, or has other signals.
+        """
+        above = import_module("uncertain_lti.identification.update")  # a model alone needs no solver
+        updated: UncertainLTI = above.updated(self, transients, progress)
+        return updated
 
     # --- other tools ---
 

@@ -1,0 +1,183 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Update: a model and further recordings to the optimum of all, proven by what the model keeps, or refused by name."""
+
+import json
+
+import numpy as np
+import pytest
+from engine_bag import SIGNALS, engine_bag
+
+from uncertain_lti import Transient, UncertainLTI, fit
+from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.main import main
+
+PAPER = {"additive": "noise", "alarm": "containment"}
+
+
+def runs_of(seed, lengths, n=3, m=2, noise=0.01, dt=0.02):
+    """Recordings of one random stable plant whose elements vary a little, with noise."""
+    rng = np.random.default_rng(seed)
+    elements = np.hstack([rng.normal(size=(n, n)) / np.sqrt(n) - 2 * np.eye(n), rng.normal(size=(n, m))])
+    runs = []
+    for number, count in enumerate(lengths):
+        x, u = np.zeros((count + 1, n)), np.zeros((count + 1, m))
+        for k in range(count):
+            u[k + 1] = 0.95 * u[k] + 0.3 * rng.normal(size=m)
+            drawn = elements * (1 + 0.05 * rng.uniform(-1, 1, elements.shape))
+            step = dt * drawn @ np.concatenate([x[k], u[k]])
+            x[k + 1] = x[k] + step + noise * rng.uniform(-1, 1, n)
+        runs.append(Transient(np.arange(count + 1) * dt, x, u, name=f"run {number}"))
+    return runs
+
+
+def equal(one, other):
+    a, b = (np.atleast_1d(np.asarray(m.fit_summary["objective"])) for m in (one, other))
+    assert a == pytest.approx(b, rel=1e-9)
+    for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+        assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-6, abs=1e-7)
+    for name in ("transitions", "transients", "segments"):
+        assert one.fit_summary[name] == other.fit_summary[name]
+    assert one.fit_summary["mean_width"] == pytest.approx(other.fit_summary["mean_width"], rel=1e-7)
+    assert np.array_equal(one.domain.x_min, other.domain.x_min) and np.array_equal(one.domain.u_max, other.domain.u_max)
+    assert one.domain.step_max == pytest.approx(other.domain.step_max)
+
+
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize("additive", ["none", "disturbance", "noise", "both"])
+def test_an_update_is_the_fit_of_all(criterion, additive):
+    """With more transitions than are kept, again and again, each recording given once; or refused by name."""
+    runs = runs_of(7, (6000, 5000, 400, 300, 200), noise=0.0 if additive == "none" else 0.01)
+    options = {"additive": additive, "alarm": "containment"}
+    model, there, refused = fit(runs[:2], criterion, **options), runs[:2], 0
+    for run in runs[2:]:
+        there = [*there, run]
+        try:
+            model = model.update(run)
+        except FitError as error:
+            refused += 1
+            again = [r for r in there if r.name in str(error).partition(" give ")[2].partition(" again,")[0]]
+            assert again and run not in again
+            model = model.update([*again, run])
+        equal(model, fit(there, criterion, **options))
+        assert all((model.bounds(r.x[:-1], r.u[:-1], 0.02)[0] <= r.x[1:]).all() for r in there)
+    assert model.fit_summary["updates"] == 3 and refused < 3
+    assert model.fit_summary["violations"] == 0
+
+
+def test_what_was_not_kept_is_never_left_outside():
+    """Where new recordings move the elements far, the earlier ones are named, and given again they are fitted."""
+    quiet, loud = runs_of(3, (20_000, 20_000))[:1], runs_of(4, (500,), noise=0.05)
+    model = fit(quiet, "qp", **PAPER)
+    with pytest.raises(FitError, match="does not prove the optimum of all recordings; give run 0 again, together"):
+        model.update(loud)
+    equal(model.update([*quiet, *loud]), fit([*quiet, *loud], "qp", **PAPER))
+
+
+def test_a_recording_that_is_given_again_counts_once():
+    runs = runs_of(1, (900, 800, 700))
+    model = fit(runs[:2], "qp", **PAPER)
+    equal(model.update(runs), fit(runs, "qp", **PAPER))
+    with pytest.raises(FitError, match="every recording is in the model already"):
+        model.update(runs[:2])
+
+
+def test_the_file_holds_what_an_update_needs(tmp_path):
+    runs = runs_of(2, (9000, 300, 200))
+    model = fit(runs[:1], "lp", **PAPER)
+    for run in runs[1:]:
+        model.save(tmp_path / "m.json")
+        model = UncertainLTI.load(tmp_path / "m.json").update(run)
+    equal(model, fit(runs, "lp", **PAPER))
+
+
+def test_the_file_grows_by_a_megabyte_at_most(tmp_path):
+    (run,) = runs_of(0, (4000,), n=20, m=5)
+    model = fit(run, "qp", **PAPER)
+    model.save(tmp_path / "with.json")
+    model.replace(memory=None).save(tmp_path / "without.json")
+    with_it, without = ((tmp_path / f"{name}.json").stat().st_size for name in ("with", "without"))
+    assert 200_000 < with_it - without < 1_000_000
+
+
+def test_combinations_that_were_seen_stay_seen():
+    wide, narrow = runs_of(5, (3000, 3000))
+    narrow = Transient(narrow.t, 0.3 * narrow.x, 0.3 * narrow.u, name="narrow")
+    model = fit(narrow, "qp", **PAPER)
+    updated = model.update([wide])
+    for run in (narrow, wide):
+        assert not updated.domain.outside(run.x[:-1], run.u[:-1]).any()
+
+
+def test_repeats_and_residuals_join():
+    runs = runs_of(6, (3000, 2000))
+    held = Transient(runs[1].t, np.repeat(runs[1].x[::4], 4, axis=0)[: len(runs[1])], runs[1].u, name="held")
+    one, other = (fit(r, "qp", **PAPER) for r in (runs[0], held))
+    updated = one.update(held)
+    assert (updated.repeats.longest_repeat_s >= other.repeats.longest_repeat_s).all()
+    assert np.linalg.eigvalsh(updated.residuals.covariance).min() >= 0
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"discard": 3}, "discarded"),
+        ({"count": "transient"}, "weights that differ between samples"),
+        ({"horizons": [5], "widths": "constant"}, "has horizons"),
+        ({"schedule": {"x1": [-0.2, 0.2]}}, "is scheduled"),
+        ({"describe_data": False}, "keeps nothing of its recordings"),
+    ],
+)
+def test_what_is_not_plain_is_refused_with_the_remedy(options, match):
+    runs = runs_of(8, (600, 500, 400))
+    model = fit(runs[:2], "qp", **PAPER, **options)
+    with pytest.raises(FitError, match=f"{match}.*; fit again with all recordings"):
+        model.update(runs[2])
+
+
+def test_a_model_that_was_changed_is_refused():
+    runs = runs_of(8, (600, 500))
+    model = fit(runs[0], "qp", **PAPER)
+    with pytest.raises(FitError, match="was changed after its fit.*fit again with all recordings"):
+        model.replace(A=1.01 * model.A).update(runs[1])
+    damaged = {**model.memory, "kept": {}}
+    with pytest.raises(FitError, match="field 'memory' of the model file is damaged"):
+        model.replace(memory=damaged).update(runs[1])
+    other = Transient(runs[1].t, runs[1].x, runs[1].u, state_names=["a", "b", "c"])
+    with pytest.raises(FitError, match="transient has states a, b, c"):
+        model.update(other)
+
+
+def test_steps_of_another_length_are_refused_if_disturbance_and_noise_were_one_term():
+    model = fit(runs_of(9, (800,)), "qp", additive="both", alarm="containment")
+    with pytest.raises(FitError, match="steps of the model have one length"):
+        model.update(runs_of(9, (700,), dt=0.03))
+
+
+def test_the_command_updates(tmp_path, capsys):
+    (tmp_path / "signals.yaml").write_text("additive: disturbance\n" + SIGNALS)
+    bags = [str(engine_bag(tmp_path / f"run{s}x.mcap", 80 + 15 * s, s)) for s in range(3)]
+    fitted = ["--signals", str(tmp_path / "signals.yaml"), "--criterion", "qp", "--alarm", "containment", "--quiet"]
+    names = [str(tmp_path / f"{name}.model.json") for name in ("old", "new", "all")]
+    assert main(["fit", *bags[:2], *fitted, "--output", names[0]]) == 0
+    assert main(["fit", bags[2], "--update", names[0], "--output", names[1], "--quiet"]) == 0
+    assert main(["fit", *bags, *fitted, "--output", names[2]]) == 0
+    old, new, whole = (UncertainLTI.load(name) for name in names)
+    equal(new, whole)
+    assert new.fit_summary["sources"] == whole.fit_summary["sources"] != old.fit_summary["sources"]
+    capsys.readouterr()
+    assert main(["info", names[1], "--json"]) == 0
+    assert "memory" not in json.loads(capsys.readouterr().out)
+    for more, words in (
+        (["--update", names[0], "--criterion", "qp"], "--criterion is given, and an update keeps what"),
+        ([], "no --signals; give the signals file"),
+    ):
+        assert main(["fit", bags[2], *more, "--output", str(tmp_path / "no.model.json")]) == 2
+        assert words in capsys.readouterr().err
