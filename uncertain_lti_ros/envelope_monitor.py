@@ -32,7 +32,6 @@ from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
-from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
@@ -98,10 +97,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._looked = self._reported = time.monotonic()
         self.outputs = Outputs(self, self._looked)
         self.failures = Failures(self.get_logger().error)
+        self.note_failure = self.failures.note
         self.clock: ROSClock = self.get_clock()  # type: ignore[assignment]  # stated too narrowly in rclpy
         self.snapshots = Snapshots(self, self.settings)
         self._event_log = EventLog(self._log)
-        self.intake = Intake(self.outputs.sender, self.snapshots, self._on_turned, self.note_failure)
+        self.intake = Intake(self.outputs.sender, self.snapshots, self._event_log.turned, self.note_failure)
         self._look_at_clock()
         self._noted = 0.0
         self._diagnostics = Diagnostics(self, str(self.settings.value("hardware_id")))
@@ -310,12 +310,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.report()
         self._diagnostics.wait(_LAST_WORDS)
 
-    # --- unexpected errors ---
-
-    def note_failure(self, where: str, error: Exception) -> None:
-        """Count an unexpected error, log it, and put it into the next diagnostics; the node goes on."""
-        self.failures.note(where, error)
-
     # --- messages ---
 
     def subscribe(self) -> None:
@@ -344,9 +338,6 @@ class EnvelopeMonitorNode(LifecycleNode):
             subscription.destroy()
         self.inputs.clear()
 
-    def _on_turned(self, session: Session, verdicts: Sequence[Verdict], now: float) -> None:
-        self._event_log.turned(session, verdicts, now)
-
     def _beat(self) -> None:
         assert self.session is not None
         self.outputs.sender.send_alarm(self.session.alarm, time.monotonic())
@@ -357,8 +348,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Run the periodic tasks: heartbeat, graph, diagnostics, snapshots and log."""
         self._look_at_clock()
         tasks = (
-            self._keep_beating, self._keep_reason, self._look_around, self._keep_reporting, self._keep_snapshots,
-            self._log_events,
+            self._keep_beating, self._keep_reason, self._look_around, self._keep_reporting,
+            partial(self.snapshots.write_due, self.session), self._log_events,
         )  # fmt: skip
         for task in tasks:
             try:
@@ -447,10 +438,6 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.get_logger().warning(line)
         else:
             self.get_logger().info(line)
-
-    def _keep_snapshots(self) -> None:
-        if self.session is not None:
-            self.snapshots.write_due(self.session)
 
     def _lasting_problems(self) -> list[str]:
         """Problems that last and concern no topic of the model."""

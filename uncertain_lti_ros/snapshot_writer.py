@@ -78,9 +78,9 @@ class Snapshots:
         """No alarm for as long as a snapshot goes back: one that flaps must not replace the first file."""
         return now - self._alarmed >= self._settings.real("snapshot.seconds")
 
-    def write_due(self, session: Session) -> None:
+    def write_due(self, session: Session | None) -> None:
         """Begin to write the snapshot of an alarm, if it is due."""
-        if self._due is not None and time.monotonic() >= self._due:
+        if session is not None and self._due is not None and time.monotonic() >= self._due:
             self._take_due(session)
 
     def _take_due(self, session: Session) -> None:
