@@ -300,3 +300,11 @@ def test_each_rule_names_the_states_that_it_blames() -> None:
     ]  # fmt: skip
     masked = Alarm(rules, two_states(), np.array([False, True])).reasons(range(3), values, sizes, flags)
     assert [(r.label, r.state) for r in masked] == [("containment", ""), ("containment@4", "x2"), ("mean", "x2")]
+
+
+@pytest.mark.parametrize(
+    ("field", "what"), [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)", "rate")]
+)
+def test_a_condition_on_what_needs_a_history_is_refused(field: str, what: str) -> None:
+    with pytest.raises(ModelError, match=f"cannot be compared, as {what} needs a history"):
+        Condition.parse(f"/machine/mode {field} > 1")

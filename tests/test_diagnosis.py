@@ -360,23 +360,6 @@ def test_a_number_that_stands_for_no_value_is_named_and_no_steady_state(code, at
     assert "code" not in said(messages(run()))
 
 
-@pytest.mark.parametrize(
-    "values",
-    [
-        np.repeat([0.0, 1000.0], 50),  # a pump that is off or on
-        np.concatenate([np.random.default_rng(0).normal(size=100), [1e6]]),  # one outlier
-        np.concatenate([101325 + np.random.default_rng(0).normal(size=100), [101325.0 + 200] * 5]),
-        np.repeat(np.arange(20.0) * 1000, 5),
-        np.full(9, 2.146e9),
-        np.array([]),
-    ],
-)
-def test_what_is_no_code(values):
-    from uncertain_lti.sampling.steady_state import codes
-
-    assert codes(values) == {}
-
-
 def attitude(flips=(), names=("qz", "qw"), count=1500):
     """Heading of a robot as two components of a quaternion."""
     rng = np.random.default_rng(0)

@@ -24,6 +24,7 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.sampling.steady_state import (
     STILL_BAND,
     STILL_SAMPLES,
+    codes,
     end_stops,
     resolve_auto,
     still_stretches,
@@ -283,3 +284,29 @@ def test_an_end_stop_is_held_for_ten_samples_and_reached_at_half_the_usual_speed
     assert end_stops([column]) == [[91.0]] and end_stops([column[:-1]]) == [[]]
     at_once = np.concatenate([[90.0], np.full(10, 91.0)])[:, None]
     assert end_stops([column, at_once]) == [[91.0]]
+
+
+# --- numbers that stand for no value -------------------------------------------------------------------------
+
+ELEVEN, TENS = np.linspace(-1.0, 1.0, 11), np.linspace(0.0, 10.0, 11)
+
+
+@pytest.mark.parametrize(
+    ("others", "numbers", "found"),
+    [
+        (ELEVEN, [900.0] * 2, {900.0: 2}),
+        (ELEVEN, [-900.0] * 3, {-900.0: 3}),
+        (ELEVEN, [899.0] * 2, {}),  # too small
+        (ELEVEN, [900.0], {}),  # once
+        (ELEVEN[:9], [900.0] * 2, {}),  # of nine others
+        (TENS, [3010.5] * 2, {3010.5: 2}),
+        (TENS, [3010.0] * 2, {}),  # 300 times as far as the others spread, and no farther
+        (np.full(5, 5.0), [-1e9], {-1e9: 1}),
+        (np.full(5, 5.0), [-0.999e9], {}),
+        (np.array([-999_999.0, 0.0]), [1e9], {1e9: 1}),
+        (np.array([-1e6, 0.0]), [1e9], {}),
+        (ELEVEN, [1e3, 1e6, 1e9, 1e12, 1e15] * 2, {1e15: 2, 1e12: 2, 1e9: 2, 1e6: 2}),  # four at most
+    ],
+)
+def test_which_numbers_stand_for_no_value(others: np.ndarray, numbers: list[float], found: dict[float, int]) -> None:
+    assert codes(np.concatenate([others, numbers, [NAN, INF]])) == found
