@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import Transient, UncertainLTI, fit
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 
@@ -79,6 +79,23 @@ def test_what_was_not_kept_is_never_left_outside():
     with pytest.raises(FitError, match="does not prove the optimum of all recordings; give run 0 again, together"):
         model.update(loud)
     equal(model.update([*quiet, *loud]), fit([*quiet, *loud], "qp", **PAPER))
+
+
+def test_thresholds_take_in_what_new_recordings_reach():
+    """A new recording raises no alarm afterwards, and no threshold falls."""
+    runs = runs_of(11, (1500, 1500, 1500, 1500))
+    model = fit(runs[:3], "qp", additive="noise")
+    calm = model.update(runs[3])
+    x = runs[3].x.copy()
+    x[700:760, 0] += 0.02 * np.where(np.arange(60) % 2, 1.0, -1.0)
+    loud = Transient(runs[3].t, x, runs[3].u, name="loud")
+    assert EnvelopeMonitor(model).check(loud).alarm.any()
+    updated = model.update(loud)
+    before, after = (np.concatenate([np.ravel(rule.threshold) for rule in m.alarm]) for m in (model, updated))
+    assert (after >= before).all() and (after > before).any()
+    assert not EnvelopeMonitor(updated).check(loud).alarm.any()
+    assert (np.concatenate([np.ravel(rule.threshold) for rule in calm.alarm]) >= before).all()
+    assert "brought up to date" in updated.fit_summary["alarm"]["note"]
 
 
 def test_a_recording_that_is_given_again_counts_once():

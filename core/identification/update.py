@@ -86,8 +86,8 @@ class _Updated(Fleet):
 
 def updated(
     model: UncertainLTI, transients: Iterable[Transient] | Transient, progress: Callable[[str], None] | None = None
-) -> UncertainLTI:
-    """`UncertainLTI.update`."""
+) -> tuple[UncertainLTI, list[Transient]]:
+    """`UncertainLTI.update` but for the alarm, which stays, and the recordings that are new."""
     memory, facts = Memory.of(model), model.fit_summary
     columns, point = memory.kept.columns, model.operating_point
     marks = {recording.mark: number for number, recording in enumerate(memory.recordings)}
@@ -149,7 +149,7 @@ def updated(
     if data is None:
         words = "the room for what an update needs is used up; fit all recordings the next time"
         found.fit_summary["messages"].append(words)
-    return found.replace(memory=data)
+    return found.replace(memory=data), runs
 
 
 def _as_fitted(model: UncertainLTI, transients: Iterable[Transient]) -> list[Transient]:

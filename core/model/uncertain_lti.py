@@ -469,8 +469,10 @@ class UncertainLTI(Envelope):
         -------
         UncertainLTI
             Elements, objective and ranges as of one fit of all recordings at this operating point, by the same
-            criterion and terms. Its alarm stays; residuals of `chi2` and exact repeats are those of the earlier
-            recordings by the model of then, with those of the new ones by the model of now.
+            criterion and terms. Rules of the alarm stay, but that thresholds of a learnt panel are raised to the
+            largest values that the new recordings reach by this model, which was fitted without them, within the
+            ranges of its fit; a fit of all may learn others. Residuals of `chi2` and exact repeats are those of the
+            earlier recordings by the model of then, with those of the new ones by the model of now.
 
         Raises
         ------
@@ -478,7 +480,7 @@ class UncertainLTI(Envelope):
             What the model keeps does not prove the optimum of all recordings: names those to give again. Or the model
             is not plain, keeps nothing, or has other signals.
         """
-        above = import_module("uncertain_lti.identification.update")  # a model alone needs no solver
+        above = import_module("uncertain_lti.validation.monitor_update")  # a model alone needs no solver
         updated: UncertainLTI = above.updated(self, transients, progress)
         return updated
 
