@@ -310,7 +310,10 @@ class Alarm:
         together = count >= WORTH_THREADS
         on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), parts, together)
         self.reset()
-        return np.asarray(np.logical_or.reduce(list(each.T)))
+        raised = np.zeros(count, dtype=bool)
+        for column in each.T:
+            raised |= column
+        return raised
 
 
 def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:

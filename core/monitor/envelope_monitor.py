@@ -488,7 +488,8 @@ class EnvelopeMonitor:
             return values
 
         over(alarm, each, np.empty((count, 0)))
-        alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
+        if why:
+            alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(
             transient, numbers, seen[UTILISATION], judged, left, outside, alarm, unfitted_step, unlisted_mode,
             unknown_regime, frozen, withheld, repeating, statistics, each, self.alarms, longer.transpose(1, 0, 2),
@@ -538,7 +539,9 @@ class EnvelopeMonitor:
 
 def _blank(numbers: Sequence[Any], judged: NDArray[np.bool_], withheld: NDArray[np.bool_]) -> None:
     """NaN in place of numbers without a verdict."""
+    missing, some = np.flatnonzero(~judged), bool(withheld.any())
     for values in numbers:
         if values is not None:
-            values[~judged] = np.nan
-            values[withheld] = np.nan
+            values[missing] = np.nan
+            if some:
+                values[withheld] = np.nan
