@@ -55,18 +55,6 @@ def test_the_direct_search_contains_every_sample_and_never_beats_the_exact_solve
     assert found.rows.sum() == pytest.approx(found.objective)
 
 
-def test_the_direct_search_finds_an_interval_that_can_be_told_by_hand():
-    """One state, dx/dt = a x with a drawn from {-1.5, -0.5}: a = -1 ± 0.5 and nothing narrower."""
-    x = [1.0]
-    for k in range(60):
-        x.append(x[-1] * (1.0 + 0.01 * (-1.5 if k % 2 else -0.5)))
-    run = Transient(0.01 * np.arange(61), np.array(x)[:, None], np.zeros((61, 0)))
-    run = Transient(run.t, run.x, run.u, signals=fit([run]).signals)
-    found = direct_search([run])
-    assert found.model.A[0, 0] == pytest.approx(-1.0, abs=1e-3)
-    assert found.model.dA[0, 0] == pytest.approx(0.5, abs=1e-3)
-
-
 def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
     from uncertain_lti.reports.figures import envelope_figure, save
 
