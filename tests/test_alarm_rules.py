@@ -246,6 +246,7 @@ def test_two_of_three_verdicts_of_a_horizon_and_no_verdict_changes_nothing() -> 
     alarms = [window.push(0.1, True, row) for row in rows]
     assert alarms == [False, False, False, True, True, True, False, False, False]
     again, dt, every = np.empty(len(rows), dtype=bool), np.full(len(rows), 0.1), np.ones(len(rows), dtype=bool)
+    window.reset()
     window.push_all(dt, every, [rows[:, :2], rows[:, 2:]], every, again, np.empty((len(rows), 0)))
     assert again.tolist() == alarms
 

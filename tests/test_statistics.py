@@ -18,7 +18,7 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.fleet import likelier_alone
-from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, some_beyond
+from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.reports.check import check_data, check_text
@@ -119,14 +119,28 @@ def test_several_take_their_parts_of_one_table_and_refuse_one_that_is_too_short(
 
 
 def test_one_number_beyond_a_limit_is_enough_and_none_at_all_is_no_verdict() -> None:
-    places, nan, beyond = array("q", [1, 3]), float("nan"), some_beyond
-    assert beyond(array("d", [9.0, -1.0, 9.0, 1.0]), places, 1.0) == 0
-    assert beyond(array("d", [0.0, 0.0, 0.0, -1.5]), places, 1.0) == 1
-    assert beyond(array("d", [0.0, nan, 0.0, 1.0]), places, 1.0) == 0
-    assert beyond(array("d", [0.0, nan, 0.0, 1.5]), places, 1.0) == 1
-    assert beyond(array("d", [0.0, nan, 0.0, nan]), places, 1.0) == -1
+    window, nan = Window(1, 1, 1.0, [0, 2], 1), float("nan")
+    for table, raised in (
+        ([9.0, -1.0, 9.0, 1.0], False),
+        ([0.0, 0.0, 0.0, -1.5], True),
+        ([0.0, nan, 0.0, nan], True),
+        ([0.0, nan, 0.0, 1.0], False),
+        ([0.0, nan, 0.0, nan], False),
+        ([0.0, nan, 0.0, 1.5], True),
+    ):
+        assert window.push(False, array("d", table)) == raised, table
     with pytest.raises(ValueError, match="do not fit"):
-        beyond(array("d", [0.0, 0.0, 0.0]), places, 1.0)
+        window.push(False, array("d", [0.0, 0.0, 0.0]))
+
+
+def test_the_alarm_of_containment_counts_the_last_verdicts() -> None:
+    rng = np.random.default_rng(3)
+    violated, judged = rng.random(400) < 0.4, rng.random(400) < 0.8
+    for needed, size in ((1, 1), (2, 3), (5, 20), (20, 20), (1, 600)):
+        alarm = np.empty(400, dtype=bool)
+        Window(needed, size).push_all(violated, None, judged, alarm)
+        for k in range(400):
+            assert alarm[k] == (violated[: k + 1][judged[: k + 1]][-size:].sum() >= needed)
 
 
 @pytest.mark.parametrize("kind", ["energy", "mean", "chi2"])

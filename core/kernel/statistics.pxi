@@ -365,16 +365,83 @@ cdef class Statistics:
         return found
 
 
-def some_beyond(table, places, double limit):
-    """1 if the size of one of some numbers is over a limit, 0 if not; -1 if all are NaN, and one alone is no verdict."""
-    cdef const double[::1] row = table
-    cdef Py_ssize_t at
-    cdef double value
-    cdef bint nothing = True, beyond = False
-    for at in places:
-        if not 0 <= at < row.shape[0]:
+@cython.final
+cdef class Window:
+    """Containment: the last verdicts, whether each is a violation, and the alarm while they have enough of them.
+
+    `violations`, `window`: of the rule; `states`: of a verdict that is a violation if the size of one of their numbers
+    is over the margin, and none if all are NaN; without states whether it is one is said; `begin`: where the numbers
+    begin in the table of `push`.
+    """
+
+    cdef readonly bint alarm
+    cdef Py_ssize_t needed, size, at, held, bad, begin, least, count
+    cdef double margin
+    cdef arrays.array _states
+    cdef bytearray _last
+    cdef unsigned char* last  # (size,): the next takes the place `at`
+    cdef const long long* states
+
+    def __init__(self, Py_ssize_t violations, Py_ssize_t window, double margin=0.0, states=(), Py_ssize_t begin=0):
+        self.needed, self.size, self.margin, self.begin = violations, window, margin, begin
+        self._states, self._last = array("q", states), bytearray(window)
+        if window < 1 or begin < 0 or (len(states) and min(states) < 0):
+            raise ValueError("the window or the states are none")
+        self.states, self.last, self.count = self._states.data.as_longlongs, self._last, len(states)
+        self.least = begin + max(states) + 1 if self.count else 0
+        self.reset()
+
+    def reset(self):
+        """Forget every verdict and the alarm."""
+        self.at = self.held = self.bad = 0
+        self.alarm = False
+
+    def push(self, bint violated, table):
+        """Take one verdict; whether the alarm is raised after it."""
+        cdef const double[::1] row
+        if self.count == 0:
+            return self.take(violated)
+        row = table
+        if row.shape[0] < self.least:
             raise ValueError("the numbers of the verdict do not fit the states")
-        value = row[at]
-        nothing &= value != value
-        beyond |= value > limit or value < -limit
-    return -1 if nothing else int(beyond)
+        return self.take(self.beyond(&row[self.begin], 1))
+
+    def push_all(self, violated, rows, judged, raised):
+        """Take many verdicts: `violated` (K,), or with states their numbers `rows` (K, n), where there is one `judged`
+        (K,); `raised` (K,) takes the alarm after each.
+        """
+        cdef const unsigned char[:] bad = np.asarray(violated).view(np.uint8)
+        cdef const unsigned char[:] given = np.asarray(judged).view(np.uint8)
+        cdef unsigned char[:] alarm = raised.view(np.uint8)
+        cdef const double[:, :] table = rows if self.count else np.empty((alarm.shape[0], 1))
+        cdef Py_ssize_t k, count = alarm.shape[0], apart = table.strides[1] // 8
+        if not bad.shape[0] == given.shape[0] == table.shape[0] == count or table.shape[1] < self.least - self.begin:
+            raise ValueError("the numbers of the verdicts do not fit the states")
+        with nogil:
+            for k in range(count):
+                alarm[k] = self.take((self.beyond(&table[k, 0], apart) if self.count else bad[k]) if given[k] else -1)
+
+    cdef bint take(self, int violated) noexcept nogil:
+        """Take one verdict, -1 for none; the alarm after it."""
+        if violated < 0:
+            return self.alarm
+        if self.held == self.size:
+            self.bad -= self.last[self.at]
+        else:
+            self.held += 1
+        self.last[self.at] = violated
+        self.bad += violated
+        self.at = self.at + 1 if self.at + 1 < self.size else 0
+        self.alarm = self.bad >= self.needed
+        return self.alarm
+
+    cdef int beyond(self, const double* row, Py_ssize_t apart) noexcept nogil:
+        """1 if the size of some state is over the margin, 0 if not; -1 if all are NaN, and one alone is no verdict."""
+        cdef Py_ssize_t i
+        cdef double value
+        cdef bint nothing = True, over = False
+        for i in range(self.count):
+            value = row[self.states[i] * apart]
+            nothing &= value != value
+            over |= (value > self.margin) | (value < -self.margin)
+        return -1 if nothing else over

@@ -17,7 +17,6 @@ from __future__ import annotations
 import operator
 import re
 from array import array
-from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import WORTH_THREADS, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
-from uncertain_lti.kernel.arithmetic import Statistic, Statistics, some_beyond
+from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.field_path import FieldPath
@@ -81,52 +80,32 @@ class AlarmWindow:
     that it looks at, 0 for none; `alarm`: `violations` of the last `window` verdicts are violations.
     """
 
-    __slots__ = ("_margin", "_needed", "_places", "_recent", "_row", "_states", "_violations", "alarm", "rule")
+    __slots__ = ("_row", "_window", "rule")
 
     def __init__(self, rule: AlarmRule, counted: NDArray[np.bool_], row: int = 0) -> None:
         self.rule: Rule = rule
-        self._needed, self._margin, self._row, self._states = rule.violations, rule.margin, row, np.flatnonzero(counted)
-        self._places = array("q", (row * len(counted) + self._states).tolist() if row else ())
-        self._recent: deque[bool] = deque(maxlen=rule.window)
-        self.reset()
+        self._row, states = row, np.flatnonzero(counted).tolist() if row else ()
+        self._window = Window(rule.violations, rule.window, rule.margin, states, row * len(counted))
+
+    @property
+    def alarm(self) -> bool:
+        """Whether enough of the last verdicts are violations."""
+        return bool(self._window.alarm)
 
     def reset(self) -> None:
         """Forget every verdict and the alarm."""
-        self._recent.clear()
-        self._violations = 0
-        self.alarm = False
-
-    @property
-    def recent(self) -> tuple[bool, ...]:
-        """The verdicts in the window, oldest first: whether each is a violation that counts."""
-        return tuple(self._recent)
+        self._window.reset()
 
     def push(self, dt: float, violated: bool, table: Any) -> bool:
         """Take one verdict."""
-        if self._places:
-            beyond = some_beyond(table, self._places, self._margin)
-            if beyond < 0:
-                return self.alarm
-            violated = beyond > 0
-        recent = self._recent
-        if len(recent) == recent.maxlen:
-            self._violations -= recent[0]
-        recent.append(violated)
-        self._violations += violated
-        self.alarm = self._violations >= self._needed
-        return self.alarm
+        return self._window.push(violated, table)
 
     def push_all(
         self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Any], judged: NDArray[np.bool_],
         after: NDArray[np.bool_], values: Array,
     ) -> None:  # fmt: skip
         """As `Alarm.over`, from a cleared alarm; `after` (K,) takes the alarm after each, `values` (K, 0) nothing."""
-        assert isinstance(self.rule, AlarmRule)
-        if self._places:
-            sizes = np.abs(rows[self._row][:, self._states])
-            judged = np.asarray(judged & ~np.isnan(sizes).all(axis=1))
-            violated = np.asarray((sizes > self._margin).any(axis=1))
-        after[:] = np.concatenate([[False], raised(violated[judged], self.rule)])[np.cumsum(judged)]
+        self._window.push_all(violated, rows[self._row], judged, after)
 
     def values(self) -> Any:
         """None: it has no statistic."""
@@ -314,17 +293,6 @@ class Alarm:
         for column in each.T:
             raised |= column
         return raised
-
-
-def raised(violated: NDArray[np.bool_], rule: AlarmRule) -> NDArray[np.bool_]:
-    """The alarm of `AlarmWindow` after each of many verdicts, from a cleared alarm.
-
-    `violated` (K,): whether each verdict is a violation that counts; Returns (K,): the alarm after each.
-    """
-    total = np.concatenate([[0], np.cumsum(violated)])
-    ends = np.arange(1, len(total))
-    recent: NDArray[np.bool_] = total[ends] - total[np.maximum(ends - rule.window, 0)] >= rule.violations
-    return recent
 
 
 _OPERATORS: Mapping[str, Callable[[float, float], bool]] = {
