@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.proposal.tune import Remembered, memory_candidates, remember
 from uncertain_lti.sampling.clock import Status
-from uncertain_lti.sampling.recall import recall, recalled, with_delays, with_memories
+from uncertain_lti.sampling.recall import memory_of, recall, recalled, with_delays, with_memories
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.functions import Memory, parse_memory
@@ -243,3 +243,12 @@ def test_what_is_no_control_or_a_memory_takes_no_delay(name: str, words: str) ->
     run = remember([oscillating(1)], [Remembered("push", Memory("lag"))])[0]
     with pytest.raises(TransientError, match=words):
         with_delays(run, {name: 1})
+
+
+def test_the_lag_of_a_delayed_signal_is_as_much_longer_and_it_has_no_other_memory() -> None:
+    late = Signal("push", "/u", "data", steady=2.0, unit="N", delay=3)
+    lag = memory_of(late, Memory("lag", 2), "before")
+    assert (lag.name, lag.field, lag.delay, lag.steady) == ("before", "lag(data, 5)", 0, 2.0)
+    for kind in ("diff", "rate"):
+        with pytest.raises(TransientError, match=f"'push' is delayed, and has no {kind}; take it of the field itself"):
+            memory_of(late, Memory(kind), "change")  # type: ignore[arg-type]
