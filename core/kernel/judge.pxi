@@ -209,6 +209,8 @@ cdef class Judge:
                     at = begins[low + q] + 1
                     if beyond[q] & _BEYOND:
                         flags[at] = 0
+                    if not flags[at] & _JUDGED:  # without a verdict nothing left its bounds
+                        flags[at] &= _UNLISTED
                     flags[at] |= beyond[q] & _REPEATS
         free(psi)
 
