@@ -17,9 +17,9 @@ beyond those of one as the quantiles of a normal distribution do,
     threshold = median + a (largest - median),   a = sqrt(log(N n) / log N).
 
 Where windows are few, the largest of one state is chance, and the states share what is relative to their typical peak.
-Recordings differ by more than their blocks, so a threshold is also the limit below which the largest size of one more
-recording or group lies with CONFIDENCE, where the logarithms of the largest sizes p of each of G (TELLING at least) are
-normal,
+Elsewhere, and of recordings, which differ by more than their blocks, a threshold is also the limit below which the
+largest size of one more of them lies with CONFIDENCE (of a block with ALIKE), where the logarithms of the largest sizes
+p of each of G (TELLING at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1.
 
@@ -50,12 +50,12 @@ PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 30, 3))
 """Kind and window of each rule, in verdicts, and how many such windows a typical left-out stretch must hold."""
 FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
-MORE = 0.1
-"""Over the number of recordings, groups or blocks: share by which thresholds are raised for what the next brings."""
 CONFIDENCE = 0.9
 """Of the limit of the false-alarm rate, one-sided, and of the largest size in one more recording or group."""
+ALIKE = 0.95
+"""As CONFIDENCE, of the largest size in one more block of a single recording."""
 TELLING = 4
-"""Recordings or groups from which on the spread of their largest sizes is known well enough to reckon with."""
+"""Recordings, groups or blocks from which on the spread of their largest sizes is known well enough to reckon with."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
@@ -233,31 +233,27 @@ def _threshold(
 ) -> Array:
     """Threshold (n,) or (1,) of one rule, of its sizes on the parts `left` out, and on `every` healthy data."""
     peaks = _peaks(units, left)
-    found = _allowed(rule, validation.model.n, dt, np.concatenate(every), peaks) * (1.0 + MORE / len(peaks))
-    if validation.what != "block" and len(peaks) >= TELLING:
-        found = np.maximum(found, _of_next(peaks))
-    return np.asarray(np.clip(found, 1e-6, LARGEST**0.5))
-
-
-def _allowed(rule: StatisticRule, n: int, dt: float, every: Array, peaks: Array) -> Array:
-    """The largest of the sizes (K, n) or (K, 1) on all healthy data, with its allowance, (n,) or (1,)."""
-    top, median = every.max(axis=0), np.median(every, axis=0)
-    windows = max(3.0, len(every) / 2.0 / max(1, round(rule.window_s / dt)))
+    sizes = np.concatenate(every)
+    top, median = sizes.max(axis=0), np.median(sizes, axis=0)
+    windows = max(3.0, len(sizes) / 2.0 / max(1, round(rule.window_s / dt)))
+    n, blocks = validation.model.n, validation.what == "block"
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
     if windows < FEW:
         typical = np.exp(np.log(peaks).mean(axis=0))
         found = np.maximum(found, typical * (top / typical).max())
-    return np.asarray(found)
+    if len(peaks) >= TELLING and not (blocks and windows < FEW):
+        found = np.maximum(found, _of_next(peaks, ALIKE if blocks else CONFIDENCE))
+    return np.asarray(np.clip(found, 1e-6, LARGEST**0.5))
 
 
-def _of_next(peaks: Array) -> Array:
-    """Limit, with CONFIDENCE, of the largest size in one more recording or group, (n,) or (1,)."""
+def _of_next(peaks: Array, confidence: float) -> Array:
+    """Limit of the largest size in one more recording, group or block, (n,) or (1,)."""
     from scipy.special import stdtrit
 
     logs, count = np.log(peaks), len(peaks)
     spread = math.sqrt(logs.var(axis=0, ddof=1).mean())
     return np.asarray(
-        np.exp(logs.mean(axis=0) + stdtrit(count - 1, CONFIDENCE) * math.sqrt(1.0 + 1.0 / count) * spread)
+        np.exp(logs.mean(axis=0) + stdtrit(count - 1, confidence) * math.sqrt(1.0 + 1.0 / count) * spread)
     )
 
 
