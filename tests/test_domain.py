@@ -114,7 +114,7 @@ def test_the_oldest_format_that_holds_a_model_is_written(tmp_path: Path) -> None
     assert UncertainLTI.load(tmp_path / "m.model.json").domain.measure == model.domain.measure
     del data["domain"]["measure"]
     assert data["domain"].pop("step_max") and data.pop("residuals")
-    assert data.pop("frozen")
+    assert data.pop("frozen") and data.pop("memory")
     older = UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
     assert older.domain.measure is None and older.to_dict()["format"] == "uncertain-lti/1"
     assert UncertainLTI.from_dict(data).domain.measure is None, "every new key is optional"
@@ -138,7 +138,7 @@ def test_a_measure_that_is_none_is_refused_by_name(tmp_path: Path, change: dict[
     with pytest.raises(ModelError, match=named):
         UncertainLTI.from_dict(data)
     del data["residuals"]
-    del data["frozen"]
+    del data["frozen"], data["memory"]
     with pytest.raises(ModelError, match=r"domain\.measure"):
         UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
 
