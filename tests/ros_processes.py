@@ -140,6 +140,7 @@ class World:
             "PYTHONUNBUFFERED": "1",
         }
         self._processes: list[Process] = []
+        self._clients: dict[tuple[Any, str], Any] = {}
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
         self.node = Node("test", context=self._context)
@@ -206,22 +207,22 @@ class World:
 
         An answer is lost where the server has not found the client's reader yet, which a busy machine delays.
         """
-        client = self.node.create_client(kind, name)
-        try:
-            until(client.service_is_ready, f"service {name}", patience)
-            if again > 1.0:
-                time.sleep(0.2)  # this request may go out once only
-            futures, asked, end = [client.call_async(request)], time.monotonic(), time.monotonic() + patience
-            while not (answered := [future for future in futures if future.done()]):
-                now = time.monotonic()
-                assert now < end, f"waited {patience:g} s for an answer of {name}"
-                if now - asked > again:
-                    futures.append(client.call_async(request))
-                    asked = now
-                time.sleep(0.002)
-            return answered[0].result()
-        finally:
-            self.node.destroy_client(client)
+        known = (kind, name) in self._clients
+        if not known:  # and kept: a client that is destroyed while the executor spins may take the process with it
+            self._clients[kind, name] = self.node.create_client(kind, name)
+        client = self._clients[kind, name]
+        until(client.service_is_ready, f"service {name}", patience)
+        if again > 1.0 and not known:
+            time.sleep(0.2)  # this request may go out once only
+        futures, asked, end = [client.call_async(request)], time.monotonic(), time.monotonic() + patience
+        while not (answered := [future for future in futures if future.done()]):
+            now = time.monotonic()
+            assert now < end, f"waited {patience:g} s for an answer of {name}"
+            if now - asked > again:
+                futures.append(client.call_async(request))
+                asked = now
+            time.sleep(0.002)
+        return answered[0].result()
 
     def status(self, name: str = MONITOR) -> dict[str, Any]:
         """What ~/status says."""
