@@ -9,22 +9,18 @@
 
 """Memory: what a fit keeps of its recordings, so that a later one with further recordings can be proven the optimum.
 
-Kept are the sums that the objectives need, the transitions that decide, and of the others, by recording, how far they
-are from mattering. With the size of a transition
-
-    size² = (Δt φ)ᵀ P⁻¹ (Δt φ) + (Δt ψ)ᵀ Q⁻¹ (Δt ψ),
-
-P and Q the means of the squares over all, its slack, half-width less |x_next - centre|, falls at most by size times
-(Δθᵀ P Δθ + Δdᵀ Q Δd)^(1/2) as the elements change by Δθ and Δd (Cauchy and Schwarz). What half-widths of additive
-terms change is known exactly as well, so that they may be left out of Δd.
+Kept are the sums that the objectives need, the transitions that decide, to the bit, and of the others boxes: in what
+range the values of a few that follow each other are, in a byte each and rounded outwards, and what room they leave.
+Room is linear in the elements with coefficients within the box, so that an interval of each product bounds what is
+left of it at other elements.
 """
 
 from __future__ import annotations
 
 import hashlib
 from base64 import b64decode, b64encode
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,14 +30,14 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, moments
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Block, Problem
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 BYTES, _PER_STATE, _MOST = 720_000, 90_000, 8_000_000
 """What is kept at most, of all and per state, unless those that decide take more; in the file it takes a third more."""
-_GROUPS = 32
-"""Recordings, or groups of them, that are told apart at most, of each fit and update."""
+_STEPS = 254
+"""In so many steps the range of a value is divided in the file; with one to round outwards they fill a byte."""
 _AGAIN = "fit again with all recordings"
 
 
@@ -58,73 +54,109 @@ class Recording(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Margins:
-    """How far transitions that were not kept are from mattering, at the elements of the fit that left them out.
+class Boxes:
+    """What is known of transitions that were not kept, a few of one recording together.
 
-    `theta` (r, n), `d` (q, n): these elements; `nominal` (r, r), `half` (q, q): roots L of P = L Lᵀ and of Q; `steps`
-    (2,): shortest and longest Δt, s; `widest` (n,): largest half-width; `groups` (recordings,): the group of each, -1
-    for none; of each group `ratio`, `least` (G, n): least slack over size, least slack; `narrow_ratio`, `narrow_least`
-    (G, n): the same of `widest` less the half-width; `most`, `narrow_most` (G,): greatest size.
+    `low`, `high` (p + 1, K): range of [Δt z; Δt]; `room` (2 n or 3 n, K): the least distance of x_next from the upper
+    bound, from the lower one, and of the half-width from the largest one; `source` (K,): number of the recording.
     """
 
-    theta: Array
-    d: Array
-    nominal: Array
-    half: Array
-    steps: Array
-    widest: Array
-    groups: Array
-    ratio: Array
-    least: Array
-    most: Array
-    narrow_ratio: Array
-    narrow_least: Array
-    narrow_most: Array
+    low: Array
+    high: Array
+    room: Array
+    source: NDArray[np.intp]
 
-    def unproven(self, theta: Array, d: Array, widest: Array | None, columns: Columns) -> NDArray[np.bool_]:
-        """Groups (G,) of which some transition may be outside with these elements, or wider than `widest` (n,)."""
-        more, p = d - self.d, len(d) - len(columns.half)
-        nominal = _norms(self.nominal, theta - self.theta)
-        inside, narrow = np.zeros((2, *self.ratio.shape), dtype=bool)
-        for known in (True, False):  # what additive terms change: exactly, or with all others
-            gain, growth, others = np.zeros(len(self.widest)), np.zeros(len(self.widest)), more.copy()
-            for j, term in enumerate(columns.half if known else (), start=p):
-                each = np.outer(self.steps if term.times_dt else np.ones(1), more[j])
-                gain, growth, others[j] = gain + each.min(axis=0), growth + each.max(axis=0), 0.0
-            both = _norms(self.half, others)
-            falls, rises = (np.minimum(both, _norms(self.half, f(others, 0.0))) for f in (np.minimum, np.maximum))
-            inside |= _least_after(self.ratio, self.least, self.most, gain, np.hypot(nominal, falls)) >= 0.0
-            if widest is not None:
-                room = widest - self.widest - growth
-                after = _least_after(self.narrow_ratio, self.narrow_least, self.narrow_most, room, rises)
-                narrow |= after >= -1e-12 * widest
-        return np.asarray(~(inside & narrow if widest is not None else inside).all(axis=1))
+    @classmethod
+    def of(cls, model: UncertainLTI, block: Block, source: NDArray[np.intp], widest: Array | None) -> Boxes:
+        """Of each transition one."""
+        values = np.vstack([block.z * block.dt, block.dt])
+        return cls(values, values, _room(model, block, widest), source)
+
+    @classmethod
+    def join(cls, parts: Sequence[Boxes]) -> Boxes:
+        """All of them, by recording."""
+        every = cls(*(np.concatenate([getattr(part, f.name) for part in parts], axis=-1) for f in fields(cls)))
+        return every[np.argsort(every.source, kind="stable")]
+
+    def __getitem__(self, index: Index | NDArray[np.bool_]) -> Boxes:
+        return Boxes(*(getattr(self, field.name)[..., index] for field in fields(self)))
+
+    def fewer(self, first: int, share: float) -> Boxes:
+        """About this share of them, those that follow each other in one; `first`: of those before these."""
+        number = (share * np.arange(first, first + len(self.source))).astype(np.intp)
+        starts = np.flatnonzero(np.diff(number, prepend=-1) | np.diff(self.source, prepend=-1))
+        low, room = (np.minimum.reduceat(values, starts, axis=1) for values in (self.low, self.room))
+        return Boxes(low, np.maximum.reduceat(self.high, starts, axis=1), room, self.source[starts])
+
+    def after(self, columns: Columns, before: UncertainLTI, model: Any, widths: Array) -> Boxes:
+        """With the room that another model leaves at least, whose largest widths are `widths` (n,)."""
+        theta, d = (new - old for new, old in zip(_elements(model, columns), _elements(before, columns), strict=True))
+        ones, even = np.ones(len(self.source)), [-1] * len(columns.nominal)
+        nearer, farther = (
+            np.maximum(np.maximum(self.low, -self.high), 0.0),
+            np.maximum(np.abs(self.low), np.abs(self.high)),
+        )
+        least, largest = (
+            np.vstack([end[:-1], *(end[-1] if term.times_dt else ones for term in columns.half)])
+            for end in (nearer, farther)
+        )
+        z_low, z_high = (np.vstack([end[:-1], end[even]]) for end in (self.low, self.high))
+        (falls, rises), (less, more) = _products(theta, z_low, z_high), _products(d, least, largest)
+        changes = [falls + less, less - rises]
+        if len(self.room) > 2 * len(widths):
+            wider = 0.5 * (widths - np.asarray(before.fit_summary["max_width"]))
+            changes.append(wider[:, None] - more + 1e-12 * widths[:, None])
+        return replace(self, room=self.room + np.vstack(changes))
+
+    def to_dict(self, recordings: int) -> dict[str, Any]:
+        """As it is in the file, rounded to the side of less room."""
+        least, top = self.low.min(axis=1)[:, None], self.room.max(axis=1, initial=0.0)[:, None]
+        step = (self.high.max(axis=1)[:, None] - least) / _STEPS
+        low, high = ((end - least) / np.where(step > 0.0, step, 1.0) for end in (self.low, self.high))
+        room = 255.0 * np.sqrt(np.maximum(self.room, 0.0) / np.where(top > 0.0, top, 1.0))
+        parts = {"low": np.floor(low - 1e-6), "high": np.ceil(high + 1e-6), "room": np.floor(room - 1e-6)}
+        counts = np.bincount(self.source, minlength=recordings)
+        return {
+            **{name: _text(np.maximum(values, 0.0), "u1") for name, values in parts.items()},
+            **{
+                name: _text(values)
+                for name, values in {"least": least, "step": step, "top": top, "counts": counts}.items()
+            },
+        }
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> Boxes:
+        """As the file has it."""
+        least, step, top, counts = (_array(data[name]) for name in ("least", "step", "top", "counts"))
+        low, high, room = (_array(data[name], "u1") for name in ("low", "high", "room"))
+        source = np.repeat(np.arange(len(counts)), counts.astype(np.intp))
+        return cls(least + step * low, least + step * high, top * (room / 255.0) ** 2, source)
 
 
-def _norms(root: Array, change: Array) -> Array:
-    """(Δᵀ L Lᵀ Δ)^(1/2) of each column (n,), with room for rounding."""
-    return np.asarray(np.linalg.norm(root.T @ change, axis=0)) * (1.0 + 1e-6)
+def _room(model: UncertainLTI, block: Block, widest: Array | None) -> Array:
+    """`Boxes.room` of each transition."""
+    centre, half = model.columns_centre_and_half(np.ascontiguousarray(block.z), block.dt)
+    above, narrower = block.x_next - centre, [] if widest is None else [widest[:, None] - half]
+    return np.vstack([half - above, half + above, *narrower])
 
 
-def _least_after(ratio: Array, least: Array, most: Array, gain: Array, moved: Array) -> Array:
-    """The least that slack + gain - moved x size can be, where slack >= max(least, ratio x size) and size <= most."""
-    largest = np.broadcast_to(most[:, None], ratio.shape)
-    kink = np.divide(least, ratio, out=np.zeros(ratio.shape), where=ratio > 0.0)
-    worst = np.where(ratio > moved, np.minimum(kink, largest), largest)
-    return np.asarray(np.maximum(least, ratio * worst) + gain - moved * worst)
+def _products(change: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Least and largest of Δᵀ v for values v within (q, K), (n, K) each."""
+    rise, fall = np.maximum(change, 0.0).T, np.minimum(change, 0.0).T
+    return rise @ low + fall @ high, rise @ high + fall @ low
 
 
 @dataclass(frozen=True)
 class Memory:
     """What a model keeps of its recordings.
 
-    `kept`: transitions that decide, `source` being the number of their recording; `rest`: sums over the others, None
-    if there are none; `margins`: of the others, of each fit and update; `recordings`: all of them.
+    `kept`: transitions that decide, `source` being the number of their recording; `rest`: sums over the others, and
+    `boxes` of them; None if there are none; `recordings`: all of them.
     """
 
     kept: Problem
     rest: Moments | None
-    margins: tuple[Margins, ...]
+    boxes: Boxes | None
     recordings: tuple[Recording, ...]
 
     def to_dict(self, model: UncertainLTI) -> dict[str, Any]:
@@ -138,7 +170,7 @@ class Memory:
             "weights": _text(of.weights),
             "kept": {name: _text(values) for name, values in kept.items()},
             "rest": None if self.rest is None else _texts(self.rest),
-            "margins": [_texts(each) for each in self.margins],
+            "boxes": None if self.boxes is None else self.boxes.to_dict(len(self.recordings)),
         }
 
     @classmethod
@@ -170,18 +202,15 @@ class Memory:
                 found |= {name: found[name].item() for name in ("dt_min", "dt_max")}
                 found |= {"count": int(found["count"].item()), "visits": found["visits"].astype(np.intp)}
                 rest = Moments(**{"gram": None, "coupled": None, **found})
-            margins = tuple(Margins(**{name: _array(text) for name, text in each.items()}) for each in data["margins"])
-            return cls(kept, rest, margins, tuple(Recording(*each) for each in data["recordings"]))
+            boxes = None if data["boxes"] is None else Boxes.from_dict(data["boxes"])
+            return cls(kept, rest, boxes, tuple(Recording(*each) for each in data["recordings"]))
         except (TypeError, ValueError, KeyError, AttributeError):
             raise FitError(f"field 'memory' of the model file is damaged; {_AGAIN}") from None
 
-    def unproven(self, model: Any, widest: Array | None) -> list[str]:
-        """Names of recordings of which some transition may be outside a model, as of `Margins.unproven`."""
-        found, columns = set[int](), self.kept.columns
-        for each in self.margins:
-            wrong = np.flatnonzero(each.unproven(*_elements(model, columns), widest, columns))
-            found |= set(np.flatnonzero(np.isin(each.groups, wrong)).tolist())
-        return list(dict.fromkeys(self.recordings[number].name for number in sorted(found)))
+    def unproven(self, boxes: Boxes | None) -> list[str]:
+        """Names of recordings of which these, with what room is left, do not prove that all is inside."""
+        found = [] if boxes is None else np.unique(boxes.source[(boxes.room < 0.0).any(axis=0)]).tolist()
+        return list(dict.fromkeys(self.recordings[number].name for number in found))
 
 
 def remembered(
@@ -189,106 +218,61 @@ def remembered(
     problem: Problem,
     recordings: Sequence[Recording],
     rest: Moments | None = None,
-    margins: Sequence[Margins] = (),
+    boxes: Boxes | None = None,
 ) -> dict[str, Any] | None:
     """What the file of a model keeps of transitions, beside what was kept of others already.
 
-    None if there is no room for those that decide. `problem`: `source` being the number of the recording, rising.
+    None if there is no room for those that decide. `problem`: `source` being the number of the recording, rising;
+    `boxes`: with the room that the model leaves.
     """
     n, p, widths = model.n, problem.p, model.fit_summary["criterion"] == "lp"
-    unknowns = problem.columns.unknowns(p)
-    taken = sum(getattr(one, field.name).size for one in margins for field in fields(one))
-    taken += 4 * n * min(len(recordings), _GROUPS) + 2 * n * unknowns + 4 * (p + 2) ** 2
-    each = p + n + 3
-    room = max(min(n * _PER_STATE, BYTES), min(12 * n * unknowns * each, _MOST)) // 8
-    most = (room - taken) // each
-    if problem.N > most:
-        narrow = most // (3 * n) if widths else 0
-        if (count := most // n - narrow) <= unknowns:
+    unknowns, each, box = problem.columns.unknowns(p), 8 * (p + n + 3), 2 * (p + 1) + (3 if widths else 2) * n
+    room = min(n * _PER_STATE, BYTES) - 32 * (p + 2) ** 2
+    most = max(room // 2, min(12 * n * unknowns * (p + n + 3), _MOST)) // each
+    if problem.N > (most if boxes else max(room // each, most)):
+        if most <= n * unknowns:
             return None
+        widest = 0.5 * np.asarray(model.fit_summary["max_width"]) if widths else None
         sums = moments(problem)[0]
-        measure = _Measure.of(model, problem, sums if rest is None else sums + rest)
-        kept = measure.nearest(problem, count, narrow)
-        chosen = problem.subset(kept)
-        left = sums - moments(chosen)[0]
-        rest = left if rest is None else rest + left
-        margins = (*margins, measure.margins(problem, kept, len(recordings)))
-        problem = chosen
-    return Memory(problem, rest, tuple(margins), tuple(recordings)).to_dict(model)
-
-
-@dataclass(frozen=True)
-class _Measure:
-    """Slack and size of transitions at the elements of a model; attributes as those of `Margins`."""
-
-    model: UncertainLTI
-    columns: Columns
-    nominal: Array
-    half: Array
-    steps: Array
-    widest: Array
-
-    @classmethod
-    def of(cls, model: UncertainLTI, problem: Problem, sums: Moments) -> _Measure:
-        nominal, half = _root(sums.centre / sums.count), _root(sums.plain_gram / sums.count)
-        widest = 0.5 * np.asarray(model.fit_summary["max_width"])
-        return cls(model, problem.columns, nominal, half, np.array([sums.dt_min, sums.dt_max]), widest)
-
-    def over(self, problem: Problem) -> Iterator[tuple[slice, tuple[Array, Array], tuple[Array, Array]]]:
-        """Of the transitions of each block slack (n, K) and size (K,), and the same of how much narrower they are."""
-        to_nominal, to_half = np.linalg.inv(self.nominal), np.linalg.inv(self.half)
-        for block in problem.blocks():
-            wide = np.square(to_half @ (self.columns.psi(block.z, block.dt, None) * block.dt)).sum(axis=0)
-            size = np.square(to_nominal @ (self.columns.phi(block.z, None) * block.dt)).sum(axis=0) + wide
-            centre, half = self.model.columns_centre_and_half(np.ascontiguousarray(block.z), block.dt)
-            slack, narrow = half - np.abs(block.x_next - centre), np.maximum(self.widest[:, None] - half, 0.0)
-            yield slice(block.start, block.start + len(block)), (slack, np.sqrt(size)), (narrow, np.sqrt(wide))
-
-    def nearest(self, problem: Problem, count: int, narrow_count: int) -> Index:
-        """The transitions of least slack for their size, so many per row, and those least narrow for theirs."""
-        counts, n = (count, narrow_count), self.model.n
-        best = [(np.full((n, c), 1e300), np.zeros((n, c), np.intp)) for c in counts]
-        for part, *measured in self.over(problem):
-            for number, (slack, size) in enumerate(measured[: 2 if narrow_count else 1]):
-                values, held = best[number]
-                near = np.flatnonzero((slack <= values.max(axis=1)[:, None] * size).any(axis=0))
-                values = np.hstack([values, slack[:, near] / np.maximum(size[near], 1e-300)])
-                least = np.argpartition(values, counts[number], axis=1)[:, : counts[number]]
-                index = np.broadcast_to(near + part.start, (n, len(near)))
-                held = np.take_along_axis(np.hstack([held, index]), least, axis=1)
-                best[number] = np.take_along_axis(values, least, axis=1), held
-        return np.unique(np.concatenate([held[values < 1e300] for values, held in best]))
-
-    def margins(self, problem: Problem, kept: Index, recordings: int) -> Margins:
-        """Those of the transitions that are not kept."""
+        kept = _nearest(model, problem, sums if rest is None else sums + rest, widest, most)
         left = np.ones(problem.N, dtype=bool)
         left[kept] = False
-        present = np.unique(problem.source[left])
-        groups = np.full(recordings, -1)
-        for number, some in enumerate(np.array_split(present, min(len(present), _GROUPS))):
-            groups[some] = number
-        count = int(groups.max(initial=-1)) + 1
-        ratios, leasts = np.full((2, 2, count, self.model.n), np.inf)
-        greatest = np.zeros((2, count))
-        for part, *measured in self.over(problem):
-            of = groups[problem.source[part]]
-            starts = np.flatnonzero(np.diff(of, prepend=-2))
-            for number, (slack, size) in enumerate(measured):
-                slack[:, ~left[part]], size[~left[part]] = np.inf, 0.0  # they count for none, not even the last group
-                ratio = np.minimum.reduceat(slack / np.maximum(size, 1e-300), starts, axis=1).T
-                np.minimum.at(ratios[number], of[starts], ratio)
-                np.minimum.at(leasts[number], of[starts], np.minimum.reduceat(slack, starts, axis=1).T)
-                np.maximum.at(greatest[number], of[starts], np.maximum.reduceat(size, starts))
-        return Margins(
-            *_elements(self.model, self.columns),
-            self.nominal,
-            self.half,
-            self.steps,
-            self.widest,
-            groups.astype(np.float64),
-            *(ratios[0], leasts[0], greatest[0]),
-            *(ratios[1], leasts[1], greatest[1]),
-        )
+        chosen, first = problem.subset(kept), 0 if boxes is None else len(boxes.source)
+        share = min(max(room - most * each, room // 5) // box / (first + problem.N - len(kept)), 1.0)
+        parts = [] if boxes is None else [boxes.fewer(0, share)]
+        for block in problem.blocks():
+            part = slice(block.start, block.start + len(block))
+            of = Boxes.of(model, block, problem.source[part], widest)[left[part]]
+            parts, first = [*parts, of.fewer(first, share)] if len(of.source) else parts, first + len(of.source)
+        others = sums - moments(chosen)[0]
+        problem, rest, boxes = chosen, others if rest is None else rest + others, Boxes.join(parts)
+    return Memory(problem, rest, boxes, tuple(recordings)).to_dict(model)
+
+
+def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array | None, most: int) -> Index:
+    """The transitions of least room for their size, in each row alike, and those of the largest widths; so many.
+
+    The size of a transition is (Δt φ)ᵀ P⁻¹ (Δt φ) + (Δt ψ)ᵀ Q⁻¹ (Δt ψ), its root, P and Q the means of the squares
+    over all: by so much its room may change as the elements do.
+    """
+    n, count = model.n, -(-4 * most // model.n)
+    to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
+    values = np.empty((n if widest is None else 2 * n, 0))
+    held = values.astype(np.intp)
+    for block in problem.blocks():
+        wide = np.square(to_half @ (problem.columns.psi(block.z, block.dt, None) * block.dt)).sum(axis=0)
+        size = np.square(to_nominal @ (problem.columns.phi(block.z, None) * block.dt)).sum(axis=0) + wide
+        room = _room(model, block, widest)
+        near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
+        near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
+        index = np.broadcast_to(np.arange(block.start, block.start + len(block)), near.shape)
+        values, held = np.hstack([values, near]), np.hstack([held, index])
+        if values.shape[1] > count:
+            least = np.argpartition(values, count, axis=1)[:, :count]
+            values, held = np.take_along_axis(values, least, axis=1), np.take_along_axis(held, least, axis=1)
+    ranked = np.take_along_axis(held, np.argsort(values, axis=1, kind="stable"), axis=1)
+    index, first = np.unique(ranked.T, return_index=True)
+    return np.sort(index[np.argsort(first)[:most]])
 
 
 def _root(gram: Array) -> Array:
@@ -318,16 +302,16 @@ def _mark_of(model: UncertainLTI) -> str:
     )
 
 
-def _text(values: Any) -> list[Any]:
-    array = np.atleast_1d(np.asarray(values, dtype="<f8"))
+def _text(values: Any, form: str = "<f8") -> list[Any]:
+    array = np.atleast_1d(np.asarray(values)).astype(form)
     return [*array.shape, b64encode(np.ascontiguousarray(array).tobytes()).decode()]
 
 
-def _texts(part: Margins | Moments) -> dict[str, Any]:
+def _texts(part: Moments) -> dict[str, Any]:
     each = {field.name: getattr(part, field.name) for field in fields(part)}
     return {name: _text(values) for name, values in each.items() if values is not None}
 
 
-def _array(text: Sequence[Any]) -> Array:
+def _array(text: Sequence[Any], form: str = "<f8") -> Array:
     *shape, data = text
-    return np.frombuffer(b64decode(data, validate=True), dtype="<f8").reshape(shape).astype(np.float64)
+    return np.frombuffer(b64decode(data, validate=True), dtype=form).reshape(shape).astype(np.float64)

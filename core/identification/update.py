@@ -23,7 +23,7 @@ from uncertain_lti.identification import passes
 from uncertain_lti.identification.assembly import assemble, is_constant, median_step
 from uncertain_lti.identification.fitting import common_signals, contradiction_in, distance_in_words, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.memory import Memory, Recording, remembered
+from uncertain_lti.identification.memory import Boxes, Memory, Recording, remembered
 from uncertain_lti.identification.passes import Envelope, Judged, Moments, Samples, moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.row import InfeasibleError
@@ -54,13 +54,17 @@ class _Updated(Fleet):
     def judge(self, model: Envelope) -> Judged:
         """What the bounds are on the transitions that are there; refused if another may be outside."""
         judged = super().judge(model)
-        widest = 0.5 * judged.largest if self._model.fit_summary["criterion"] == "lp" else None
-        if names := self._memory.unproven(model, widest):
+        if names := self._memory.unproven(self.boxes_after(model, judged.largest)):
             raise FitError(
                 f"what the model keeps does not prove the optimum of all recordings; give {', '.join(names)} again, "
                 f"together with the new ones"
             )
         return judged
+
+    def boxes_after(self, model: Any, widths: Array) -> Boxes | None:
+        """What is known of the others, with the room that a model of these largest widths (n,) leaves."""
+        boxes = self._memory.boxes
+        return boxes and boxes.after(self.columns, self._model, model, widths)
 
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:
         """Combinations of two signals that the model has seen, or that are new."""
@@ -118,8 +122,9 @@ def updated(
         )
     structure = Structure.from_dict(facts["structure"], model.n, model.m) if "structure" in facts else None
     try:
+        fleet = _Updated(model, memory, here, new)
         found = fit_fleet(
-            _Updated(model, memory, here, new),
+            fleet,
             model.signals,
             facts["criterion"],
             structure=structure,
@@ -145,7 +150,8 @@ def updated(
         repeats=found.repeats and (found.repeats.and_of(model.repeats) if model.repeats else found.repeats),
         alarm=model.alarm,
     )
-    data = remembered(found, _joined([here, new]), every, memory.rest, memory.margins)
+    boxes = fleet.boxes_after(found, np.asarray(found.fit_summary["max_width"]))
+    data = remembered(found, _joined([here, new]), every, memory.rest, boxes)
     if data is None:
         words = "the room for what an update needs is used up; fit all recordings the next time"
         found.fit_summary["messages"].append(words)
@@ -183,13 +189,11 @@ def _without(memory: Memory, known: dict[int, Problem]) -> Memory:
             rest = rest - moments(problem)[0]
         if gone.N:
             rest = rest + moments(gone)[0]
-    margins = []
-    for each in memory.margins:
-        groups = each.groups.copy()
-        groups[[number for number in known if number < len(groups)]] = -1.0
-        margins.append(replace(each, groups=groups))
+    boxes = memory.boxes and memory.boxes[~np.isin(memory.boxes.source, list(known))]
     kept = memory.kept.subset(~again)
-    return replace(memory, kept=kept, rest=rest if rest is not None and rest.count else None, margins=tuple(margins))
+    if rest is None or not rest.count:
+        rest = boxes = None
+    return replace(memory, kept=kept, rest=rest, boxes=boxes)
 
 
 def _farthest(domain: Domain, before: Domain) -> Domain:
