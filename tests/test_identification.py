@@ -270,7 +270,7 @@ def test_rest_with_a_moving_successor_names_sample_and_remedy():
     x, u = transient.x.copy(), transient.u.copy()
     x[40], u[40], x[60], u[60] = 0.0, 0.0, 0.0, 0.0
     transient = Transient(transient.t_ns, x, u, name="run.mcap", state_names=["speed", "flow"])
-    with pytest.raises(FitError, match=r"run\.mcap: sample 40 .*'speed'.*--additive noise") as caught:
+    with pytest.raises(FitError, match=r"sample 40 of run\.mcap .*'speed'.*--additive noise") as caught:
         fit(transient)
     assert "1 other" in str(caught.value)
     for additive in ADDITIVE[1:]:

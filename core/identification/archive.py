@@ -25,17 +25,14 @@ from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.assembly import assemble, is_constant
 from uncertain_lti.identification.columns import Columns, Regimes
-from uncertain_lti.identification.diagnosis import too_few
-from uncertain_lti.identification.fitting import contradiction_in, fit_fleet
+from uncertain_lti.identification.diagnosis import check_solvable
+from uncertain_lti.identification.fitting import contradiction_named, fit_fleet, structure_of, with_repeats
 from uncertain_lti.identification.fleet import DaskFleet, Fleet
 from uncertain_lti.identification.problem import DiskPartition, Problem
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of, unused
-from uncertain_lti.identification.row import InfeasibleError
-from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.domain import largest_steps
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.repeats import Found, repeats_in, together
+from uncertain_lti.model.repeats import Found, repeats_in
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
@@ -169,10 +166,6 @@ def fit_archive(
     additive = additive or signals.additive or "none"
     scheduled = scheduled_by(schedule, signals)
     regimes = None if scheduled is None else Regimes.of(scheduled, signals)
-    structure = None
-    if signals.structure:
-        names = ([s.name for s in signals.states], [s.name for s in signals.controls])
-        structure = Structure.from_rules(signals.structure, *names, f"{signals.source}: structure", scheduled)
     fleet: Fleet
     if client is not None:
         # whether Δt is constant decides what is identifiable, and must be one answer for all partitions
@@ -197,22 +190,23 @@ def fit_archive(
         dt = np.concatenate(steps)
         columns = Columns.of(additive, is_constant(dt), regimes)
         fleet = Fleet([replace(partition, columns=columns)])
-    _check(fleet, signals)
-    try:
+    starts = np.concatenate([[0], np.cumsum(counts)])
+
+    def where(index: int) -> str:
+        which = int(np.searchsorted(starts, index, side="right")) - 1
+        return f"transition {index - starts[which]} of {recordings[which][0]}"
+
+    check_solvable(fleet, where, [s.name for s in signals.states])
+    with contradiction_named(where, signals):
         model = fit_fleet(
             fleet,
             signals,
             criterion,
-            structure=structure,
+            structure=structure_of(signals, scheduled),
             alarm_rule=alarm_rule,
             progress=progress,
             dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
         )
-    except InfeasibleError as error:
-        starts = np.concatenate([[0], np.cumsum(counts)])
-        which = int(np.searchsorted(starts, error.index, side="right")) - 1
-        name = f"transition {error.index - starts[which]} of {recordings[which][0]}"
-        raise contradiction_in(error, name, signals) from None
     facts = {
         **model.fit_summary,
         "messages": [*model.fit_summary.get("messages", []), *messages],
@@ -221,13 +215,7 @@ def fit_archive(
         "transients": len(recordings),
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
-    found = visit("repeats in", repeats, model)
-    step_max = largest_steps(model, found)
-    return model.replace(
-        fit_summary=facts,
-        repeats=together(model.n, found),
-        domain=replace(model.domain, step_max=step_max),
-    )
+    return with_repeats(model.replace(fit_summary=facts), visit("repeats in", repeats, model))
 
 
 def _sampled(recording: Recording, signals: SignalMap) -> Transient:
@@ -257,20 +245,3 @@ def repeats(recording: Recording, model: UncertainLTI) -> Found:
 
 def _constant_dt(recording: Recording, signals: SignalMap) -> bool:
     return is_constant(load(recording, signals, Columns()).dt)
-
-
-def _check(fleet: Fleet, signals: SignalMap) -> None:
-    """What `diagnosis.check_solvable` refuses."""
-    unknowns = fleet.columns.unknowns(fleet.p)
-    if fleet.N < unknowns:
-        raise FitError(too_few(fleet.N, unknowns))
-    if fleet.columns.half:
-        return
-    count, state, step = fleet.moving_from_rest()
-    if count:
-        signal = signals.states[state]
-        raise FitError(
-            f"{count} samples are at rest, x = u = 0, and move in the next step ('{signal.name}' by up to "
-            f"{step * float(signal.scale):.3g} {signal.unit}), which no interval matrices can contain; use an additive "
-            f"term: --additive noise for measurement noise, --additive disturbance for unmodelled inputs"
-        )

@@ -23,7 +23,7 @@ from uncertain_lti.base.text import plural
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns
-from uncertain_lti.sampling.transient import Transient, Transitions
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.values import Additive
 
 
@@ -78,18 +78,18 @@ def assemble(
     z = samples[:, :-1]
     shared = len(steps) == 1 and steps[0].consecutive  # the next sample is the next column
     x_next = samples[:n, 1:] if shared else np.empty((n, len(dt)))
-    start, square = 0, 0.0
+    further, start, square = np.empty((len(point.s_s), len(dt))), 0, 0.0
     for s in steps:
         stop = start + len(s.dt)
         part = slice(start, stop)
         start = stop
         square += normalise_columns(s.transient.x[:-1], s.k, point.x_s, point.X, z[:n, part])
         square += normalise_columns(s.transient.u[:-1], s.k, point.u_s, point.U, z[n:, part])
+        square += normalise_columns(s.transient.s[:-1], s.k, point.s_s, point.S, further[:, part])
         if shared:
             s = s.take(slice(-1, None))
         square += normalise_columns(s.transient.x[1:], s.k, point.x_s, point.X, x_next[:, stop - len(s.k) : stop])
-    further, more = _scheduling(steps, point)
-    if not square + more <= LARGEST**2:
+    if not square <= LARGEST**2:
         raise _too_large(transients)
     columns = Columns.of(additive, is_constant(dt), regimes)
     chosen = _weights(weights, transients, k, source, n)
@@ -97,7 +97,7 @@ def assemble(
     if factors is not None:
         factors = factors[source]
         chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
-    problem = Problem(z, x_next, dt, source, k, chosen, columns, further)
+    problem = Problem(z, x_next, dt, source, k, chosen, columns, further if len(further) else None)
     if regimes is not None:
         refuse_unlisted(problem, regimes, transients)
     return problem
@@ -116,19 +116,6 @@ def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Tra
                 f"{plural(len(unlisted), 'transition')} of all), a mode that the schedule does not list; list it, or "
                 f"leave that part of the recording out"
             )
-
-
-def _scheduling(steps: Sequence[Transitions], point: OperatingPoint) -> tuple[Array | None, float]:
-    """Scheduling signals that are neither state nor control, normalised, (q, N), and the sum of their squares."""
-    if not len(point.s_s):
-        return None, 0.0
-    s = np.empty((len(point.s_s), sum(len(step.dt) for step in steps)))
-    start, square = 0, 0.0
-    for step in steps:
-        part = s[:, start : start + len(step.k)]
-        square += normalise_columns(step.transient.s[:-1], step.k, point.s_s, point.S, part)
-        start += len(step.dt)
-    return s, square
 
 
 def _joined(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -34,6 +34,7 @@ from uncertain_lti.identification.evidence import (
     successive,
     unexplained,
 )
+from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import recorded
@@ -77,41 +78,23 @@ _REMEDIES = (  # words of a message on the state, or on any signal; what narrows
 )
 
 
-def too_few(transitions: int, unknowns: int) -> str:
-    """The sentence for fewer transitions than unknowns."""
-    return (
-        f"{plural(transitions, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
-        "half-widths); record "
-        f"at least {unknowns}, better a hundred times as many, or use fewer signals"
-    )
-
-
-def check_solvable(problem: Problem, transients: Sequence[Transient], names: Sequence[str]) -> None:
-    """Refuse data to which no envelope can be fitted."""
-    columns = problem.columns
-    unknowns = columns.unknowns(problem.p)
-    if problem.N < unknowns:
-        raise FitError(too_few(problem.N, unknowns))
-    if columns.half:
-        return
-    rest = np.ones(problem.N, dtype=bool)
-    for column in problem.z_columns:
-        rest &= column == 0.0
-        if not rest.any():
-            return
-    moving = rest[:, None] & (problem.x_next != problem.z[:, : problem.n])
-    where = np.argwhere(moving)
-    if len(where):
-        sample, state = where[0]
-        transient = transients[problem.source[sample]]
-        k = int(problem.k[sample])
-        others = len(np.unique(where[:, 0])) - 1
-        also = f" (so {'does' if others == 1 else 'do'} {plural(others, 'other sample')})" if others else ""
+def check_solvable(fleet: Fleet, where: Callable[[int], str], names: Sequence[str]) -> None:
+    """Refuse data to which no envelope can be fitted; `where`: what a transition is called."""
+    unknowns = fleet.columns.unknowns(fleet.p)
+    if fleet.N < unknowns:
         raise FitError(
-            f"{transient.name}: sample {k} (t = {transient.t[k]:.6g} s) is at rest, x = u = 0, and '{names[state]}' "
-            f"moves by {problem.x_next[sample, state]:.3g} in the next step, which no interval matrices can contain"
-            f"{also}; use an additive term: --additive noise for "
-            f"measurement noise, --additive disturbance for unmodelled inputs"
+            f"{plural(fleet.N, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
+            f"half-widths); record at least {unknowns}, better a hundred times as many, or use fewer signals"
+        )
+    if fleet.columns.half:
+        return
+    count, first, state, step = fleet.moving_from_rest()
+    if count:
+        also = f" (so {'does' if count == 2 else 'do'} {plural(count - 1, 'other sample')})" if count > 1 else ""
+        raise FitError(
+            f"{where(first)} begins at rest, x = u = 0, and '{names[state]}' moves by {step:.3g} in it, which no "
+            f"interval matrices can contain{also}; use an additive term: --additive noise for measurement noise, "
+            f"--additive disturbance for unmodelled inputs"
         )
 
 

@@ -43,7 +43,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling, largest_steps
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.operating_point import OperatingPoint
-from uncertain_lti.model.repeats import repeats_in, together
+from uncertain_lti.model.repeats import Found, repeats_in, together
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
@@ -112,9 +112,7 @@ def fit(
     if additive is None:
         additive = signals.additive or "none"
     scheduled = scheduled_by(schedule, signals, lambda: assemble(transients, operating_point, None, additive))
-    if structure is None and signals.structure:
-        names = ([s.name for s in signals.states], [s.name for s in signals.controls])
-        structure = Structure.from_rules(signals.structure, *names, f"{signals.source}: structure", scheduled)
+    structure = structure or structure_of(signals, scheduled)
     if structure is not None:
         if (structure.n, structure.m) != (n, m):
             raise FitError(
@@ -131,7 +129,12 @@ def fit(
         count=count,
         regimes=None if scheduled is None else Regimes.of(scheduled, signals),
     )
-    check_solvable(problem, transients, [s.name for s in signals.states])
+
+    def where(index: int) -> str:
+        of, k = transients[problem.source[index]], int(problem.k[index])
+        return f"the step from sample {k} of {of.name} (t = {of.t[k]:.6g} s)"
+
+    check_solvable(Fleet([problem]), where, [s.name for s in signals.states])
 
     discarded: list[dict[str, Any]] = []
     if budget := _budget(discard, problem.N):
@@ -140,7 +143,7 @@ def fit(
                 f"discard is {discard!r}, which leaves {plural(left, 'transition')} for {unknowns} unknowns per row; "
                 f"discard {problem.N - unknowns} at most, or record more"
             )
-        with _named_contradiction(problem, transients, signals):
+        with contradiction_named(where, signals):
             before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure)
         chosen = choose_discards(problem, criterion, structure, budget, progress)
         for index, effect in chosen:
@@ -148,7 +151,7 @@ def fit(
             when = {"t": float(of.t[k]), "t_ns": int(of.t_ns[k])}
             discarded.append({"file": of.name, "k": k, **when, "effect": effect})
         problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
-    with _named_contradiction(problem, transients, signals):
+    with contradiction_named(where, signals):
         model = fit_fleet(
             Fleet.of(problem) if method == "working-set" else Fleet([problem]),
             signals,
@@ -285,9 +288,22 @@ def fit_fleet(
     if words is not None:
         facts["rank"], facts["messages"] = words
     if transients:
-        domain = replace(domain, step_max=largest_steps(model, seen))
-        model = model.replace(repeats=together(n, seen), domain=domain)
+        model = with_repeats(model, seen)
     return model.replace(fit_summary=facts, residuals=residuals)
+
+
+def structure_of(signals: SignalMap, schedule: Schedule | None) -> Structure | None:
+    """What the signals file knows of single elements."""
+    if not signals.structure:
+        return None
+    names = ([s.name for s in signals.states], [s.name for s in signals.controls])
+    return Structure.from_rules(signals.structure, *names, f"{signals.source}: structure", schedule)
+
+
+def with_repeats(model: UncertainLTI, found: Sequence[Found]) -> UncertainLTI:
+    """A model with the exact repeats and the largest steps of its recordings, from what each of them has."""
+    domain = replace(model.domain, step_max=largest_steps(model, found))
+    return model.replace(repeats=together(model.n, found), domain=domain)
 
 
 def _block_facts(
@@ -320,13 +336,12 @@ def distance_in_words(gap: float) -> list[str]:
 
 
 @contextmanager
-def _named_contradiction(problem: Problem, transients: Sequence[Transient], signals: SignalMap) -> Iterator[None]:
-    """A transition that the structure cannot contain is named by its recording."""
+def contradiction_named(where: Callable[[int], str], signals: SignalMap) -> Iterator[None]:
+    """A transition that the structure cannot contain is named, as `where` calls it."""
     try:
         yield
     except InfeasibleError as error:
-        of, k = transients[problem.source[error.index]], int(problem.k[error.index])
-        raise contradiction_in(error, f"the step from sample {k} of {of.name} (t = {of.t[k]:.6g} s)", signals) from None
+        raise contradiction_in(error, where(error.index), signals) from None
 
 
 def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:

@@ -122,11 +122,10 @@ class Fleet:
             covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T
         return Residuals(mean, 0.5 * (covariance + covariance.T), relative)
 
-    def moving_from_rest(self) -> tuple[int, int, float]:
-        """Samples with x = u = 0 and a successor that is not 0."""
-        results = self.map(passes.moving_from_rest, self._same())
-        _, state, step = max(results, key=lambda r: r[2])
-        return sum(r[0] for r in results), state, step
+    def moving_from_rest(self) -> tuple[int, int, int, float]:
+        """Samples with x = u = 0 and a successor that is not 0; see `passes.moving_from_rest`."""
+        results = self.map(passes.moving_from_rest, [(offset,) for offset in self.offsets])
+        return sum(r[0] for r in results), *next((r for r in results if r[0]), results[0])[1:]
 
     def least_eigenvalue(self) -> float:
         """Least eigenvalue of any full weight; see `passes.least_eigenvalue`."""

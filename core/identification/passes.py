@@ -11,9 +11,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, fields, replace
+from operator import add
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,20 @@ from uncertain_lti.identification.assembly import scaled_eigenvalues
 from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.problem import Block, Partition
 from uncertain_lti.kernel.arithmetic import Blocks, centre_and_half, near_bounds, occupy, pair_count, sums_of, verdicts
+
+T = TypeVar("T", "Moments", "Judged")
+
+
+def _merged(a: T, b: T, least: Collection[str], greatest: Collection[str]) -> T:
+    """Sums of two parts, but for fields of which the least or the greatest is taken; None where a part has none."""
+
+    def both(name: str) -> Any:
+        of = getattr(a, name), getattr(b, name)
+        if of[0] is None or of[1] is None:
+            return None
+        return (np.minimum if name in least else np.maximum if name in greatest else add)(*of)
+
+    return type(a)(**{field.name: both(field.name) for field in fields(a)})
 
 
 @dataclass
@@ -52,24 +67,7 @@ class Moments:
     visits: NDArray[np.intp]
 
     def __add__(self, other: Moments) -> Moments:
-        def both(a: Array | None, b: Array | None) -> Array | None:
-            return None if a is None or b is None else a + b
-
-        return Moments(
-            self.plain_gram + other.plain_gram,
-            both(self.gram, other.gram),
-            both(self.coupled, other.coupled),
-            self.centre + other.centre,
-            self.target + other.target,
-            self.rate_square + other.rate_square,
-            self.width_sum + other.width_sum,
-            np.minimum(self.low, other.low),
-            np.maximum(self.high, other.high),
-            min(self.dt_min, other.dt_min),
-            max(self.dt_max, other.dt_max),
-            self.count + other.count,
-            self.visits + other.visits,
-        )
+        return _merged(self, other, ("low", "dt_min"), ("high", "dt_max"))
 
     def __sub__(self, other: Moments) -> Moments:
         """The sums without those over some of the transitions; ranges stay."""
@@ -164,21 +162,9 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             parts = np.empty((n, len(plain), n, len(plain)))
             parts[i, :, j] = parts[j, :, i] = grams
             coupled = parts.reshape(n * len(plain), -1)
-        found = Moments(
-            plain,
-            np.stack(grams) if weights.ndim == 2 else None,
-            coupled,
-            centre,
-            target,
-            square,
-            width,
-            block.z.min(axis=1),
-            block.z.max(axis=1),
-            float(block.dt.min()),
-            float(block.dt.max()),
-            len(block),
-            visits,
-        )
+        ends = block.z.min(axis=1), block.z.max(axis=1), float(block.dt.min()), float(block.dt.max())
+        by_row = np.stack(grams) if weights.ndim == 2 else None
+        found = Moments(plain, by_row, coupled, centre, target, square, width, *ends, len(block), visits)
         sums = found if sums is None else sums + found
     if sums is None:
         raise ValueError("a partition without transitions")
@@ -245,15 +231,19 @@ class Samples:
             return cls(np.empty(0, dtype=np.intp), np.empty((p, 0)), nothing, nothing, nothing)
         if len(parts) == 1:
             return parts[0]
-        index, first = np.unique(np.concatenate([s.index for s in parts]), return_index=True)
-        further = _joined([s.s for s in parts])
+        whole = cls.beside(parts)
+        return whole[np.unique(whole.index, return_index=True)[1]]
+
+    @classmethod
+    def beside(cls, parts: Sequence[Samples]) -> Samples:
+        """All of them, one after the other."""
         return cls(
-            index,
-            np.hstack([s.z for s in parts])[:, first],
-            np.concatenate([s.rate for s in parts])[first],
-            np.concatenate([s.dt for s in parts])[first],
-            np.concatenate([s.root_weight for s in parts])[first],
-            None if further is None else further[:, first],
+            np.concatenate([s.index for s in parts]),
+            np.hstack([s.z for s in parts]),
+            np.concatenate([s.rate for s in parts]),
+            np.concatenate([s.dt for s in parts]),
+            np.concatenate([s.root_weight for s in parts]),
+            _joined([s.s for s in parts]),
         )
 
 
@@ -337,17 +327,9 @@ class _Near:
         """One after the other."""
         if len(parts) == 1:
             return parts[0]
-        samples = [part.samples for part in parts]
         return cls(
             np.concatenate([part.row for part in parts]),
-            Samples(
-                np.concatenate([s.index for s in samples]),
-                np.hstack([s.z for s in samples]),
-                np.concatenate([s.rate for s in samples]),
-                np.concatenate([s.dt for s in samples]),
-                np.concatenate([s.root_weight for s in samples]),
-                _joined([s.s for s in samples]),
-            ),
+            Samples.beside([part.samples for part in parts]),
             np.concatenate([part.slack for part in parts]),
         )
 
@@ -410,15 +392,7 @@ class Judged:
     widest: Array
 
     def __add__(self, other: Judged) -> Judged:
-        return Judged(
-            self.outside + other.outside,
-            np.maximum(self.largest, other.largest),
-            np.maximum(self.weighted, other.weighted),
-            self.total + other.total,
-            self.products + other.products,
-            self.widths + other.widths,
-            np.maximum(self.widest, other.widest),
-        )
+        return _merged(self, other, (), ("largest", "weighted", "widest"))
 
 
 class Envelope(Protocol):
@@ -449,17 +423,17 @@ def some_residuals(part: Partition, model: Envelope, stride: int) -> tuple[Array
     return np.concatenate(left), np.concatenate(halves)
 
 
-def moving_from_rest(part: Partition) -> tuple[int, int, float]:
-    """Samples with x = u = 0 and a successor that is not 0."""
-    count, state, step = 0, 0, 0.0
+def moving_from_rest(part: Partition, offset: int = 0) -> tuple[int, int, int, float]:
+    """Samples with x = u = 0 and a successor that is not 0: how many; of the first its number, a state, its step."""
+    count, first = 0, (0, 0, 0.0)
     for block in part.blocks():
-        rest = ~block.z.any(axis=0)
-        if rest.any():
-            moves = np.abs(block.x_next[:, rest])
-            count += int(moves.any(axis=0).sum())
-            if moves.max() > step:
-                state, step = int(moves.max(axis=1).argmax()), float(moves.max())
-    return count, state, step
+        rest = np.flatnonzero(~block.z.any(axis=0))
+        moving = np.argwhere(block.x_next[:, rest].T != 0.0)
+        if len(moving) and not count:
+            k, state = rest[moving[0, 0]], moving[0, 1]
+            first = int(k) + block.start + offset, int(state), float(block.x_next[state, k])
+        count += len(np.unique(moving[:, 0]))
+    return count, *first
 
 
 def steps(part: Partition) -> Array:

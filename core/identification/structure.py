@@ -22,7 +22,9 @@ from uncertain_lti.base.arrays import Array, real
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, TERMS
+from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, NOMINAL, SHAPES, TERMS
+
+_KEYS = {"state", "from", "nominal", "half_width", "knot", "shared"}
 
 
 class Structure:
@@ -66,9 +68,7 @@ class Structure:
         shared: Mapping[str, ArrayLike] | None = None,
     ) -> None:
         self.n, self.m, self.blocks = n, m, blocks
-        nominal = [term for term in TERMS if term.nominal]
-        one_block = {term.nominal: term.shape(n, m) for term in nominal}
-        one_block |= {term.half: term.shape(n, m) for term in TERMS}
+        one_block = {name: SHAPES[name].shape(n, m) for name in (*NOMINAL, *HALF_WIDTHS)}
         self._shapes = {name: shape if blocks is None else (blocks, *shape) for name, shape in one_block.items()}
         self.shared = {name: np.zeros(shape, dtype=bool) for name, shape in one_block.items()}
         for name, values in (shared or {}).items():
@@ -81,11 +81,7 @@ class Structure:
         for name, shape in self._shapes.items():
             self.lower[name] = np.full(shape, 0.0 if name in HALF_WIDTHS else -math.inf)
             self.upper[name] = np.full(shape, math.inf)
-        for given, targets in (
-            (lower, (self.lower,)),
-            (upper, (self.upper,)),
-            (fixed, (self.lower, self.upper)),
-        ):
+        for given, targets in ((lower, (self.lower,)), (upper, (self.upper,)), (fixed, (self.lower, self.upper))):
             for name, values in (given or {}).items():
                 for target in targets:
                     said = self._read(name, values)
@@ -139,20 +135,12 @@ class Structure:
         the same at all of them.
         """
         n, m = len(states), len(controls)
-        blocks = 1 if schedule is None else schedule.blocks
-        structure = cls(n, m, blocks=blocks)
+        structure = cls(n, m, blocks=None if schedule is None else schedule.blocks)
         if not isinstance(rules, list):
             raise FitError(f"{source}: a list of rules is wanted, not {type(rules).__name__}")
         for number, rule in enumerate(rules):
             here = f"{source}[{number}]"
-            if not isinstance(rule, dict) or not {"state", "from"} <= set(rule) <= {
-                "state",
-                "from",
-                "nominal",
-                "half_width",
-                "knot",
-                "shared",
-            }:
+            if not isinstance(rule, dict) or not {"state", "from"} <= set(rule) <= _KEYS:
                 raise FitError(
                     f"{here}: a rule has the keys state, from, and nominal and/or half_width, or shared; and knot, if "
                     f"it is not for all knots"
@@ -164,19 +152,14 @@ class Structure:
             if "shared" in rule and "knot" in rule and rule["knot"] != "all":
                 raise FitError(f"{here}: what is shared is so at all knots; leave out knot, or shared")
             rows = range(n) if rule["state"] == "*" else [_position(rule["state"], states, f"{here}: state")]
-            columns: list[tuple[str, str, int | None]] = []
             word = "disturbance" if rule["from"] == "drift" else rule["from"]  # as rules had it before
-            additive = [term for term in ADDITIVE if word == term.word]
-            if additive:
-                columns = [(term.nominal, term.half, None) for term in additive]
-            elif rule["from"] == "*":
-                columns = [*(("A", "dA", j) for j in range(n)), *(("B", "dB", j) for j in range(m))]
-            else:
-                j = _position(rule["from"], (*states, *controls), f"{here}: from")
-                columns = [("A", "dA", j) if j < n else ("B", "dB", j - n)]
+            each = [("A", "dA", j) for j in range(n)] + [("B", "dB", j) for j in range(m)]
+            columns: Sequence[tuple[str, str, *tuple[int, ...]]]
+            columns = each if word == "*" else [(term.nominal, term.half) for term in ADDITIVE if word == term.word]
+            columns = columns or [each[_position(word, (*states, *controls), f"{here}: from")]]
             for i in rows:
-                for nominal, half, column in columns:
-                    at: tuple[int, ...] = (i,) if column is None else (i, column)
+                for nominal, half, *column in columns:
+                    at = (i, *column)
                     for key, name in (("nominal", nominal), ("half_width", half)):
                         if "shared" in rule and name and (key in rule or not {"nominal", "half_width"} & set(rule)):
                             structure.shared[name][at] = same
@@ -186,13 +169,10 @@ class Structure:
                             low, high = _range(rule[key], f"{here}: {key}")
                             low = max(low, 0.0) if name in HALF_WIDTHS and low == -math.inf else low
                             for block in which:
-                                structure.lower[name][(block, *at)] = low
-                                structure.upper[name][(block, *at)] = high
-        lower, upper = structure.lower, structure.upper
-        if schedule is None:
-            one = [{name: array[0] for name, array in side.items()} for side in (lower, upper)]
-            return cls(n, m, lower=one[0], upper=one[1])
-        return cls(n, m, lower=lower, upper=upper, blocks=blocks, shared=structure.shared)
+                                structure.lower[name][(*block, *at)] = low
+                                structure.upper[name][(*block, *at)] = high
+        shared = None if schedule is None else structure.shared
+        return cls(n, m, lower=structure.lower, upper=structure.upper, blocks=structure.blocks, shared=shared)
 
     def to_dict(self) -> dict[str, Any]:
         """`lower`, `upper` and `shared` for the model file; null for no bound."""
@@ -211,18 +191,16 @@ class Structure:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], n: int, m: int) -> Structure:
         """From what `to_dict` returned."""
-
-        def arrays(side: str, kind: type = np.float64) -> dict[str, Any]:
-            try:
-                return {name: np.array(values, dtype=kind) for name, values in data[side].items() if values}
-            except (AttributeError, KeyError, TypeError, ValueError):
-                raise FitError("structure: the model file does not hold it as it was written; fit again") from None
-
-        shaped = {side: {k: v for k, v in arrays(side).items() if v.size} for side in ("lower", "upper")}
-        A = shaped["lower"].get("A")
-        blocks = len(A) if A is not None and A.ndim == 3 else None
-        shared = {k: v for k, v in arrays("shared", bool).items() if v.size} if "shared" in data else None
-        return cls(n, m, lower=shaped["lower"], upper=shaped["upper"], blocks=blocks, shared=shared)
+        kinds = {"lower": np.float64, "upper": np.float64} | ({"shared": np.bool_} if "shared" in data else {})
+        try:
+            sides = {
+                side: {name: a for name, values in data[side].items() if (a := np.array(values, dtype=kind)).size}
+                for side, kind in kinds.items()
+            }
+            blocks = len(sides["lower"]["A"]) if sides["lower"]["A"].ndim == 3 else None
+        except (AttributeError, KeyError, TypeError, ValueError):
+            raise FitError("structure: the model file does not hold it as it was written; fit again") from None
+        return cls(n, m, **sides, blocks=blocks)
 
     def stacked(self, names: Collection[str], tied: Sequence[int] = (0,)) -> tuple[Array, Array, Array, Array]:
         """Lower and upper bounds of theta (r, n), and of d (q, n), in the order of the unknowns.
@@ -293,10 +271,10 @@ def narrowed(
     return sides[0], sides[1], sides[2], sides[3]
 
 
-def _blocks(knot: Any, schedule: Schedule | None, where: str) -> Sequence[int]:
-    """Blocks that a rule holds for."""
+def _blocks(knot: Any, schedule: Schedule | None, where: str) -> Sequence[tuple[int, ...]]:
+    """Blocks that a rule holds for, as their arrays are indexed: without a schedule they have no axis of them."""
     if knot == "all":
-        return range(1 if schedule is None else schedule.blocks)
+        return [()] if schedule is None else [(r,) for r in range(schedule.blocks)]
     if schedule is None:
         raise FitError(f"{where} is {knot!r}, and the model has no schedule; leave it out")
     numbers = knot if isinstance(knot, list) else [knot]
@@ -307,7 +285,7 @@ def _blocks(knot: Any, schedule: Schedule | None, where: str) -> Sequence[int]:
     for k, axis in zip(numbers, schedule.axes, strict=True):
         if not 1 <= k <= len(axis):
             raise FitError(f"{where} is {knot!r}; '{axis.signal}' has {len(axis)}, counted from 1")
-    return [schedule.indices.index(tuple(k - 1 for k in numbers))]
+    return [(schedule.indices.index(tuple(k - 1 for k in numbers)),)]
 
 
 def _position(name: Any, names: Sequence[str], where: str) -> int:

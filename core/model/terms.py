@@ -74,6 +74,8 @@ TERMS = (
 ADDITIVE = tuple(term for term in TERMS if not term.required)
 """The terms that a fit has or not, each on the regressor 1."""
 _RATES = tuple(term for term in TERMS if term.times_dt)
+NOMINAL = tuple(term.nominal for term in TERMS if term.nominal)
+"""Names of the nominal elements."""
 HALF_WIDTHS = tuple(term.half for term in TERMS)
 """Names of the half-widths."""
 REQUIRED = tuple(name for k in (0, 1) for t in TERMS if t.required for name in t.names[k : k + 1])
