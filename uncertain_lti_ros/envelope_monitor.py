@@ -380,6 +380,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._looked = now
         for subscription in self.inputs.values():
             subscription.look()
+        self.outputs.look()
         self._find_enable_type()
 
     def _find_enable_type(self) -> None:

@@ -19,11 +19,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
-from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -48,6 +49,7 @@ RELIABILITY = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": Reliabilit
 DURABILITY = {"volatile": DurabilityPolicy.VOLATILE, "transient_local": DurabilityPolicy.TRANSIENT_LOCAL}
 _NEVER_NS = 2**62
 """A deadline of this or more means none."""
+_MESSAGE_ONLY, _WITH_INFO = (SimpleNamespace(value=kind.value) for kind in Subscription.CallbackType)
 _OUTPUT_DEPTH = MOST // 5  # samples that a start or a stall may send at once; what readers have is kept no longer
 _LAST_WORDS = 1.0  # s that the end waits until readers have the last messages
 
@@ -143,6 +145,17 @@ def incompatible(asked: QoSProfile, offered: QoSProfile) -> list[str]:
 def _policies(qos: QoSProfile) -> tuple[Any, ...]:
     """What must be compatible between publishers and subscribers."""
     return qos.reliability, qos.durability, qos.deadline.nanoseconds % _NEVER_NS
+
+
+class _Plain(Subscription):
+    """A subscription without properties and enumerations.
+
+    The executor looks four of them up for every message, which takes as long as to take the message.
+    """
+
+    handle: Any = None  # of each one, as is the next
+    callback: Any = None
+    CallbackType: Any = SimpleNamespace(MessageOnly=_MESSAGE_ONLY)
 
 
 class MatchedSubscription:
@@ -249,14 +262,15 @@ class MatchedSubscription:
             deadline=self._missed,
         )
         self._number = None
-        self._subscription = self._node.create_subscription(
+        self._subscription = subscription = self._node.create_subscription(
             self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=self._raw
         )
-        # so that the message comes with its number; the events executor of Jazzy then gives both as one argument
-        self._subscription._callback_type = Subscription.CallbackType.WithMessageInfo
-        self._events = PolledEvents(self._node, self._subscription)
+        handle, subscription.__class__ = subscription.handle, _Plain
+        vars(subscription).update(handle=handle, callback=self._take, _callback_type=_WITH_INFO)
+        self._events = PolledEvents(self._node, subscription)
 
     def _take(self, *given: Any) -> None:
+        """A message with its number; the events executor of Jazzy gives both as one argument."""
         message, info = given if len(given) == 2 else given[0]
         self.received, self.last = self.received + 1, message
         number, before = info["publication_sequence_number"], self._number
@@ -296,17 +310,15 @@ class OutputPublisher:
     """One topic of the node, and how many listen to it; takes serialised messages.
 
     `node`: the node; `kind`: message class; `name`: of the topic, below the node's; `qos`: what is offered; `changed`:
-    called when there are more or fewer listeners; `send`: publishes the bytes of a message; `poll`: reads the events of
-    the middleware.
+    called when there are more or fewer listeners; `send`: publishes the bytes of a message; `look`: logs who cannot
+    listen, by the events of the middleware.
     """
 
     def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
-        events = PublisherEventCallbacks(matched=self._matched)
-        self._node = node
-        self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos, event_callbacks=events)
+        self._node, self._changed = node, changed
+        self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos)
         self._events = PolledEvents(node, self._publisher)
-        self.poll = self._events.poll
-        self._changed = changed
+        self.look = self._events.poll
         self.listeners = 0
         # Past the check of the lifecycle state: the node publishes only while it is active.
         self.send = self._publisher.handle.publish_raw
@@ -322,8 +334,11 @@ class OutputPublisher:
         self._listeners = count
         self._changed()
 
-    def _matched(self, event: Any) -> None:
-        self.listeners = event.current_count
+    def poll(self) -> None:
+        """Count the listeners; events would cost ten times as much."""
+        count = self._publisher.handle.get_subscription_count()
+        if count != self._listeners:
+            self.listeners = count
 
     def destroy(self, patience: float) -> None:
         """Stop publishing, once every reliable reader has everything."""
@@ -366,6 +381,11 @@ class Outputs:
         """Update the numbers of listeners."""
         for publisher in self.publishers.values():
             publisher.poll()
+
+    def look(self) -> None:
+        """Log who asks for what is not offered."""
+        for publisher in self.publishers.values():
+            publisher.look()
 
     def close(self) -> None:
         """Stop publishing, once readers have what was published last."""

@@ -23,6 +23,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from libc.math cimport NAN
 from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, uint32_t, uint64_t
 from libc.string cimport memchr, memcmp, memcpy
 
@@ -140,7 +141,8 @@ cdef class Plan:
     cdef bint big, untrue
     cdef double* slots
     cdef int64_t* places
-    cdef object row, place
+    cdef double[::1] row  # slots and places of a message alone
+    cdef int64_t[::1] place
 
     def __init__(self, type_name, paths, type_fields):
         self.fields_of, self.unwanted, self.able = type_fields, {}, True
@@ -156,7 +158,7 @@ cdef class Plan:
         for parts, function in zip(self.parts, self.functions):
             if function is not None and any(self.codes[slot] in "qQ" for slot in parts.values()):
                 self.able = False  # a function of whole numbers takes them without rounding
-        self.row, self.place = np.empty((1, len(self.codes))), np.empty((1, 2 * len(self.every)), np.int64)
+        self.row, self.place = np.empty(len(self.codes)), np.empty(2 * len(self.every), np.int64)
 
     def stamp(self, type_name, number):
         """What is wanted for the header stamp."""
@@ -433,31 +435,28 @@ cdef class Plan:
         return ("", "it is cut", "it holds a truth value that is neither 0 nor 1", "it is no plain CDR")[what]
 
     cdef Py_ssize_t alone(self, bytes data) except -1:
-        cdef double[:, ::1] row = self.row
-        cdef int64_t[:, ::1] place = self.place
-        row[:] = math.nan
-        place[:] = -1
-        self.slots = &row[0, 0] if row.shape[1] else NULL
-        self.places = &place[0, 0] if place.shape[1] else NULL
+        self.row[:] = NAN
+        self.place[:] = -1
+        self.slots = &self.row[0] if self.row.shape[0] else NULL
+        self.places = &self.place[0] if self.place.shape[0] else NULL
         return self.walk(<const uint8_t*><const char*>data, len(data))
 
-    def read(self, bytes data):
+    cpdef tuple read(self, bytes data):
         """What a message is, and if it is whole, its stamp (ns or None) and values."""
         cdef Py_ssize_t what = self.alone(data)
         cdef Py_ssize_t slot
-        cdef double[:, ::1] row = self.row
         if what != WHOLE or not self.able:
             return what, None
         values = []
         for number, function in enumerate(self.functions):
             if function is None:
                 slot = self.parts[number][0]
-                values.append(row[0, slot])
+                values.append(self.slots[slot])
             else:
-                values.append(self.computed(number, function, row[0], self.place[0], data))
+                values.append(self.computed(number, function, self.row, np.asarray(self.place), data))
         stamp = None
         if self.seconds >= 0:
-            stamp = <int64_t>row[0, self.seconds] * 1_000_000_000 + <int64_t>row[0, self.nanoseconds] or None
+            stamp = <int64_t>self.slots[self.seconds] * 1_000_000_000 + <int64_t>self.slots[self.nanoseconds] or None
         return WHOLE, (stamp, values)
 
     def read_all(self, buffer, int64_t[::1] begin, int64_t[::1] end, double[:, :] values, int64_t[::1] stamps):
