@@ -132,7 +132,8 @@ def fit_archive(
     if not isinstance(signals, SignalMap):
         paths = list(paths)
         signals = load_signals(signals, paths)
-    on = signals_of(asked_by(signals) if schedule is None else schedule, [s.name for s in signals.signals])
+    schedule = asked_by(signals) if schedule is None else schedule
+    on = signals_of(schedule, [s.name for s in signals.signals])
     messages = unused([s.name for s in signals.scheduling], on)
     signals = signals.scheduled_on(on)
     for signal in signals.signals:

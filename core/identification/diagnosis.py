@@ -180,8 +180,16 @@ def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
     columns = problem.columns
     if columns.regimes is None:
         return []
-    tied = [r if data.tied_to is None else data.tied_to for r, data in enumerate(model.block_data)]
-    messages = regimes.tied_words(columns.regimes.schedule, sums, columns, problem.p, tied, model.signals.signals)
+    messages = []
+    reasons = regimes.lacking(sums.centre, sums.visits, columns, problem.p)
+    for r, (reason, data) in enumerate(zip(reasons, model.block_data, strict=True)):
+        if data.tied_to is not None:
+            if not sums.visits[r]:
+                reason = "no transition is nearest to it, so there is no bound to trust there"
+            messages.append(
+                f"the block at {model.block_name(r)} has too little data for elements of its own ({reason}) and shares "
+                f"those at {model.block_name(data.tied_to)}: record the machine there, or give fewer knots"
+            )
     if (more := len(messages) - MOST_TIED) > 1:
         messages[MOST_TIED:] = [
             f"{more} more blocks have too little data and share the elements of others; the table of regimes, of "
@@ -272,7 +280,8 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int]) -> 
         size = float(change @ change)
         if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
             continue
-        explained = 1.0 - float(unexplained(gram, (basis.T @ change)[:, None], np.array([size]))[0]) / size
+        left, _ = unexplained(gram, (basis.T @ change)[:, None], np.array([size]))
+        explained = 1.0 - float(left[0]) / size
         if explained > FED_BACK:
             messages.append(
                 f"the changes of control '{names[j]}' follow from the states to {explained:.0%}: a feedback sets it, "

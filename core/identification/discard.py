@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
@@ -65,17 +64,14 @@ def choose_discards(
     it carries without it. A discarded transition need not be contained in any row. It stops early when none has an
     effect.
     """
-
-    def say(number: int) -> None:
+    chosen: list[tuple[int, float]] = []
+    greedy = _greedy(WorkingSet(Fleet([problem]), structure), criterion)
+    for number in range(1, budget + 1):
         if progress is not None:
             progress(CountedStep(f"discard {number} of {budget}", number, budget))
-
-    chosen: list[tuple[int, float]] = []
-    say(1)
-    for found in islice(_greedy(WorkingSet(Fleet([problem]), structure), criterion), budget):
+        if (found := next(greedy, None)) is None:
+            break
         chosen.append(found)
-        if len(chosen) < budget:
-            say(len(chosen) + 1)
     return chosen
 
 
@@ -198,7 +194,7 @@ def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
             if not len(outside):
                 return float(answer[-1])
             add(outside)
-            trial.join(outside)
+            trial.pool = np.concatenate([trial.pool, outside])
 
     add(trial.pool)
     value = solve()

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.model.horizon import unbroken_over
 from uncertain_lti.signals.signal_map import Signal
 
 NOISE = 0.5
@@ -47,23 +48,17 @@ _MOST_PRODUCTS = 12
 
 def successive(problem: Problem) -> NDArray[np.intp]:
     """Transitions that the next one in the problem continues: same recording, next sample."""
-    same = (problem.source[1:] == problem.source[:-1]) & (problem.k[1:] == problem.k[:-1] + 1)
-    return np.flatnonzero(same)
+    return np.flatnonzero(np.diff(problem.order) == 1)
 
 
-def unexplained(gram: Array, cross: Array, total: Array) -> Array:
-    """Sum of squares of each target that its least-squares fit on some regressors leaves.
+def unexplained(gram: Array, cross: Array, total: Array) -> tuple[Array, NDArray[np.intp]]:
+    """Sum of squares of each target that its least-squares fit on some regressors leaves, and the rank of these.
 
     Shares below 1e-11 are not distinguished, which no decision here needs.
 
     `gram` (..., b, b): products of the regressors with one another; leading axes are other choices of regressors;
     `cross` (..., b, t): products of the regressors with the targets; `total` (t,): sums of squares of the targets.
     """
-    return _explained(gram, cross, total)[0]
-
-
-def _explained(gram: Array, cross: Array, total: Array) -> tuple[Array, NDArray[np.intp]]:
-    """As `unexplained`, and the rank of the regressors."""
     size = np.sqrt(np.diagonal(gram, axis1=-2, axis2=-1))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     values, vectors = np.linalg.eigh(gram * unit[..., :, None] * unit[..., None, :])
@@ -85,7 +80,7 @@ def predicted(X: Array, U: Array, after: Array) -> Array:
     columns /= np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300)
     known, targets = columns[:, : X.shape[1] + U.shape[1]], columns[:, X.shape[1] + U.shape[1] :]
     total = np.einsum("ki,ki->i", targets, targets)
-    left, rank = _explained(known.T @ known, known.T @ targets, total)
+    left, rank = unexplained(known.T @ known, known.T @ targets, total)
     left = left * (len(X) - 1) / max(len(X) - 1 - int(rank), 1)
     return np.asarray(np.where(total > 0.0, 1.0 - left / np.maximum(total, 1e-300), 0.0))
 
@@ -135,7 +130,7 @@ def autocorrelation(problem: Problem) -> Autocorrelation | None:
     own = np.arange(p + 1)
 
     def left(columns: NDArray[np.intp], states: slice) -> Array:
-        return unexplained(gram[np.ix_(columns, columns)], cross[columns, states], total[states])
+        return unexplained(gram[np.ix_(columns, columns)], cross[columns, states], total[states])[0]
 
     plain = left(own, slice(None))
     past = np.array([left(np.append(own, p + 1 + i), slice(i, i + 1))[0] for i in range(n)])
@@ -200,12 +195,7 @@ def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dic
 def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tuple[int, float]]:
     """Controls that explain the states clearly better when taken some samples earlier."""
     n, p = problem.n, problem.p
-    follows = successive(problem)
-    joined = np.zeros(problem.N, dtype=bool)
-    joined[follows + 1] = True
-    breaks = np.flatnonzero(~joined)
-    # samples before this one in the same unbroken stretch
-    run = np.arange(problem.N) - breaks[np.searchsorted(breaks, np.arange(problem.N), side="right") - 1]
+    run = np.arange(problem.N) - unbroken_over(problem.order, [], None)  # samples before this one in its stretch
     usable = np.flatnonzero(run >= LONGEST_DELAY)
     if len(usable) < 20 * p:
         return {}
@@ -244,7 +234,7 @@ def _lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[in
 
     def score(chosen: list[list[int]]) -> Array:
         which = np.array(chosen)
-        left = unexplained(gram[which[:, :, None], which[:, None, :]], cross[which], total)
+        left, _ = unexplained(gram[which[:, :, None], which[:, None, :]], cross[which], total)
         return np.asarray(np.log(np.maximum(left, 1e-300)).sum(axis=-1))
 
     found = {}

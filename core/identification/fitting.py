@@ -90,7 +90,8 @@ def fit(
     if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
         raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
     signals = common_signals(transients)
-    on = signals_of(asked_by(signals) if schedule is None else schedule, [s.name for s in signals.signals])
+    schedule = asked_by(signals) if schedule is None else schedule
+    on = signals_of(schedule, [s.name for s in signals.signals])
     if operating_point is not None:
         operating_point = operating_point.scheduled_on([s.name in on for s in signals.scheduling])
     transients, signals = [t.scheduled_on(on) for t in transients], signals.scheduled_on(on)
@@ -371,18 +372,18 @@ def common_signals(transients: Sequence[Transient]) -> SignalMap:
     """Signals of recordings, which must all be read alike."""
     if not transients:
         raise FitError("no transients; give at least one recording")
+
+    def named(t: Transient) -> str:
+        each = t.state_names, t.control_names, t.scheduling_names
+        of = [", ".join(names) or "none" for names in each]
+        return f"states {of[0]}, controls {of[1]} and scheduling signals {of[2]}"
+
     first = transients[0]
     for other in transients[1:]:
-        if (other.state_names, other.control_names) != (first.state_names, first.control_names):
+        if named(other) != named(first):
             raise FitError(
-                f"{other.name} has states {', '.join(other.state_names)} and controls "
-                f"{', '.join(other.control_names) or 'none'}, {first.name} has {', '.join(first.state_names)} and "
-                f"{', '.join(first.control_names) or 'none'}; read all recordings with one signals file"
-            )
-        if other.scheduling_names != first.scheduling_names:
-            raise FitError(
-                f"{other.name} has the scheduling signals {', '.join(other.scheduling_names) or 'none'}, {first.name} "
-                f"has {', '.join(first.scheduling_names) or 'none'}; read all recordings with one signals file"
+                f"{other.name} has {named(other)}, {first.name} has {named(first)}; read all recordings with one "
+                f"signals file"
             )
         if other.step != first.step:
             raise FitError(f"{other.name} has step {other.step or 'recorded'}, {first.name} {first.step or 'recorded'}")

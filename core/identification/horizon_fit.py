@@ -20,7 +20,6 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.cores import one_thread_each
@@ -62,7 +61,7 @@ def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], stru
     made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
     """
     lengths = sorted(set(steps))
-    k, signals = _in_order(problem)
+    k, signals = problem.order, _signals(problem)
     dt, after = problem.dt, problem.next_columns
     piece = max(20 * lengths[-1], 1000)
     if len(dt) > _COMPARED:
@@ -85,10 +84,9 @@ def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], stru
     return run if distance(model.replace(run=run)) < distance(model) else None
 
 
-def _in_order(problem: Problem) -> tuple[NDArray[np.intp], Array]:
-    """Numbers of the samples, with those of another recording never following, and [x; u; s], one column for each."""
-    signals = problem.z_columns if problem.s_columns is None else np.vstack([problem.z_columns, problem.s_columns])
-    return problem.k + problem.source * (int(problem.k.max(initial=0)) + 2), signals
+def _signals(problem: Problem) -> Array:
+    """[x; u; s] of the transitions, one column for each."""
+    return problem.z_columns if problem.s_columns is None else np.vstack([problem.z_columns, problem.s_columns])
 
 
 @one_thread_each()
@@ -105,14 +103,13 @@ def fit_horizons(
     found: list[Horizon] = []
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
-    k, signals = _in_order(problem)
     n, p = problem.n, problem.p
     axes = 0 if model.schedule is None else len(model.schedule.axes)
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
     columns = Columns(_UNKNOWN, regimes)
     halves = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
     lengths = sorted(set(steps))
-    for windows in model.windows(k, signals, problem.dt, lengths):
+    for windows in model.windows(problem.order, _signals(problem), problem.dt, lengths):
         if progress is not None:
             progress(f"horizon of {windows.steps} steps: {plural(len(windows.start), 'window')}")
         few = 2 * (p + 1) * columns.count

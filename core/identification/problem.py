@@ -128,6 +128,11 @@ class Problem:
         """Next states with samples in rows, (N, n)."""
         return self.next_columns.T
 
+    @property
+    def order(self) -> NDArray[np.intp]:
+        """Numbers of the samples (N,), with those of another recording never following."""
+        return self.k + self.source * (int(self.k.max(initial=0)) + 2)
+
     def block(self, part: slice) -> Block:
         """Transitions of a slice, without a copy."""
         of = self.subset(part)

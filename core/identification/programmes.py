@@ -194,7 +194,6 @@ class Programmes:
         G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
         kinds = 3 if box is None else 2
         number = kinds * np.tile(row.samples.index[row.pool], kinds) + np.repeat(np.arange(kinds), len(row.pool))
-        there = np.zeros((kinds, len(row.samples)), dtype=bool)  # rows that the simplex method has
         if self._simplex is None:  # of each sample the side that it is on, and its width
             self._simplex = self.minimax(nominal_alone=box is not None)
             theta, d = row.scaled()
@@ -210,8 +209,7 @@ class Programmes:
             if len(idle):
                 self._simplex.drop(idle)
                 self._known = np.delete(self._known, idle - len(row.asked))
-        there[self._known % kinds, np.searchsorted(row.samples.index, self._known // kinds)] = True
-        others = ~there[:, row.pool].ravel()
+        others = ~np.isin(number, self._known)  # rows that the simplex method does not have
         while True:  # of a sample few have more than one row that matters
             wanted &= others
             if wanted.any():
@@ -239,7 +237,7 @@ class Programmes:
         structure or the recordings have no such half-widths.
         """
         row = self.row
-        sums, columns = row.sums, row._columns
+        sums, columns = row.sums, row.columns
         least_known = row.fixed_d.any() or (row.lower[row.r :] > 0.0).any()
         if least_known or sums.gram is not None or sums.coupled is not None or not len(row.samples):
             return None
@@ -269,7 +267,7 @@ class Programmes:
         return np.vstack(sides), np.concatenate([y, -y])
 
     def least_width(self) -> float:
-        """A lower bound of δ, in units of scale: by multipliers, or the optimum on the samples that decide it."""
+        """A lower bound of δ, in units of scale: by multipliers, or the optimum on the working set."""
         row = self.row
         assert row.limit is not None
         xi = np.concatenate([*row.scaled(), [row.limit]])
@@ -280,20 +278,9 @@ class Programmes:
             bound = linear_bound(cost, G, h, low, high, xi, active)
             if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
                 return bound
-        inside, room = row.slacks()
-        assert room is not None
-        few = 2 * (row.r + row.q)
-        inside, room = inside[row.pool], room[row.pool]
-        least = np.argpartition(room, few)[:few] if len(room) > few else np.arange(len(room))
-        decisive = np.union1d(np.flatnonzero(inside < 1e-7), least)
-        bound = max(bound, 0.0)
-        for pool in (row.pool[decisive], row.pool):
-            simplex = self.minimax()
-            simplex.add(*self.rows(pool))
-            bound = max(bound, float(simplex.solve()[-1]))
-            if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
-                break
-        return bound
+        simplex = self.minimax()
+        simplex.add(*self.rows(row.pool))
+        return max(bound, 0.0, float(simplex.solve()[-1]))
 
     def minimax(self, nominal_alone: bool = False) -> Simplex:
         """Minimise δ, the last unknown, after all others or the nominal elements alone."""

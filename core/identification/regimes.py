@@ -120,36 +120,20 @@ def block_data(sums: Moments, tied: Sequence[int]) -> tuple[BlockData, ...]:
     )
 
 
-def tied_words(
-    schedule: Schedule, sums: Moments, columns: Columns, p: int, tied: Sequence[int], signals: Sequence[Signal]
-) -> list[str]:
-    """Which blocks share the elements of another, and why."""
-    messages = []
-    reasons = lacking(sums.centre, sums.visits, columns, p)
-    for r, (reason, block) in enumerate(zip(reasons, tied, strict=True)):
-        if block == r:
-            continue
-        where, other = schedule.block_name(r, signals), schedule.block_name(block, signals)
-        if not sums.visits[r]:
-            reason = "no transition is nearest to it, so there is no bound to trust there"
-        messages.append(
-            f"the block at {where} has too little data for elements of its own ({reason}) and shares those at {other}: "
-            f"record the machine there, or give fewer knots"
-        )
-    return messages
-
-
 def asked_by(signals: SignalMap) -> dict[str, Knots]:
     """The schedule that a signals file asks for."""
     return {rule.signal: Modes(rule.modes) if rule.knots is None else rule.knots for rule in signals.schedule}
 
 
-def signals_of(schedule: Schedule | Mapping[str, Knots] | None, names: Sequence[str]) -> list[str]:
-    """The signals that a fit is scheduled on."""
+def signals_of(schedule: Schedule | Mapping[str, Knots], names: Sequence[str]) -> list[str]:
+    """The signals that a fit is scheduled on; refuses what is no schedule of these signals."""
     if isinstance(schedule, Schedule):
         return [axis.signal for axis in schedule.axes]
     if not isinstance(schedule, Mapping):
-        return list(names)  # `scheduled_by` refuses it
+        raise FitError(
+            f"schedule is {type(schedule).__name__}; give a Schedule, or a mapping from signals to knots in recorded "
+            f"units, Modes, or how many knots"
+        )
     check_names(schedule, names)
     return [
         name
@@ -180,22 +164,11 @@ def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
 
 
 def scheduled_by(
-    schedule: Schedule | Mapping[str, Knots] | None,
-    signals: SignalMap,
-    data: Callable[[], Problem] | None = None,
+    schedule: Schedule | Mapping[str, Knots], signals: SignalMap, data: Callable[[], Problem] | None = None
 ) -> Schedule | None:
-    """What a fit is scheduled by."""
-    if schedule is None:
-        schedule = asked_by(signals)
+    """What a fit is scheduled by, where `signals_of` has found its signals."""
     if isinstance(schedule, Schedule):
         return schedule
-    if not isinstance(schedule, Mapping):
-        raise FitError(
-            f"schedule is {type(schedule).__name__}; give a Schedule, or a mapping from signals to knots in recorded "
-            f"units, Modes, or how many knots"
-        )
-    names = [s.name for s in signals.signals]
-    check_names(schedule, names)
     asked: dict[str, Knots] = {}
     for name, knots in schedule.items():
         if isinstance(knots, str):
@@ -219,13 +192,9 @@ def scheduled_by(
     if not asked:
         return None
     problem = data() if data and any(isinstance(k, (int, np.integer)) for k in asked.values()) else None
+    rows = {signal.name: row for row, signal in enumerate(signals.signals)}
     try:
-        return Schedule(
-            tuple(
-                _axis(signals.signals[names.index(name)], names.index(name), knots, problem)
-                for name, knots in asked.items()
-            )
-        )
+        return Schedule(tuple(_axis(signals.signals[rows[k]], rows[k], knots, problem) for k, knots in asked.items()))
     except ModelError as error:
         raise FitError(str(error)) from None
 

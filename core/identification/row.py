@@ -122,19 +122,21 @@ class Row:
 
     Elements that the structure fixes, and columns that are 0 in every sample, are no unknowns.
 
-    `i`: which row of the model; `sums`: of all data; `bounds`: of `Structure.stacked`; `shared` (r,): of each nominal
-    element and each half-width the first that it shares its value with; default none but itself.
+    `i`: which row of the model; `sums`: of all data; `columns`: terms that are unknown; `bounds`: of
+    `Structure.stacked`; `shared` (r,): of each nominal element and each half-width the first that it shares its value
+    with; default none but itself.
     """
 
     def __init__(
         self,
         i: int,
         sums: Moments,
+        columns: Columns,
         bounds: tuple[Array, Array, Array, Array],
         shared: tuple[Index, Index] | None = None,
     ) -> None:
         self.i = i
-        self.sums = sums
+        self.sums, self.columns = sums, columns
         self._bounds = bounds
         self._shared = shared
         self.refined = False
@@ -201,7 +203,7 @@ class Row:
         """
         samples, pool, limit = self.samples, self.pool, self.limit
         theta, d, before = self.theta, self.d, self.limit_unit
-        phi = self._phi(samples)
+        phi = self.columns.phi(samples.z, samples.s)
         step = samples.rate * samples.dt
         fixed = self.theta.copy()
         self.phi_columns.put(fixed, 0.0)
@@ -238,18 +240,16 @@ class Row:
                 self.centre = np.eye(self.basis.shape[1])
                 self.target = left[:, keep].T @ residual / (root * scale)
             low, high = self.lower[: self.r], self.upper[: self.r]
-            there = np.concatenate([np.flatnonzero(np.isfinite(low)), np.flatnonzero(np.isfinite(high))])
-            signs = np.repeat([1.0, -1.0], [int(np.isfinite(low).sum()), int(np.isfinite(high).sum())])
-            asked = signs[:, None] * self.basis[there]
-            size = np.maximum(np.abs(asked).max(axis=1, initial=0.0), 1e-300)
+            asked = np.vstack([self.basis[np.isfinite(low)], -self.basis[np.isfinite(high)]])
             limits = np.concatenate([low[np.isfinite(low)], -high[np.isfinite(high)]])
+            size = np.maximum(np.abs(asked).max(axis=1, initial=0.0), 1e-300)
             self.asked, self.asked_limits = asked / size[:, None], limits / size
-            self.r = self.basis.shape[1]
-            self.lower = np.concatenate([np.full(self.r, -np.inf), self.lower[-self.q :] if self.q else np.empty(0)])
-            self.upper = np.concatenate([np.full(self.r, np.inf), self.upper[-self.q :] if self.q else np.empty(0)])
+            free = np.full(self.basis.shape[1], np.inf)
+            self.lower, self.upper = np.append(-free, self.lower[self.r :]), np.append(free, self.upper[self.r :])
+            self.r = len(free)
         self.theta, self.d = theta, d
         self.width_unit = 1.0
-        self.hold(samples, self._columns)
+        self.hold(samples)
         self.width_unit = float(np.sqrt(np.mean(self.width**2))) if len(samples) else 1.0
         self.width = self.width / self.width_unit
         self.limit = None if limit is None else limit * before / self.limit_unit
@@ -263,12 +263,6 @@ class Row:
     def sizes(self, positions: Index | int) -> Array:
         """Size of held samples: the unit of their slack, with `scale`."""
         return np.asarray(self.width[positions] * self.width_unit / (2.0 * self.samples.root_weight[positions]))
-
-    def _phi(self, samples: Samples) -> Array:
-        return self._columns.phi(samples.z, samples.s)
-
-    def _psi(self, samples: Samples) -> Array:
-        return self._columns.psi(samples.z, samples.dt, samples.s)
 
     def scaled(self) -> tuple[Array, Array]:
         """Return the row's elements as differences from its fixed part, in scaled units.
@@ -326,9 +320,8 @@ class Row:
         theta = change * self.unit_phi * self.scale
         self.phi_columns.put(self.theta, theta + self.fixed_theta[self.free_phi] if self.refined else theta)
 
-    def hold(self, samples: Samples, columns: Columns, like: Row | None = None) -> None:
+    def hold(self, samples: Samples, like: Row | None = None) -> None:
         """Hold these samples, and the working set so far; `like`: a row that may hold the same transitions."""
-        self._columns = columns
         kept = self.samples[self.pool]
         if not kept.among(samples):
             samples = Samples.join([samples, kept], len(samples.z))
@@ -337,8 +330,10 @@ class Row:
         held = next((row._held for row in (self, like) if row is not None and row._holds(self)), None)
         self._held = held = held or self._divided(samples)
         self.plain_phi, self.psi, size = held.phi, held.psi, held.size
-        fixed_phi = self.fixed_theta @ self._phi(samples) if self.fixed_theta.any() else 0.0
-        fixed_psi = self.fixed_d @ self._psi(samples) if self.fixed_d.any() else np.zeros(len(samples))
+        fixed_phi = self.fixed_theta @ self.columns.phi(samples.z, samples.s) if self.fixed_theta.any() else 0.0
+        fixed_psi = np.zeros(len(samples))
+        if self.fixed_d.any():
+            fixed_psi = self.fixed_d @ self.columns.psi(samples.z, samples.dt, samples.s)
         self.y = (samples.rate - fixed_phi) / (size * self.scale)
         self.half = fixed_psi / (size * self.scale)
         self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
@@ -359,10 +354,10 @@ class Row:
 
     def _divided(self, samples: Samples) -> _Held:
         """Each sample divided by its own size, so that one near rest weighs as any other."""
-        psi = self._psi(samples)
+        psi = self.columns.psi(samples.z, samples.dt, samples.s)
         size = self.size_unit @ psi
         size[size == 0.0] = 1.0
-        phi = ((self.phi_columns.take(self._phi(samples)) * self.unit_phi[:, None]) / size).T
+        phi = ((self.phi_columns.take(self.columns.phi(samples.z, samples.s)) * self.unit_phi[:, None]) / size).T
         psi = ((self.psi_columns.take(psi) * self.unit_psi[:, None]) / size).T
         return _Held(samples.z, samples.dt, samples.s, phi, psi, size)
 
@@ -371,7 +366,7 @@ class Row:
         outside = self.slack() < 0.0
         outside[self.pool] = False
         self.pool = np.concatenate([self.pool, np.flatnonzero(outside)])
-        self.hold(self.samples[np.sort(self.pool)], self._columns)
+        self.hold(self.samples[np.sort(self.pool)])
 
     def along(self, pool: Index) -> Array:
         """Regressors of the nominal unknowns of some samples, in the row's coordinates, (K, r)."""
@@ -434,12 +429,8 @@ class Row:
         most = most or max(JOIN, 2 * (self.r + self.q))
         if len(outside) > most:
             outside = outside[np.argpartition(slack[outside], most)[:most]]
-        self.join(outside)
+        self.pool = np.concatenate([self.pool, outside])
         return len(outside) > 0
-
-    def join(self, positions: Index) -> None:
-        """Let these held samples join the working set."""
-        self.pool = np.concatenate([self.pool, positions])
 
     def containment(self, pool: Index) -> tuple[Array, Array]:
         """Containment (8)(9) of some samples as G ξ >= h.
@@ -517,13 +508,8 @@ class Row:
         self.theta, self.d, self.limit = theta, d, limit
 
     def lifted_loss(self) -> float:
-        """Estimate what lifting the half-widths over the violation that is left adds to the optimum."""
+        """Estimate what lifting the half-widths over the violation that is left adds to the optimum of (10)."""
         _, d = self.scaled()
         outside = self.outside()
-        if outside <= 0.0:
-            return 0.0
-        if self.limit is None:
-            slope = float((self.gram @ d + self.linear).sum())
-            return outside * slope / max(self.value(d), self.least_value())
-        least = LEAST * self.rms_step / self.limit_unit * float(self.samples.root_weight.max(initial=0.0))
-        return outside * float(self.width.max(initial=0.0)) / max(self.limit, least, 1e-300)
+        slope = float((self.gram @ d + self.linear).sum())
+        return outside * slope / max(self.value(d), self.least_value()) if outside > 0.0 else 0.0

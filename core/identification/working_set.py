@@ -99,7 +99,7 @@ class WorkingSet:
             bounds = narrowed(bounds, shared)
         self.half_limits = bounds[2:]  # least and largest half-widths that the structure allows, (q, n) each
         self.rows = [
-            Row(i, self.sums, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
+            Row(i, self.sums, columns, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
             for i in range(fleet.n)
         ]
         self.programmes = [Programmes(row) for row in self.rows]
@@ -507,7 +507,7 @@ class WorkingSet:
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
     def _hold(self, row: Row, samples: Samples) -> None:
-        row.hold(samples, self.fleet.columns, self._like)
+        row.hold(samples, self._like)
         self._like = row
 
     def _sizes(self) -> str:

@@ -22,7 +22,7 @@ step by the recorded scheduling vector, and the elements of the horizon by that 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -90,7 +90,7 @@ class Run(Elements):
         return cls(**blocks_of(parts, "run.blocks", n, m, blocks, _OF_RUN, _OF_RUN))
 
 
-def unbroken_over(k: NDArray[np.intp], vectors: Array, schedule: Schedule | None) -> NDArray[np.int64]:
+def unbroken_over(k: NDArray[np.intp], vectors: Iterable[Array], schedule: Schedule | None) -> NDArray[np.int64]:
     """Of each transition the first of those that follow one another without a break, in the same modes, up to it.
 
     `k` (N,): sample that each begins with; recordings one after the other leave one out in between; `vectors` (axes,
