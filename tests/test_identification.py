@@ -516,17 +516,18 @@ def test_the_dual_bound_is_below_every_feasible_value_and_meets_the_optimum(seed
     M, G = rng.standard_normal((6, 6)), rng.standard_normal((40, 6))
     H, f, h = M @ M.T + 1e-3 * np.eye(6), rng.standard_normal(6), G @ rng.uniform(0, 1, 6) - rng.uniform(0, 1, 40)
     lower, upper = np.full(6, -5.0), np.full(6, 5.0)
-    answer = solvers.solve_qp(H, f, G, h, lower, upper)
+    programme = solvers.Programme(H, f, G, h, lower, upper)
+    answer = solvers.solve_qp(programme)
 
     def value(xi):
         return 0.5 * xi @ H @ xi + f @ xi
 
     best = value(answer.xi)
-    assert solvers.dual_bound(H, f, G, h, lower, upper, answer.xi) == pytest.approx(best, rel=1e-9, abs=1e-9)
+    assert solvers.dual_bound(programme, answer.xi) == pytest.approx(best, rel=1e-9, abs=1e-9)
     for _ in range(20):  # a bound wherever it is taken
         anywhere = answer.xi + 0.1 * rng.standard_normal(6)
-        assert solvers.dual_bound(H, f, G, h, lower, upper, anywhere) <= best + 1e-9
-    again = solvers.solve_qp(H, f, G, h, lower, upper, answer.active)
+        assert solvers.dual_bound(programme, anywhere) <= best + 1e-9
+    again = solvers.solve_qp(programme, answer.active)
     np.testing.assert_allclose(again.xi, answer.xi, atol=1e-10)
 
 
@@ -786,11 +787,12 @@ def test_near_rows_alone_lead_to_the_minimiser_of_all():
     root, G = rng.normal(size=(6, 6)), rng.normal(size=(400, 6))
     H, f = root @ root.T + np.eye(6), rng.normal(size=6)
     h, lower, upper = G @ rng.normal(size=6) - rng.uniform(0, 1, 400), np.full(6, -np.inf), np.full(6, np.inf)
-    whole = solvers.solve_qp(H, f, G, h, lower, upper)
+    programme = solvers.Programme(H, f, G, h, lower, upper)
+    whole = solvers.solve_qp(programme)
     for xi in (np.zeros(6), whole.xi, 100 * rng.normal(size=6)):
-        near = solvers.solve_near(H, f, G, h, lower, upper, xi)
+        near = solvers.solve_near(programme, xi)
         np.testing.assert_allclose(near.xi, whole.xi, rtol=0, atol=1e-9)
-        again = solvers.solve_near(H, f, G, h, lower, upper, near.xi, near.active)
+        again = solvers.solve_near(programme, near.xi, near.active)
         np.testing.assert_allclose(again.xi, whole.xi, rtol=0, atol=1e-9)
 
 

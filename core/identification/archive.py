@@ -36,7 +36,16 @@ from uncertain_lti.model.repeats import Found, repeats_in
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.sampling.reading import Times, load_signals, read_stream, resolved_by, sample, times_of, types_of
+from uncertain_lti.sampling.reading import (
+    Stream,
+    Times,
+    load_signals,
+    read_stream,
+    resolved_by,
+    sample,
+    times_of,
+    types_of,
+)
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.values import Additive
@@ -219,15 +228,17 @@ def fit_archive(
     return with_repeats(model.replace(fit_summary=facts), visit("repeats in", repeats, model))
 
 
+def _stream(recording: Recording, signals: SignalMap) -> Stream:
+    return read_stream(open_recording(*recording, indexed=True, layout=signals.table), signals)
+
+
 def _sampled(recording: Recording, signals: SignalMap) -> Transient:
-    bag = open_recording(recording[0], recording[1], indexed=True, layout=signals.table)
-    return sample(read_stream(bag, signals), signals)[0]
+    return sample(_stream(recording, signals), signals)[0]
 
 
 def survey(recording: Recording, signals: SignalMap) -> Times:
     """First look at one recording."""
-    bag = open_recording(recording[0], recording[1], indexed=True, layout=signals.table)
-    return times_of(read_stream(bag, signals), signals)
+    return times_of(_stream(recording, signals), signals)
 
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:

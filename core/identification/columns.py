@@ -15,7 +15,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, ModelError
@@ -52,14 +51,6 @@ class Regimes:
         p = len(z)
         rows = [z[j] if j < p or s is None else s[j - p] for j in self.positions]
         return np.stack(rows)
-
-    def main_block(self, z: Array, s: Array | None) -> NDArray[np.intp]:
-        """The block of the largest weight.
-
-        `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (K,): numbers of
-        blocks.
-        """
-        return self.schedule.main_block(self.vectors(z, s))
 
 
 @dataclass(frozen=True)

@@ -101,13 +101,12 @@ def check_solvable(fleet: Fleet, where: Callable[[int], str], names: Sequence[st
 def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
     names = [*names, "the disturbance c"] if problem.columns.drift else list(names)
-    messages = []
     dead = sums.phi_scale == 0
-    for j in np.flatnonzero(dead):
-        messages.append(
-            f"rank deficient: '{names[j]}' is 0 in every transition, so its column is not identifiable and is set "
-            f"to 0; record it moving, or leave it out"
-        )
+    messages = [
+        f"rank deficient: '{names[j]}' is 0 in every transition, so its column is not identifiable and is set "
+        f"to 0; record it moving, or leave it out"
+        for j in np.flatnonzero(dead)
+    ]
     free = np.flatnonzero(~dead)
     values, vectors = _directions(sums, free)
     limit = 1e-12 * len(free)
@@ -118,12 +117,11 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
                 f"rank deficient: {_quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
-    moved = sums.high - sums.low
-    for j in np.flatnonzero((moved == 0) & ~dead[: problem.p]):
-        messages.append(
-            f"'{names[j]}' is constant ({problem.z[0, j]:.4g}) in every transition, so its column cannot be told from "
-            f"the disturbance c; record it moving, or leave it out"
-        )
+    messages += [
+        f"'{names[j]}' is constant ({problem.z[0, j]:.4g}) in every transition, so its column cannot be told from "
+        f"the disturbance c; record it moving, or leave it out"
+        for j in np.flatnonzero((sums.high == sums.low) & ~dead[: problem.p])
+    ]
     return int(np.count_nonzero(values > limit)), messages
 
 
@@ -526,11 +524,10 @@ def _slow(model: UncertainLTI) -> list[str]:
     turn = abs(fastest) * dt
     if turn <= FAST:
         return []
-    mode = f"{fastest.real:.3g}{fastest.imag:+.3g}j" if fastest.imag else f"{fastest.real:.3g}"
     return [
-        f"sampling is slow for the fastest mode ({mode} 1/s, {turn:.2g} in a step of {dt:.3g} s), unless noise of the "
-        f"readings makes it look fast: the bounds hold, but A is the matrix of this step length, so read no time "
-        f"constants from it; if the machine is that fast, sample {np.ceil(turn / 0.2):.0f} times as fast"
+        f"sampling is slow for the fastest mode ({_complex(fastest)} 1/s, {turn:.2g} in a step of {dt:.3g} s), unless "
+        f"noise of the readings makes it look fast: the bounds hold, but A is the matrix of this step length, so read "
+        f"no time constants from it; if the machine is that fast, sample {np.ceil(turn / 0.2):.0f} times as fast"
     ]
 
 
@@ -541,8 +538,7 @@ def _unstable(model: UncertainLTI) -> list[str]:
         at = f" at {model.block_name(r)}" if model.schedule is not None else ""
         unstable = [v for v in block.eigenvalues() if v.real > 0]
         if unstable:
-            values = ", ".join(f"{v.real:.3g}{v.imag:+.3g}j" if v.imag else f"{v.real:.3g}" for v in unstable)
-            found.append(f"eigenvalues {values} 1/s{at}")
+            found.append(f"eigenvalues {', '.join(map(_complex, unstable))} 1/s{at}")
         elif block.spectral_radius() > 1.0 + 1e-9:
             found.append(f"spectral radius {block.spectral_radius():.4g} at the recorded step{at}")
     if not found:
@@ -552,6 +548,10 @@ def _unstable(model: UncertainLTI) -> list[str]:
         f"the nominal model is unstable ({listed}): one-step bounds restart from the measured state and stay valid, "
         f"a free run does not"
     ]
+
+
+def _complex(value: complex) -> str:
+    return f"{value.real:.3g}{value.imag:+.3g}j" if value.imag else f"{value.real:.3g}"
 
 
 def _wide(sums: Moments, mean_width: Array, names: Sequence[str]) -> list[str]:

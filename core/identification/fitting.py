@@ -35,7 +35,7 @@ from uncertain_lti.identification.memory import Recording, remembered
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.regimes import Knots, asked_by, block_data, scheduled_by, signals_of
+from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
@@ -44,7 +44,7 @@ from uncertain_lti.model.domain import Domain, Sampling, largest_steps
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.repeats import Found, repeats_in, together
-from uncertain_lti.model.schedule import Schedule
+from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.field_path import FieldPath
@@ -240,9 +240,11 @@ def fit_fleet(
     domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
 
     regimes = fleet.columns.regimes
-    scheduled: dict[str, Any] = (
-        {} if regimes is None else {"schedule": regimes.schedule, "block_data": block_data(sums, engine.tied)}
-    )
+    scheduled: dict[str, Any] = {}
+    if regimes is not None:
+        each = enumerate(zip(sums.visits.tolist(), engine.tied, strict=True))
+        data = [BlockData(count, None if block == r else block) for r, (count, block) in each]
+        scheduled = {"schedule": regimes.schedule, "block_data": data}
 
     def build(theta: Array, d: Array) -> UncertainLTI:
         return UncertainLTI(

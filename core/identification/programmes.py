@@ -21,6 +21,7 @@ from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
 from uncertain_lti.identification.solvers import (
     FEASIBLE,
     Answer,
+    Programme,
     Sense,
     Simplex,
     dual_bound,
@@ -96,13 +97,6 @@ class Programmes:
         """Those of a copy of the row, which can be solved on its own."""
         return Programmes(self.row.trial(), self)
 
-    def allow(self) -> None:
-        """Let the ties of (11) be broken a little above the δ that was found."""
-        row = self.row
-        assert row.limit is not None
-        self.allowed = row.limit * (1.0 + WIDTH_SLACK)
-        row.limit = self.allowed
-
     def _solve(
         self,
         kind: str,
@@ -131,17 +125,17 @@ class Programmes:
         begin = np.zeros(len(lower)) if last is None else last.xi
         if last is None and row.basis is None:
             begin[: row.r] = row.scaled()[0]
-        G, h = self._with_asked(G, h)
+        limits = *self._with_asked(G, h), lower, upper
         for self.attempt in _ATTEMPTS:
             try:
-                answer = solve_near(*objective(*self.attempt), G, h, lower, upper, begin, start, feasible)
+                answer = solve_near(Programme(*objective(*self.attempt), *limits), begin, start, feasible)
                 break
             except FitError:
                 continue
         else:
             if not any_solver:
                 raise FitError("DAQP could not solve the quadratic programme")
-            answer = solve_qp(*objective(*self.attempt), G, h, lower, upper, feasible=feasible)
+            answer = solve_qp(Programme(*objective(*self.attempt), *limits), feasible=feasible)
         self._last[kind] = answer
         return answer.xi, answer.solver
 
@@ -306,11 +300,11 @@ class Programmes:
             theta = np.linalg.lstsq(row.basis, theta, rcond=None)[0].astype(np.float64)
         H, f = row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        G, h = self._with_asked(*row.containment(row.pool))
+        programme = Programme(H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper)
         objective, value = float(0.5 * xi @ H @ xi + f @ xi), max(row.value(d), row.least_value())
         above = np.inf
-        for active in self._active_sets("quadratic", len(f) + len(h)):
-            above = min(above, objective - dual_bound(H, f, G, h, row.lower, row.upper, xi, active))
+        for active in self._active_sets("quadratic", len(f) + len(programme.h)):
+            above = min(above, objective - dual_bound(programme, xi, active))
             if above <= GOOD * value:
                 break
         weight = factor * TIE_BREAK * float(np.diagonal(row.gram).min(initial=1.0))
@@ -356,7 +350,7 @@ class Programmes:
         G, h = self._with_asked(*row.containment(row.pool))
         if -row.linear.min() >= row.linear.max():
             H, f = row.hessian(row.gram, row.linear, TIE_BREAK)
-            answer = solve_qp(H, f / steep, G, h / steep, row.lower / steep, row.upper / steep)
+            answer = solve_qp(Programme(H, f / steep, G, h / steep, row.lower / steep, row.upper / steep))
             row.store(answer.xi * steep)
             return answer.solver
         simplex = Simplex(np.concatenate([np.zeros(row.r), row.linear / steep]), row.lower, row.upper)
@@ -435,12 +429,10 @@ class Programmes:
         for room in _ROOM:
             h[:contained] -= room
             for share in _HOLD:
-                hold = share * largest
                 try:
-                    held = H + hold * np.eye(len(step)), f - hold * step
-                    low, high = row.lower - point, row.upper - point
+                    programme = Programme(H, f, G, h, row.lower - point, row.upper - point).held(share * largest, step)
                     feasible = _ROOM[-1] if row.refined else FEASIBLE
-                    answer = solve_near(*held, G, h, low, high, step, active, feasible, any_solver=True)
+                    answer = solve_near(programme, step, active, feasible, any_solver=True)
                 except FitError:
                     break
                 left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
@@ -466,15 +458,14 @@ class Programmes:
         half = psi @ (row.d[row.free_psi] / (row.unit_psi * row.scale)) + row.half[row.pool]
         y = row.y[row.pool]
         try:
-            answer = solve_qp(
+            programme = Programme(
                 row.centre + self.attempt[1] * np.eye(row.r),
                 -row.target,
                 *self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
                 row.lower[: row.r],
                 row.upper[: row.r],
-                any_solver=False,
-                feasible=FEASIBLE if row.refined else ROUGH,
             )
+            answer = solve_qp(programme, any_solver=False, feasible=FEASIBLE if row.refined else ROUGH)
         except FitError:  # the half-widths leave no room at all
             return
         row.store_theta(answer.xi)

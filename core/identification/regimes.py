@@ -24,7 +24,7 @@ from uncertain_lti.base.text import meant, plural
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.model.schedule import MOST_AXES, Axis, BlockData, Schedule
+from uncertain_lti.model.schedule import MOST_AXES, Axis, Schedule
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 LOOKED_AT = 20_000
@@ -110,14 +110,6 @@ def _rank(gram: Array) -> int:
     unit = 1.0 / scale[there]
     values = np.linalg.eigvalsh(gram[np.ix_(there, there)] * np.outer(unit, unit))
     return int(np.count_nonzero(values > RANK * len(there)))
-
-
-def block_data(sums: Moments, tied: Sequence[int]) -> tuple[BlockData, ...]:
-    """Facts on each block, for the model file."""
-    return tuple(
-        BlockData(int(count), None if block == r else block)
-        for r, (count, block) in enumerate(zip(sums.visits, tied, strict=True))
-    )
 
 
 def asked_by(signals: SignalMap) -> dict[str, Knots]:
@@ -272,7 +264,8 @@ def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tupl
     phi = columns.phi(problem.z_columns, problem.s_columns) * problem.dt
     step = problem.next_columns - problem.z_columns[: problem.n]
     gram = phi @ phi.T
-    visits = each * np.bincount(regimes.main_block(problem.z_columns, problem.s_columns), minlength=len(knots))
+    main = regimes.schedule.main_block(values_of(problem, row)[None])
+    visits = each * np.bincount(main, minlength=len(knots))
     lacks = [bool(reason) for reason in lacking(gram, visits, columns, problem.p)]
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
     ridge = 1e-12 * np.eye(len(gram))

@@ -336,9 +336,7 @@ class Row:
             fixed_psi = self.fixed_d @ self.columns.psi(samples.z, samples.dt, samples.s)
         self.y = (samples.rate - fixed_phi) / (size * self.scale)
         self.half = fixed_psi / (size * self.scale)
-        self.width = 2.0 * samples.root_weight * samples.dt * size  # √w x width = width x (ψ d + half)
-        if self.refined:
-            self.width = self.width / self.width_unit
+        self.width = 2.0 * samples.root_weight * samples.dt * size / self.width_unit  # x (ψ d + half) is √w x width
 
     def _holds(self, other: Row) -> bool:
         """Whether this row has divided the samples of another as that one would."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,32 +47,37 @@ class Answer:
     active: Sense | None
 
 
-def solve_qp(
-    H: Array,
-    f: Array,
-    G: Array,
-    h: Array,
-    lower: Array,
-    upper: Array,
-    active: Sense | None = None,
-    any_solver: bool = True,
-    feasible: float = FEASIBLE,
-) -> Answer:
-    """Minimise ½ ξᵀHξ + fᵀξ subject to G ξ >= h, lower <= ξ <= upper.
-
-    H must be positive definite, everything scaled to order one. DAQP (dual active set, exact to rounding) first;
-    PIQP if it gives up or returns what violates a row by more than `FEASIBLE`. DAQP's tolerance is one on rows in the
-    metric of H, coarse where H hardly weighs an unknown: what it leaves is mended with the step held back.
+class Programme(NamedTuple):
+    """Minimise ½ ξᵀHξ + fᵀξ subject to G ξ >= h, lower <= ξ <= upper; everything scaled to order one.
 
     `H` (v, v): positive definite; `f` (v,): linear term; `G` (K, v): rows of the constraints; `h` (K,): their lower
     limits; `lower` (v,): bounds of ξ; -inf for none; `upper` (v,): bounds of ξ; inf for none.
     """
-    answer, violation = _solved(H, f, G, h, lower, upper, active, any_solver, feasible)
-    hold = _HOLD * float(np.diagonal(H).max(initial=0.0))
+
+    H: Array
+    f: Array
+    G: Array
+    h: Array
+    lower: Array
+    upper: Array
+
+    def held(self, hold: float, xi: Array) -> Programme:
+        """The same with half of `hold` times the square of the distance from ξ (v,) more."""
+        return self._replace(H=self.H + hold * np.eye(len(xi)), f=self.f - hold * xi)
+
+
+def solve_qp(of: Programme, active: Sense | None = None, any_solver: bool = True, feasible: float = FEASIBLE) -> Answer:
+    """Minimise a programme.
+
+    DAQP (dual active set, exact to rounding) first; PIQP if it gives up or returns what violates a row by more than
+    `FEASIBLE`. DAQP's tolerance is one on rows in the metric of H, coarse where H hardly weighs an unknown: what it
+    leaves is mended with the step held back.
+    """
+    answer, violation = _solved(of, active, any_solver, feasible)
+    hold = _HOLD * float(np.diagonal(of.H).max(initial=0.0))
     while violation > _SLIGHT and answer.active is not None:
-        held = H + hold * np.eye(len(f)), f - hold * answer.xi
         try:
-            nearer, left = _solved(*held, G, h, lower, upper, answer.active, False, feasible)
+            nearer, left = _solved(of.held(hold, answer.xi), answer.active, False, feasible)
         except FitError:
             break
         if left > 0.1 * violation:
@@ -81,31 +86,20 @@ def solve_qp(
     return answer
 
 
-def _solved(
-    H: Array,
-    f: Array,
-    G: Array,
-    h: Array,
-    lower: Array,
-    upper: Array,
-    active: Sense | None,
-    any_solver: bool,
-    feasible: float,
-) -> tuple[Answer, float]:
+def _solved(of: Programme, active: Sense | None, any_solver: bool, feasible: float) -> tuple[Answer, float]:
     """The answer of the first solver that has a good one, and by how much it violates a row."""
     # a diagonal scaling makes a badly scaled Hessian harmless to every solver
-    s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))
-    rows, limits = G, h
-    H, f, G, lower, upper = H * np.outer(s, s), f * s, G * s, lower / s, upper / s
+    s = 1.0 / np.sqrt(np.maximum(np.diagonal(of.H), 1e-300))
+    G, lower, upper = of.G * s, of.lower / s, of.upper / s
     norm = np.maximum(np.abs(G).max(axis=1, initial=0.0), 1e-300)
-    G, h = G / norm[:, None], h / norm
+    scaled = Programme(of.H * np.outer(s, s), of.f * s, G / norm[:, None], of.h / norm, lower, upper)
     best: tuple[float, Answer] | None = None
     for name, solver in _SOLVERS if any_solver else _SOLVERS[:1]:
-        answer, found = solver(H, f, G, h, lower, upper, active)
+        answer, found = solver(scaled, active)
         if answer is None or not np.isfinite(answer).all():
             continue
         answer = np.clip(answer, lower, upper) * s
-        violation = float(np.max(limits - rows @ answer, initial=0.0))  # not that of what was scaled for the solver
+        violation = float(np.max(of.h - of.G @ answer, initial=0.0))  # not that of what was scaled for the solver
         if best is None or violation < best[0]:
             best = (violation, Answer(answer, name, found))
         if violation <= FEASIBLE:
@@ -117,22 +111,14 @@ def _solved(
 
 
 def solve_near(
-    H: Array,
-    f: Array,
-    G: Array,
-    h: Array,
-    lower: Array,
-    upper: Array,
-    xi: Array,
-    active: Sense | None = None,
-    feasible: float = FEASIBLE,
-    any_solver: bool = False,
+    of: Programme, xi: Array, active: Sense | None = None, feasible: float = FEASIBLE, any_solver: bool = False
 ) -> Answer:
     """As `solve_qp`, with the rows that are near at ξ alone, and then those that the answer violates.
 
     A strictly convex programme has one minimiser, so it does not matter which other rows were left out.
     """
-    slack, size = G @ xi - h, len(f)
+    (G, h), size = of[2:4], len(of.f)
+    slack = G @ xi - h
     wanted = slack < -_SLIGHT
     if active is not None:
         wanted |= active[size:] > 0
@@ -140,7 +126,7 @@ def solve_near(
     wanted[np.argpartition(slack, near)[:near] if len(slack) > near else slice(None)] = True
     while True:
         start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
-        answer = solve_qp(H, f, G[wanted], h[wanted], lower, upper, start, any_solver, feasible)
+        answer = solve_qp(of._replace(G=G[wanted], h=h[wanted]), start, any_solver, feasible)
         if answer.active is None:
             active = None
         else:
@@ -156,17 +142,17 @@ def solve_near(
 _Found = tuple[Array | None, Sense | None]
 
 
-def _daqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, active: Sense | None) -> _Found:
+def _daqp(of: Programme, active: Sense | None) -> _Found:
     import daqp
 
-    size = len(f)
-    bupper = np.concatenate([np.minimum(upper, 1e30), np.full(len(h), 1e30)])
-    blower = np.concatenate([np.maximum(lower, -1e30), h])
-    H, G = np.ascontiguousarray(H), np.ascontiguousarray(G)
-    cold = np.zeros(size + len(h), dtype=np.int32)
+    size, count = len(of.f), len(of.h)
+    bupper = np.concatenate([np.minimum(of.upper, 1e30), np.full(count, 1e30)])
+    blower = np.concatenate([np.maximum(of.lower, -1e30), of.h])
+    H, G = np.ascontiguousarray(of.H), np.ascontiguousarray(of.G)
+    cold = np.zeros(size + count, dtype=np.int32)
     for sense in (cold,) if active is None else (active.copy(), cold):
         x, _, flag, info = daqp.solve(
-            H, f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000, cycle_tol=100
+            H, of.f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000, cycle_tol=100
         )
         if flag == 1:
             multiplier = np.asarray(info["lam"])
@@ -175,14 +161,14 @@ def _daqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, ac
     return None, None
 
 
-def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _: Sense | None) -> _Found:
+def _piqp(of: Programme, _: Sense | None) -> _Found:
     import piqp
 
     solver = piqp.DenseSolver()
     solver.settings.eps_abs = 1e-12
     solver.settings.eps_rel = 1e-12
     solver.settings.max_iter = 500
-    solver.setup(H, f, None, None, G, h, np.full(len(h), np.inf), lower, upper)
+    solver.setup(of.H, of.f, None, None, of.G, of.h, np.full(len(of.h), np.inf), of.lower, of.upper)
     status = solver.solve()
     done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
     return (np.array(solver.result.x, dtype=np.float64) if status in done else None), None
@@ -191,9 +177,7 @@ def _piqp(H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, _:
 _SOLVERS = (("DAQP", _daqp), ("PIQP", _piqp))
 
 
-def dual_bound(
-    H: Array, f: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None = None
-) -> float:
+def dual_bound(of: Programme, xi: Array, active: Sense | None = None) -> float:
     """A lower bound of the optimum of `solve_qp`, whoever found ξ: the dual objective at multipliers made for ξ.
 
     Any non-negative multipliers λ give a bound, -½ |L⁻¹(Cᵀλ - f)|² + lᵀλ with H = L Lᵀ and C ξ >= l what is active at
@@ -201,20 +185,18 @@ def dual_bound(
     least squares, in the units of the gradient and in those of L, of which either can be the better. -inf where
     there are none.
 
-    `H` (v, v): as in `solve_qp`; `f` (v,): as in `solve_qp`; `G` (K, v): as in `solve_qp`; `h` (K,): as in `solve_qp`;
-    `lower` (v,): as in `solve_qp`; `upper` (v,): as in `solve_qp`; `xi` (v,): ξ, near the optimum; `active`: as of
-    `Answer`; without it what has next to no slack.
+    `xi` (v,): ξ, near the optimum; `active`: as of `Answer`; without it what has next to no slack.
     """
     from scipy.linalg import solve_triangular
     from scipy.optimize import nnls
 
-    s = 1.0 / np.sqrt(np.maximum(np.diagonal(H), 1e-300))  # as in `solve_qp`
-    C, limits = _binding(G, h, lower, upper, xi, active)
+    s = 1.0 / np.sqrt(np.maximum(np.diagonal(of.H), 1e-300))  # as in `solve_qp`
+    C, limits = _binding(*of[2:], xi, active)
     best = -np.inf
     try:
-        L = np.linalg.cholesky(H * np.outer(s, s))
-        whitened, linear = (solve_triangular(L, (v.T * s).T, lower=True) for v in (C, f))
-        attempts = ((C, f + H @ xi), (whitened, linear + L.T @ (xi / s)))
+        L = np.linalg.cholesky(of.H * np.outer(s, s))
+        whitened, linear = (solve_triangular(L, (v.T * s).T, lower=True) for v in (C, of.f))
+        attempts = ((C, of.f + of.H @ xi), (whitened, linear + L.T @ (xi / s)))
     except np.linalg.LinAlgError:  # not definite, to rounding
         return best
     for columns, gradient in attempts:

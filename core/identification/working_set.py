@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from time import perf_counter
 
 import numpy as np
@@ -104,12 +105,11 @@ class WorkingSet:
         ]
         self.programmes = [Programmes(row) for row in self.rows]
         self.solvers: set[str] = set()
-        self.rounds, self.passes = 0, 1
+        self.passes = 1
         self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
         self._together = False  # (10) with full weights: the rows meet in the objective
-        self._least_eigenvalue: float | None = None  # of full weights, once it is needed
         self._like: Row | None = None  # the row that held samples last
 
     def solve(self, criterion: str) -> Solution:
@@ -241,6 +241,11 @@ class WorkingSet:
                 return np.inf
         return float(max(above, 0.0) / value)
 
+    @cached_property
+    def _least_eigenvalue(self) -> float:
+        """Of any full weight."""
+        return max(self.fleet.least_eigenvalue(), 1e-300)
+
     def _at_most(self, row: Row, diagonal: Array) -> Array:
         """Largest scaled half-widths that the optimum of (10) with full weights can have, (q,) of the free ones.
 
@@ -250,8 +255,6 @@ class WorkingSet:
 
         `diagonal` (q,): of Σ (Δt ψ)(Δt ψ)ᵀ w_ii.
         """
-        if self._least_eigenvalue is None:
-            self._least_eigenvalue = max(self.fleet.least_eigenvalue(), 1e-300)
         coupled = self.sums.coupled
         assert coupled is not None
         flat = np.concatenate([other.d + other.outside() * other.size_unit * other.scale for other in self.rows])
@@ -276,7 +279,7 @@ class WorkingSet:
             if row.limit is None:  # nothing unknown: the structure fixes the widths
                 row.limit = float((row.width * row.half).max(initial=0.0))
             deltas[row.i] = row.limit * row.limit_unit
-            own.allow()
+            own.allowed = row.limit = row.limit * (1.0 + WIDTH_SLACK)  # room for the ties
             if own.exact:
                 self._settle(own, Programmes.bounded, polish=True)
 
@@ -354,7 +357,7 @@ class WorkingSet:
             np.column_stack([row.d for row in self.rows]),
             np.array([row.outside() * row.scale if row.kept is None else row.kept for row in self.rows]),
             delta,
-            self.rounds + int(self._row_rounds.sum()),
+            int(self._row_rounds.sum()),
             self.passes,
             [len(row.pool) for row in self.rows],
             self.solvers,
