@@ -20,9 +20,10 @@ import pytest
 from uncertain_lti import Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
+from uncertain_lti.kernel.arithmetic import Window
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon, Residuals
-from uncertain_lti.monitor.alarm import Alarm, AlarmWindow, Arming, Condition, Nearest, back_and_restarts, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Arming, Condition, Nearest, back_and_restarts, steps_back
 
 ZEROS = np.zeros((2, 2))
 RULES = (
@@ -240,14 +241,14 @@ def test_time_has_stepped_back_where_an_instant_is_not_after_the_one_before_the_
 
 
 def test_two_of_three_verdicts_of_a_horizon_and_no_verdict_changes_nothing() -> None:
-    window = AlarmWindow(AlarmRule(2, 3, margin=1.5, horizon=4), np.array([True, True]), 1)
+    window = Window(2, 3, 1.5, (0, 1), 2)
     inside, beyond, none = ([9.0, 9.0, -1.5, 1.5], [0.0, 0.0, 0.0, -1.6], [9.0, 9.0, np.nan, np.nan])
     rows = np.array([inside, beyond, none, beyond, none, inside, inside, [0.0, 0.0, 1.6, np.nan], none])
-    alarms = [window.push(0.1, True, row) for row in rows]
+    alarms = [window.push(True, row) for row in rows]
     assert alarms == [False, False, False, True, True, True, False, False, False]
-    again, dt, every = np.empty(len(rows), dtype=bool), np.full(len(rows), 0.1), np.ones(len(rows), dtype=bool)
+    again, every = np.empty(len(rows), dtype=bool), np.ones(len(rows), dtype=bool)
     window.reset()
-    window.push_all(dt, every, [rows[:, :2], rows[:, 2:]], every, again, np.empty((len(rows), 0)))
+    window.push_all(every, rows[:, 2:], every, again)
     assert again.tolist() == alarms
 
 

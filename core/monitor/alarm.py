@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import operator
 import re
-from array import array
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -28,7 +27,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.cores import WORTH_THREADS, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
-from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, StatisticRule, labels
+from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.field_path import FieldPath
 
@@ -73,92 +72,6 @@ class Nearest(NamedTuple):
     threshold: float
 
 
-class AlarmWindow:
-    """Containment: the last verdicts and the alarm that they raise, one verdict after another.
-
-    `rule`: m, n; for a horizon of several steps its margin, too; `counted` (n,): states that count; `row`: of the table
-    that it looks at, 0 for none; `alarm`: `violations` of the last `window` verdicts are violations.
-    """
-
-    __slots__ = ("_row", "_window", "rule")
-
-    def __init__(self, rule: AlarmRule, counted: NDArray[np.bool_], row: int = 0) -> None:
-        self.rule: Rule = rule
-        self._row, states = row, np.flatnonzero(counted).tolist() if row else ()
-        self._window = Window(rule.violations, rule.window, rule.margin, states, row * len(counted))
-
-    @property
-    def alarm(self) -> bool:
-        """Whether enough of the last verdicts are violations."""
-        return bool(self._window.alarm)
-
-    def reset(self) -> None:
-        """Forget every verdict and the alarm."""
-        self._window.reset()
-
-    def push(self, dt: float, violated: bool, table: Any) -> bool:
-        """Take one verdict."""
-        return self._window.push(violated, table)
-
-    def push_all(
-        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Any], judged: NDArray[np.bool_],
-        after: NDArray[np.bool_], values: Array,
-    ) -> None:  # fmt: skip
-        """As `Alarm.over`, from a cleared alarm; `after` (K,) takes the alarm after each, `values` (K, 0) nothing."""
-        self._window.push_all(violated, rows[self._row], judged, after)
-
-    def values(self) -> Any:
-        """None: it has no statistic."""
-        return array("d")
-
-
-class AlarmOverThreshold:
-    """A statistic over a window, and whether it is over its threshold.
-
-    `rule`: the statistic; `model`: gives mean and covariance of joint statistics; `counted` (n,): states that count;
-    `rule`: as given; `statistic`: its arithmetic; `begin`: where its numbers begin in the table of `Alarm.push`.
-    """
-
-    def __init__(self, rule: StatisticRule, model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
-        self.rule: Rule = rule
-        self._row = row_of(rule, model)
-        self.begin = self._row * model.n
-        residuals = model.residuals_at(rule.horizon) if rule.kind in JOINT else None
-        self.statistic = Statistic(
-            KINDS.index(rule.kind),
-            model.n,
-            rule.window_s,
-            rule.thresholds(model.n),
-            counted.tolist(),
-            rule.allowance,
-            None if residuals is None else residuals.mean,
-            None if residuals is None else residuals.whitening(counted),
-        )
-
-    @property
-    def alarm(self) -> bool:
-        """Whether it is over its threshold for some state that counts."""
-        return bool(self.statistic.alarm)
-
-    def reset(self) -> None:
-        """Forget every verdict and the alarm."""
-        self.statistic.reset()
-
-    def push_all(
-        self, dt: Array, violated: NDArray[np.bool_], rows: Sequence[Any], judged: NDArray[np.bool_],
-        after: NDArray[np.bool_], values: Array,
-    ) -> None:  # fmt: skip
-        """As `Alarm.over`; `after` (K,) takes the alarm after each, `values` (K, n) takes `values` after each."""
-        self.statistic.push_all(dt, rows[self._row], judged, after, values)
-
-    def values(self) -> Any:
-        """The statistic over its threshold.
-
-        Returns (n,): naN before the first verdict.
-        """
-        return self.statistic.values()
-
-
 def row_of(rule: Rule, model: UncertainLTI) -> int:
     """Row of the table that a rule looks at."""
     place = 0 if rule.horizon == 1 else 1 + model.steps.index(rule.horizon)
@@ -175,7 +88,7 @@ class Alarm:
     """All rules of one alarm.
 
     `rules`: at least one; `model`: what they judge by; `counted` (n,): states that count; `rules`: as given; `labels`:
-    what each is called; `parts`: what each makes of the verdicts; `names`: of the statistics, `energy/fan_speed` for
+    what each is called; `names`: of the statistics, `energy/fan_speed` for
     example; empty if every rule is containment; `needs_table`: whether some rule looks at more than the one-step
     violation; `needs_residual`: whether some rule looks at residuals, which follow the utilisation in the table;
     `alarm`: whether some rule raises the alarm.
@@ -184,37 +97,49 @@ class Alarm:
     def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
         self.rules, self.labels, self.alarm = tuple(rules), labels(rules), False
         self._model, self._counted = model, counted
-        parts, names = list[AlarmWindow | AlarmOverThreshold](), list[str]()
+        self._rows = [row_of(rule, model) for rule in self.rules]
+        names = list[str]()
         self._begins: list[int] = []  # of each rule, where its numbers begin in `values`
         for rule, label in zip(self.rules, self.labels, strict=True):
             self._begins.append(len(names))
-            if isinstance(rule, AlarmRule):
-                parts.append(AlarmWindow(rule, counted, row_of(rule, model)))
-            else:
-                parts.append(AlarmOverThreshold(rule, model, counted))
+            if not isinstance(rule, AlarmRule):
                 names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind in JOINT else model.state_names)]
-        self.parts, self.names = tuple(parts), tuple(names)
+        self.names = tuple(names)
+        self._parts = [self._part(rule, row) for rule, row in zip(self.rules, self._rows, strict=True)]
         self.needs_table = any(rule.horizon > 1 or rule.kind != "containment" for rule in self.rules)
-        self.needs_residual = any(row_of(rule, model) >= residual_row(model) for rule in self.rules)
-        self._windows = [part for part in parts if isinstance(part, AlarmWindow)]
-        over = [part for part in parts if isinstance(part, AlarmOverThreshold)]
-        self._statistics = Statistics([part.statistic for part in over], [part.begin for part in over])
-        self._only = self._windows[0] if len(parts) == len(self._windows) == 1 else None
+        self.needs_residual = any(row >= residual_row(model) for row in self._rows)
+        self._windows = [part for part in self._parts if isinstance(part, Window)]
+        over = [(part, row) for part, row in zip(self._parts, self._rows, strict=True) if isinstance(part, Statistic)]
+        self._statistics = Statistics([part for part, _ in over], [row * model.n for _, row in over])
+        self._only = self._windows[0] if len(self._parts) == len(self._windows) == 1 else None
+
+    def _part(self, rule: Rule, row: int) -> Window | Statistic:
+        """What a rule makes of verdicts; a row of the table begins at its number times n."""
+        n = self._model.n
+        if isinstance(rule, AlarmRule):
+            states = np.flatnonzero(self._counted).tolist() if row else ()
+            return Window(rule.violations, rule.window, rule.margin, states, row * n)
+        law: tuple[Any, ...] = ()
+        if rule.kind in JOINT:
+            residuals = self._model.residuals_at(rule.horizon)
+            law = residuals.mean, residuals.whitening(self._counted)
+        counted, limits = self._counted.tolist(), rule.thresholds(n)
+        return Statistic(KINDS.index(rule.kind), n, rule.window_s, limits, counted, rule.allowance, *law)
 
     def reset(self) -> None:
         """Forget every verdict and the alarm."""
-        for part in self.parts:
+        for part in self._parts:
             part.reset()
         self.alarm = False
 
     def push(self, dt: float, violated: bool, table: Any = None) -> bool:
         """Take one verdict."""
         if self._only is not None:
-            self.alarm = self._only.push(dt, violated, table)
+            self.alarm = self._only.push(violated, table)
             return self.alarm
         alarm = bool(self.names) and bool(self._statistics.push(dt, table))
         for window in self._windows:
-            alarm = window.push(dt, violated, table) or alarm
+            alarm = window.push(violated, table) or alarm
         self.alarm = alarm
         return alarm
 
@@ -238,7 +163,7 @@ class Alarm:
 
     def raised(self) -> tuple[int, ...]:
         """Rules that raise the alarm."""
-        return tuple(i for i, part in enumerate(self.parts) if part.alarm) if self.alarm else ()
+        return tuple(i for i, part in enumerate(self._parts) if part.alarm) if self.alarm else ()
 
     def reasons(self, rules: Sequence[int], values: Sequence[float], sizes: Array, flags: Array) -> tuple[Raised, ...]:
         """Why the alarm is raised at a verdict.
@@ -283,11 +208,17 @@ class Alarm:
         self.reset()
         count = len(dt)
         judged = np.ones(count, dtype=bool) if judged is None else judged
-        each = np.empty((count, len(self.parts)), dtype=bool) if each is None else each
+        each = np.empty((count, len(self.rules)), dtype=bool) if each is None else each
         values = np.empty((count, 0)) if values is None else values
-        parts = list(zip(self.parts, each.T, np.split(values, self._begins[1:], axis=1), strict=True))
-        together = count >= WORTH_THREADS
-        on_cores(lambda part, after, own: part.push_all(dt, violated, rows, judged, after, own), parts, together)
+
+        def push_all(part: Window | Statistic, row: int, after: NDArray[np.bool_], own: Array) -> None:
+            if isinstance(part, Window):
+                part.push_all(violated, rows[row], judged, after)
+            else:
+                part.push_all(dt, rows[row], judged, after, own)
+
+        owns = np.split(values, self._begins[1:], axis=1)
+        on_cores(push_all, list(zip(self._parts, self._rows, each.T, owns, strict=True)), count >= WORTH_THREADS)
         self.reset()
         raised = np.zeros(count, dtype=bool)
         for column in each.T:
