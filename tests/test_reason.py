@@ -20,7 +20,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.alarm import Raised
-from uncertain_lti.monitor.reason import Facts, Reasons, over_recording
+from uncertain_lti.monitor.reason import Reasons, over_recording
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
@@ -110,21 +110,22 @@ def test_a_mode_that_is_not_listed_is_named_live_and_over_a_recording() -> None:
 
 def test_the_states_blamed_stay_named_while_the_same_rules_hold_the_alarm() -> None:
     reasons = Reasons(model_with(RULES["statistics"]), RULES["statistics"])
-    facts = Facts(True, Status.OK, False, [Raised("energy", "energy", 1, "x2", 2.0)])
     energy = "mean square of the utilisation over 0.3 s above 0.5"
-    assert reasons.push(facts) == f"alarm: {energy}: x2"
-    assert reasons.push(facts._replace(raised=[Raised("energy", "energy", 1, "x1", 3.0)])) == f"alarm: {energy}: x2, x1"
-    assert reasons.push(facts._replace(raised=[Raised("energy", "energy", 1, "x1", 4.0)])) == f"alarm: {energy}: x2, x1"
-    both = facts._replace(raised=[Raised("containment", "containment", 1, "", 1.0), *facts.raised])
-    assert reasons.push(both) == f"alarm: at least 3 of 3 verdicts violated; {energy}: x2"
-    gap = Facts(True, Status.GAP, False)
-    assert reasons.push(gap) == f"alarm: at least 3 of 3 verdicts violated; {energy}: x2; no verdict: " + (
-        "the step is longer than max_gap"
-    )
-    latched = Facts(True, Status.OK, False)
-    assert reasons.push(latched).startswith("alarm: latched until ~/reset, raised by at least 3 of 3 verdicts violated")
-    assert reasons.push(latched) == reasons.push(latched)
-    assert reasons.push(Facts(False, Status.OK, True)) == "no alarm; a regime that was not fitted"
+
+    def push(alarm: bool, status: Status, *raised: Raised, unknown: bool = False) -> str:
+        return reasons.push(alarm, status, unknown, raised, (), (), lambda: ([0.0] * 3, [0.0] * 2, [0.0] * 2))
+
+    second = Raised("energy", "energy", 1, "x2", 2.0)
+    assert push(True, Status.OK, second) == f"alarm: {energy}: x2"
+    for value in (3.0, 4.0):
+        assert push(True, Status.OK, Raised("energy", "energy", 1, "x1", value)) == f"alarm: {energy}: x2, x1"
+    both = f"alarm: at least 3 of 3 verdicts violated; {energy}: x2"
+    assert push(True, Status.OK, Raised("containment", "containment", 1, "", 1.0), second) == both
+    assert push(True, Status.GAP) == f"{both}; no verdict: the step is longer than max_gap"
+    latched = push(True, Status.OK)
+    assert latched.startswith("alarm: latched until ~/reset, raised by at least 3 of 3 verdicts violated")
+    assert push(True, Status.OK) == latched
+    assert push(False, Status.OK, unknown=True) == "no alarm; a regime that was not fitted"
 
 
 def test_a_jump_larger_than_any_of_the_fit_is_named_with_its_limit() -> None:

@@ -11,8 +11,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,26 +39,8 @@ QUIET = "no alarm"
 """What is said of a verdict without an alarm."""
 
 
-class Facts(NamedTuple):
-    """What the words on one sample are made of.
-
-    `alarm`: the alarm after it; `status`: OK with a verdict; `unknown_regime`: the verdict is on a regime that was not
-    fitted; `raised`: which rules raise the alarm; empty without a verdict; `frozen`: states that are frozen;
-    `withheld`: states without a verdict, as their rows need a frozen one, where others have one; `lacking`: signals
-    without a value at either end of the transition; looked at if the status is MISSING; `unlisted`: which mode the
-    model does not list, in words; looked at if the status is MODE; `jumps`: states that left their bounds by a jump
-    larger than any of the fit, in words.
-    """
-
-    alarm: bool
-    status: Status
-    unknown_regime: bool
-    raised: Sequence[Raised] = ()
-    frozen: Sequence[str] = ()
-    withheld: Sequence[str] = ()
-    lacking: Sequence[str] = ()
-    unlisted: str = ""
-    jumps: Sequence[str] = ()
+Values = Callable[[], tuple[Sequence[float], Sequence[float], Sequence[float]]]
+"""[x; u; s] before a transition, x and the flags after it; they are asked for only if the words need them."""
 
 
 class Reasons:
@@ -91,58 +73,52 @@ class Reasons:
         """`push` of a verdict of the monitor."""
         if verdict.status.dropped:
             return self.text
-        if verdict.judged and not (alarm or verdict.withheld):
-            return self.push(Facts(False, Status.OK, verdict.unknown_regime))
-        names = self._model.state_names
-        lacking: Sequence[str] = ()
-        if verdict.status is Status.MISSING:
-            lacking = self._lacking([*verdict.before, *verdict.numbers("state")])
-        unlisted = self._model.why_unlisted(verdict.before) if verdict.status is Status.MODE else ""
-        frozen = [names[moved.state] for moved in verdict.frozen]
-        withheld = [names[i] for i in verdict.withheld]
-        jumps: Sequence[str] = ()
-        if verdict.violated:
-            jumps = jumps_in_words(self._model, verdict.before, verdict.numbers("state"), verdict.numbers("flags"))
-        facts = alarm, verdict.status, verdict.unknown_regime, verdict.raised
-        return self.push(Facts(*facts, frozen, withheld, lacking, unlisted, jumps))
 
-    def _lacking(self, values: Sequence[float]) -> list[str]:
-        """Names of signals of which some value, of [x; u; s] before and x after, is no number."""
-        every = [signal.name for signal in self._model.signals]
-        of = [*every, *self._model.state_names]
-        return list(dict.fromkeys(name for name, value in zip(of, values, strict=True) if value != value))
+        def values() -> tuple[list[float], list[float], list[float]]:
+            return verdict.before, verdict.numbers("state"), verdict.numbers("flags")
 
-    def push(self, facts: Facts) -> str:
-        """Take one sample that was not dropped."""
-        judged = facts.status is Status.OK
-        if not facts.alarm:
+        frozen = [moved.state for moved in verdict.frozen]
+        unknown, raised = verdict.unknown_regime, verdict.raised if alarm else ()
+        return self.push(alarm, verdict.status, unknown, raised, frozen, verdict.withheld, values)
+
+    def push(
+        self, alarm: bool, status: Status, unknown_regime: bool, raised: Sequence[Raised], frozen: Sequence[int],
+        withheld: Sequence[int], values: Values,
+    ) -> str:  # fmt: skip
+        """Take one sample that was not dropped.
+
+        `alarm`: the alarm after it; `status`: OK with a verdict; `unknown_regime`: the verdict is on a regime that was
+        not fitted; `raised`: which rules raise the alarm; `frozen`: states that are; `withheld`: states without a
+        verdict, as their rows need a frozen one; `values`: of the transition.
+        """
+        judged, names = status is Status.OK, self._model.state_names
+        if not alarm:
             self._blamed, self._jumps, self._held = {}, [], ""
-        elif facts.frozen or (judged and facts.raised):
-            by = [f"frozen: {', '.join(facts.frozen)}"] if facts.frozen else []
-            by += [self._rules_that(facts.raised, facts.jumps)] if judged and facts.raised else []
+        elif frozen or (judged and raised):
+            by = [f"frozen: {', '.join(names[i] for i in frozen)}"] if frozen else []
+            by += [self._rules_that(raised, values)] if judged and raised else []
             self._held = "; ".join(by)
         elif judged and not self._held.startswith("latched"):
             self._held = "latched until ~/reset" + (f", raised by {self._held}" if self._held else "")
         self.by = self._held or self.by
-        said = [f"alarm: {self._held}" if self._held else "alarm"] if facts.alarm else []
+        said = [f"alarm: {self._held}" if self._held else "alarm"] if alarm else []
         if not judged:
-            said.append(f"no verdict: {self._why(facts)}")
-        elif not facts.alarm:
+            said.append(f"no verdict: {self._why(status, values)}")
+        elif not alarm:
             said.append(QUIET)
-        if judged and facts.withheld:
-            said.append(f"no verdict on {', '.join(facts.withheld)}")
-        if judged and facts.unknown_regime:
+        if judged and withheld:
+            said.append(f"no verdict on {', '.join(names[i] for i in withheld)}")
+        if judged and unknown_regime:
             said.append("a regime that was not fitted")
         self.text = "; ".join(said)
         return self.text
 
-    def _rules_that(self, raised: Sequence[Raised], jumps: Sequence[str]) -> str:
+    def _rules_that(self, raised: Sequence[Raised], values: Values) -> str:
         """The rules that hold the alarm, with the states blamed and the first jump since these do."""
         held = dict.fromkeys(reason.label for reason in raised)
         if held.keys() != self._blamed.keys():
             self._blamed, self._jumps = {label: [] for label in held}, []
-        if jumps and not self._jumps:
-            self._jumps = list(jumps)
+        self._jumps = self._jumps or jumps_in_words(self._model, *values())
         for reason in raised:
             if reason.state and reason.state not in self._blamed[reason.label]:
                 self._blamed[reason.label].append(reason.state)
@@ -151,38 +127,32 @@ class Reasons:
         ]
         return "; ".join([*by, *self._jumps])
 
-    def _why(self, facts: Facts) -> str:
-        if facts.status is Status.MISSING and facts.lacking:
-            return f"{', '.join(facts.lacking)} missing, stale, not valid or not finite"
-        if facts.status is Status.MODE and facts.unlisted:
-            return facts.unlisted
-        return WHY[facts.status]
+    def _why(self, status: Status, values: Values) -> str:
+        if status is Status.MODE:
+            return self._model.why_unlisted(values()[0]) or WHY[status]
+        if status is Status.MISSING:
+            before, after, _ = values()
+            of = [*(signal.name for signal in self._model.signals), *self._model.state_names]
+            lacking = dict.fromkeys(name for name, v in zip(of, [*before, *after], strict=True) if v != v)
+            if lacking:
+                return f"{', '.join(lacking)} missing, stale, not valid or not finite"
+        return WHY[status]
 
 
 def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[int, str]]:
     """What is said of the samples of a recording, as far as it changes."""
     reasons, said = Reasons(model, verdicts.alarms.rules), ""
     transient, statuses = verdicts.transient, verdicts.statuses()
-    names = model.state_names
     for k in np.flatnonzero(_may_change(verdicts, model, statuses)).tolist():
-        status, alarm = statuses[k], bool(verdicts.alarm[k])
+
+        def values(k: int = k) -> tuple[list[float], list[float], list[float]]:
+            before = np.concatenate([transient.x[k - 1], transient.u[k - 1], transient.s[k - 1]])
+            return before.tolist(), transient.x[k].tolist(), verdicts.flags[k].tolist()
+
+        alarm, unknown = bool(verdicts.alarm[k]), bool(verdicts.unknown_regime[k])
         raised = verdicts.raised(k) if alarm else ()
-        frozen = [names[i] for i in np.flatnonzero(verdicts.frozen[k])]
-        withheld = [names[i] for i in np.flatnonzero(verdicts.withheld[k])]
-        lacking: Sequence[str] = ()
-        unlisted = ""
-        if status in (Status.MISSING, Status.MODE):
-            before = np.concatenate([transient.x[k - 1], transient.u[k - 1], transient.s[k - 1]]).tolist()
-            if status is Status.MODE:
-                unlisted = model.why_unlisted(before)
-            else:
-                lacking = reasons._lacking([*before, *transient.x[k].tolist()])
-        jumps: Sequence[str] = ()
-        if alarm and status is Status.OK:
-            flags = verdicts.flags[k].tolist()
-            jumps = jumps_in_words(model, transient.x[k - 1].tolist(), transient.x[k].tolist(), flags)
-        unknown = bool(verdicts.unknown_regime[k])
-        text = reasons.push(Facts(alarm, status, unknown, raised, frozen, withheld, lacking, unlisted, jumps))
+        frozen, withheld = (np.flatnonzero(states[k]).tolist() for states in (verdicts.frozen, verdicts.withheld))
+        text = reasons.push(alarm, statuses[k], unknown, raised, frozen, withheld, values)
         if text != said:
             yield k, text
             said = text
