@@ -81,21 +81,36 @@ def test_what_was_not_kept_is_never_left_outside():
     equal(model.update([*quiet, *loud]), fit([*quiet, *loud], "qp", **PAPER))
 
 
-def test_thresholds_take_in_what_new_recordings_reach():
-    """A new recording raises no alarm afterwards, and no threshold falls."""
-    runs = runs_of(11, (1500, 1500, 1500, 1500))
-    model = fit(runs[:3], "qp", additive="noise")
-    calm = model.update(runs[3])
+def thresholds(model):
+    return np.concatenate([np.ravel(rule.threshold) for rule in model.alarm])
+
+
+def test_thresholds_and_promise_are_learnt_from_all_recordings():
+    """About those of a fit of all; a new recording raises no alarm afterwards, and the limit of the rate falls."""
+    runs = runs_of(12, (1500,) * 7)
+    model, whole = (fit(some, "qp", additive="noise") for some in (runs[:4], runs))
+    updated = model.update(runs[4]).update(runs[5:])
+    assert thresholds(updated) == pytest.approx(thresholds(whole), rel=0.2)
+    old, new, all_at_once = (m.fit_summary["alarm"] for m in (model, updated, whole))
+    assert new["hours"] == pytest.approx(all_at_once["hours"]) and new["units"] == 7
+    limits = [alarm["limit_per_hour"] for alarm in (old, new, all_at_once)]
+    assert limits[1] < limits[0] and limits[1] == pytest.approx(limits[2], rel=0.5)
+    assert "7 recordings" in new["promises"][0] and "brought up to date" in new["note"]
     x = runs[3].x.copy()
     x[700:760, 0] += 0.02 * np.where(np.arange(60) % 2, 1.0, -1.0)
     loud = Transient(runs[3].t, x, runs[3].u, name="loud")
     assert EnvelopeMonitor(model).check(loud).alarm.any()
-    updated = model.update(loud)
-    before, after = (np.concatenate([np.ravel(rule.threshold) for rule in m.alarm]) for m in (model, updated))
-    assert (after >= before).all() and (after > before).any()
-    assert not EnvelopeMonitor(updated).check(loud).alarm.any()
-    assert (np.concatenate([np.ravel(rule.threshold) for rule in calm.alarm]) >= before).all()
-    assert "brought up to date" in updated.fit_summary["alarm"]["note"]
+    assert not EnvelopeMonitor(model.update(loud)).check(loud).alarm.any()
+
+
+def test_an_alarm_that_was_changed_stays():
+    runs = runs_of(11, (1500,) * 4)
+    model = fit(runs[:3], "qp", additive="noise")
+    by_hand = model.replace(alarm=model.alarm[:1])
+    updated = by_hand.update(runs[3])
+    assert (
+        updated.alarm == by_hand.alarm and "alarm is that of before the update" in updated.fit_summary["alarm"]["note"]
+    )
 
 
 def test_a_recording_that_is_given_again_counts_once():

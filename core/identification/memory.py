@@ -117,9 +117,9 @@ class Boxes:
         parts = {"low": np.floor(low - 1e-6), "high": np.ceil(high + 1e-6), "room": np.floor(room - 1e-6)}
         counts = np.bincount(self.source, minlength=recordings)
         return {
-            **{name: _text(np.maximum(values, 0.0), "u1") for name, values in parts.items()},
+            **{name: as_text(np.maximum(values, 0.0), "u1") for name, values in parts.items()},
             **{
-                name: _text(values)
+                name: as_text(values)
                 for name, values in {"least": least, "step": step, "top": top, "counts": counts}.items()
             },
         }
@@ -127,8 +127,8 @@ class Boxes:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Boxes:
         """As the file has it."""
-        least, step, top, counts = (_array(data[name]) for name in ("least", "step", "top", "counts"))
-        low, high, room = (_array(data[name], "u1") for name in ("low", "high", "room"))
+        least, step, top, counts = (of_text(data[name]) for name in ("least", "step", "top", "counts"))
+        low, high, room = (of_text(data[name], "u1") for name in ("low", "high", "room"))
         source = np.repeat(np.arange(len(counts)), counts.astype(np.intp))
         return cls(least + step * low, least + step * high, top * (room / 255.0) ** 2, source)
 
@@ -167,8 +167,8 @@ class Memory:
             "of": _mark_of(model),
             "columns": sorted(of.columns.names),
             "recordings": [list(recording) for recording in self.recordings],
-            "weights": _text(of.weights),
-            "kept": {name: _text(values) for name, values in kept.items()},
+            "weights": as_text(of.weights),
+            "kept": {name: as_text(values) for name, values in kept.items()},
             "rest": None if self.rest is None else _texts(self.rest),
             "boxes": None if self.boxes is None else self.boxes.to_dict(len(self.recordings)),
         }
@@ -193,12 +193,12 @@ class Memory:
         if data.get("of") != _mark_of(model):
             raise FitError(f"the model was changed after its fit, and what its file keeps is of another; {_AGAIN}")
         try:
-            z, x_next, dt, source, k = (_array(data["kept"][name]) for name in ("z", "next", "dt", "source", "k"))
-            columns, weights = Columns(frozenset(data["columns"])), _array(data["weights"])
+            z, x_next, dt, source, k = (of_text(data["kept"][name]) for name in ("z", "next", "dt", "source", "k"))
+            columns, weights = Columns(frozenset(data["columns"])), of_text(data["weights"])
             kept = Problem(z, x_next, dt, source.astype(np.intp), k.astype(np.intp), weights, columns)
             rest = None
             if data["rest"] is not None:
-                found: dict[str, Any] = {name: _array(text) for name, text in data["rest"].items()}
+                found: dict[str, Any] = {name: of_text(text) for name, text in data["rest"].items()}
                 found |= {name: found[name].item() for name in ("dt_min", "dt_max")}
                 found |= {"count": int(found["count"].item()), "visits": found["visits"].astype(np.intp)}
                 rest = Moments(**{"gram": None, "coupled": None, **found})
@@ -302,16 +302,18 @@ def _mark_of(model: UncertainLTI) -> str:
     )
 
 
-def _text(values: Any, form: str = "<f8") -> list[Any]:
+def as_text(values: Any, form: str = "<f8") -> list[Any]:
+    """Numbers as the file of a model has them, to the bit: shape, then base64."""
     array = np.atleast_1d(np.asarray(values)).astype(form)
     return [*array.shape, b64encode(np.ascontiguousarray(array).tobytes()).decode()]
 
 
 def _texts(part: Moments) -> dict[str, Any]:
     each = {field.name: getattr(part, field.name) for field in fields(part)}
-    return {name: _text(values) for name, values in each.items() if values is not None}
+    return {name: as_text(values) for name, values in each.items() if values is not None}
 
 
-def _array(text: Sequence[Any], form: str = "<f8") -> Array:
+def of_text(text: Sequence[Any], form: str = "<f8") -> Array:
+    """Of `as_text`; of one number (1,)."""
     *shape, data = text
     return np.frombuffer(b64decode(data, validate=True), dtype=form).reshape(shape).astype(np.float64)

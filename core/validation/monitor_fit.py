@@ -24,7 +24,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.panel import Panel, figure, learn, promises, worth
+from uncertain_lti.validation.panel import Panel, figure, learn
 from uncertain_lti.validation.part import Part, fitted_parts
 from uncertain_lti.validation.result import Validation
 
@@ -56,8 +56,9 @@ class Monitored:
         if panel is None:
             alarm: dict[str, Any] = {"not_learnt": self.why}
         else:
-            kind, headline = worth(model, panel)
-            alarm = {**panel.to_dict(), "worth": kind, "headline": headline, "promises": promises(model, panel)}
+            alarm = panel.summary(model)
+            if model.memory:
+                model = model.replace(memory={**model.memory, "evidence": panel.evidence.to_dict()})
             if self.why:
                 alarm["note"] = self.why
         if self.centred:

@@ -7,28 +7,26 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""An update with the monitor that goes with it: thresholds of the panel take in what new recordings reach."""
+"""An update with the monitor that goes with it: new recordings are left out, as they were not fitted yet."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification import update
-from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, Transitions
-from uncertain_lti.validation.panel import sizes_of
-from uncertain_lti.validation.part import Part, Reach, judge
+from uncertain_lti.validation.panel import Evidence, extended
+from uncertain_lti.validation.part import Reach, fitted_parts, judge
 
 NOTE = (
-    "brought up to date: thresholds are those of the first fit, or the largest that the new recordings reached by the "
-    "model fitted without them; what is promised is of the first fit, and a fit of all recordings learns it anew"
+    "brought up to date: of each recording counts how far it was from the fit that was made without it at the time; a "
+    "fit of all recordings leaves each out of all the others, which moves thresholds a little"
 )
+KEPT = "the alarm is that of before the update, as it is not the panel that the first fit learnt; fit all recordings"
 
 
 def updated(
@@ -36,14 +34,21 @@ def updated(
 ) -> UncertainLTI:
     """`UncertainLTI.update`."""
     found, runs = update.updated(model, transients, progress)
-    alarm = model.fit_summary.get("alarm", {})
+    alarm, kept = model.fit_summary.get("alarm", {}), (model.memory or {}).get("evidence")
     if "limit_per_hour" not in alarm:  # given by hand, or not learnt
         return found
-    rules, ranges = model.alarm, _Ranges(model)
-    for run in runs:
-        part = judge(model, model, run, run.name, reach=ranges)
-        rules = _raised(rules, part.without(part.extrapolated > 0))
-    return found.replace(alarm=rules, fit_summary={**found.fit_summary, "alarm": {**alarm, "note": NOTE}})
+    every = (judge(model, model, run, run.name, reach=_Ranges(model)) for run in runs)
+    parts = [part for part in every if part.judged]
+    panel = None
+    if kept and parts:
+        panel = extended(Evidence.from_dict(kept), model, alarm, parts, fitted_parts(found, runs))
+    if panel is None:
+        alarm = {**alarm, "note": KEPT} if parts else alarm
+    else:
+        found = found.replace(alarm=panel.rules)
+        kept, alarm = panel.evidence.to_dict(), {**alarm, **panel.summary(found), "note": NOTE}
+    memory = found.memory and {**found.memory, "evidence": kept}
+    return found.replace(memory=memory, fit_summary={**found.fit_summary, "alarm": alarm})
 
 
 class _Ranges(Reach):
@@ -55,16 +60,3 @@ class _Ranges(Reach):
     def level(self, steps: Transitions) -> NDArray[np.intp]:
         """(K,): 0 where a transition begins within the ranges, 1 beyond them."""
         return self._model.domain.beyond(self._model.normalised_columns(steps)).astype(np.intp)
-
-
-def _raised(rules: tuple[Rule, ...], part: Part) -> tuple[Rule, ...]:
-    """Rules whose thresholds are no less than the largest statistic on a part."""
-    statistics = [rule for rule in rules if isinstance(rule, StatisticRule)]
-    if not part.judged or not statistics:
-        return rules
-    raised: dict[StatisticRule, Rule] = {}
-    for rule, sizes in zip(statistics, sizes_of(statistics, part), strict=True):
-        factor: Array = np.maximum(sizes.max(axis=0), 1.0) ** (1 if rule.kind == "mean" else 2)
-        values = (np.asarray(rule.thresholds(part.model.n)) * factor).tolist()
-        raised[rule] = replace(rule, threshold=values[0] if rule.kind in JOINT else tuple(values))
-    return tuple(raised.get(rule, rule) if isinstance(rule, StatisticRule) else rule for rule in rules)

@@ -29,8 +29,8 @@ p of each of G (TELLING at least) are normal,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
+from uncertain_lti.identification.memory import as_text, of_text
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm
@@ -64,6 +65,91 @@ BLIND = 0.5
 """A bias of more than this share of the range of a state is no fault worth an alarm."""
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
+_NOTHING = 1e-9
+"""Size from which on a peak is one."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """What a panel is learnt from, so that an update can add to it; S sizes in all, of each rule one per state or one.
+
+    `peaks` (G, S): the largest sizes on each recording, group or block that was left out; `top`, `median` (S,): on all
+    healthy data, left out or fitted; `verdicts`: of those; `widths` (2, n): usual and median width where left out,
+    recorded units; `judged`: verdicts there; `hours`: those of them within what the others cover; `dt`: typical step,
+    s; `factor`: on the thresholds, for a rate; `counts`, `near` (units,): alarms left out at the thresholds, and
+    somewhat below.
+    """
+
+    peaks: Array
+    top: Array
+    median: Array
+    verdicts: float
+    widths: Array
+    judged: float
+    hours: float
+    dt: float
+    factor: float = 1.0
+    counts: Array = field(default_factory=lambda: np.empty(0))
+    near: Array = field(default_factory=lambda: np.empty(0))
+
+    def __add__(self, other: Evidence) -> Evidence:
+        """With what further recordings are evidence of; the median is the mean of both, which few have as another."""
+
+        share = other.verdicts / (self.verdicts + other.verdicts)
+        judged = self.judged + other.judged
+        return Evidence(
+            np.vstack([self.peaks, other.peaks]),
+            np.maximum(self.top, other.top),
+            (1.0 - share) * self.median + share * other.median,
+            self.verdicts + other.verdicts,
+            (self.judged * self.widths + other.judged * other.widths) / judged,
+            judged,
+            self.hours + other.hours,
+            self.dt,
+            self.factor,
+            np.append(self.counts, other.counts),
+            np.append(self.near, other.near),
+        )
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain data for the memory of a model."""
+        return {each.name: as_text(getattr(self, each.name)) for each in fields(self)}
+
+    @classmethod
+    def from_dict(cls, data: Mapping[str, Any]) -> Evidence:
+        """Of `to_dict`."""
+        found: dict[str, Any] = {each.name: of_text(data[each.name]) for each in fields(cls)}
+        return cls(
+            **{each.name: found[each.name].item() if each.type == "float" else found[each.name] for each in fields(cls)}
+        )
+
+    def thresholds(self, rules: Sequence[StatisticRule], n: int, what: str) -> list[Array]:
+        """Of each rule (n,) or (1,), but for the factor."""
+        ends = np.cumsum([len(rule.thresholds(n)) for rule in rules])[:-1]
+        each = (np.split(values, ends, axis=-1) for values in (self.peaks, self.top, self.median))
+        return [
+            _threshold(rule, n, what == "block", self.dt, peaks, top, median, self.verdicts)
+            for rule, peaks, top, median in zip(rules, *each, strict=True)
+        ]
+
+    def learnt(self, rules: Sequence[StatisticRule], what: str) -> tuple[StatisticRule, ...]:
+        """These rules with their thresholds."""
+        thresholds = (self.factor * t for t in self.thresholds(rules, self.widths.shape[1], what))
+        return tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True))
+
+    def with_alarms(self, rules: Sequence[StatisticRule], what: str, shown: Sequence[tuple[Part, Array]]) -> Evidence:
+        """With the alarms on these parts, of the sizes (K, S) given."""
+        if not shown:
+            return self
+        thresholds = np.concatenate(self.thresholds(rules, self.widths.shape[1], what))
+        reached = self.peaks[(self.peaks > _NOTHING).any(axis=1)] / thresholds
+        third = float(np.sort(reached.max(axis=1))[::-1][:3][-1])
+        parts, levels = [part for part, _ in shown], [(sizes / thresholds).max(axis=1) for _, sizes in shown]
+        counts, near = (
+            by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
+            for factor in (self.factor, min(self.factor, max(0.95 * third, NEARBY * self.factor)))
+        )
+        return replace(self, counts=np.append(self.counts, counts), near=np.append(self.near, near))
 
 
 @dataclass(frozen=True)
@@ -74,8 +160,8 @@ class Panel:
     `hours`: under verdict there; `units`: independent recordings, groups or blocks; `what`: which of them;
     `biases` (n,): smallest jump of each state that the energy over a window sees at nine of ten times, recorded units;
     `within`: in this time, s; `figure`: geometric mean over the states of the jumps seen half of the time, which ways
-    to fit are compared by; `unlike`: names of left-out stretches that the others do not cover; `asked`: rate that was
-    asked for.
+    to fit are compared by; `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the
+    others do not cover; `asked`: rate that was asked for.
     """
 
     rules: tuple[Rule, ...]
@@ -87,8 +173,42 @@ class Panel:
     biases: Array
     within: float
     figure: float
+    evidence: Evidence
     unlike: tuple[str, ...] = ()
     asked: float | None = None
+
+    @classmethod
+    def of(
+        cls,
+        evidence: Evidence,
+        rules: Sequence[StatisticRule],
+        what: str,
+        unlike: Sequence[str],
+        asked: float | None,
+    ) -> Panel:
+        """That of these rules; `what`: of `Validation.what`."""
+        thresholds = evidence.thresholds(rules, evidence.widths.shape[1], what)
+        at = max(i for i, rule in enumerate(rules) if _of_jumps(rule))
+        usual, median = evidence.widths / 2.0 * (evidence.factor * thresholds[at])
+        return cls(
+            evidence.learnt(rules, what),
+            _limit(evidence, len(rules)),
+            int(evidence.counts.sum()),
+            evidence.hours,
+            len(evidence.peaks),
+            what,
+            usual,
+            max(rules[at].window_s, evidence.dt),
+            _mean(median),
+            evidence,
+            tuple(unlike),
+            asked,
+        )
+
+    def summary(self, model: UncertainLTI) -> dict[str, Any]:
+        """What `fit_summary["alarm"]` of its model says."""
+        kind, headline = worth(model, self)
+        return {**self.to_dict(), "worth": kind, "headline": headline, "promises": promises(model, self)}
 
     @property
     def needed_hours(self) -> float:
@@ -158,6 +278,38 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise FitError(f"false_alarms is {rate}; give a positive number per hour")
     parts, rules, dt = _judged(validation)
+    evidence, shown, unlike = _gathered(rules, parts, fitted, dt)
+    found = evidence.with_alarms(rules, validation.what, shown)
+    while rate is not None and _limit(found, len(rules)) <= rate and found.factor > _LEAST:
+        lower = replace(evidence, factor=found.factor / _FINE).with_alarms(rules, validation.what, shown)
+        if _limit(lower, len(rules)) > rate:
+            break
+        found = lower
+    return Panel.of(found, rules, validation.what, unlike, rate)
+
+
+def extended(
+    evidence: Evidence, model: UncertainLTI, alarm: Mapping[str, Any], parts: Sequence[Part], fitted: Sequence[Part]
+) -> Panel | None:
+    """The panel of a model with what further recordings are evidence of; None if its alarm is no longer that panel.
+
+    `alarm`: what `Panel.to_dict` gave; `parts`: the recordings, judged by the model; `fitted`: by the one with them.
+    """
+    rules = [replace(rule, threshold=1.0) for rule in model.alarm if isinstance(rule, StatisticRule)]
+    what, asked = alarm["what"], alarm.get("asked")
+    sizes = sum(len(rule.thresholds(model.n)) for rule in rules)
+    if sizes != len(evidence.top) or evidence.learnt(rules, what) != model.alarm:
+        return None
+    new, shown, unlike = _gathered(rules, parts, fitted, evidence.dt)
+    both = (evidence + new).with_alarms(rules, what, shown)
+    return Panel.of(both, rules, what, [*alarm["unlike"], *unlike], asked)
+
+
+def _gathered(
+    rules: Sequence[StatisticRule], parts: Sequence[Part], fitted: Sequence[Part], dt: float
+) -> tuple[Evidence, list[tuple[Part, Array]], list[str]]:
+    """Evidence but for alarms; of what was left out the parts within what the others cover with their sizes (K, S);
+    names of those that are not."""
     left, unlike = [], []
     for part in parts:
         far = part.extrapolated == 2
@@ -165,37 +317,30 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
             far = part.extrapolated > 0
             unlike.append(part.name)
         left.append(part.without(far))
-    sizes = [sizes_of(rules, part) for part in left]
-    every = [*sizes, *(sizes_of(rules, part) for part in fitted)]
-    units = unit_numbers(parts)
-    thresholds = [
-        _threshold(rule, validation, dt, units, [of[r] for of in sizes], [of[r] for of in every])
-        for r, rule in enumerate(rules)
-    ]
-    levels = [
-        (part, np.max([(s / t).max(axis=1) for s, t in zip(of, thresholds, strict=True)], axis=0))
-        for part, of in zip(left, sizes, strict=True)
-        if part.judged
-    ]
-    hours = sum(part.hours for part, _ in levels)
-    factor, limit, alarms = _factor(levels, hours, len(rules), rate)
-    thresholds = [factor * t for t in thresholds]
-    at = _of_jumps(rules)
-    return Panel(
-        tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True)),
-        limit, alarms, hours, int(units.max()) + 1, validation.what, _jumps(parts, "usual_width", thresholds[at]),
-        max(rules[at].window_s, dt), _mean(_jumps(parts, "median_width", thresholds[at])), tuple(unlike), rate,
-    )  # fmt: skip
+    sizes = [np.hstack(sizes_of(rules, part)) for part in left]
+    every = np.concatenate([*sizes, *(np.hstack(sizes_of(rules, part)) for part in fitted)])
+    shown = [(part, of) for part, of in zip(left, sizes, strict=True) if part.judged]
+    found = Evidence(
+        _peaks(unit_numbers(parts), sizes),
+        every.max(axis=0),
+        np.median(every, axis=0),
+        len(every),
+        np.array([_widths(parts, name) for name in ("usual_width", "median_width")]),
+        sum(part.judged for part in parts),
+        sum(part.hours for part, _ in shown),
+        dt,
+    )
+    return found, shown, unlike
 
 
 def figure(seen: Validation) -> float:
     """`Panel.figure` of `learn(seen, seen.parts)`, where nothing was left out. Raises FitError as that does."""
     parts, rules, dt = _judged(seen)
-    rule = rules[_of_jumps(rules)]
+    rule = [rule for rule in rules if _of_jumps(rule)][-1]
     sizes = [sizes_of([rule], part)[0] for part in parts]
-    return _mean(
-        _jumps(parts, "median_width", _threshold(rule, seen, dt, unit_numbers(parts), sizes, [*sizes, *sizes]))
-    )
+    every, n, block = np.concatenate(sizes), seen.model.n, seen.what == "block"
+    facts = _peaks(unit_numbers(parts), sizes), every.max(axis=0), np.median(every, axis=0), 2 * len(every)
+    return _mean(_widths(parts, "median_width") / 2.0 * _threshold(rule, n, block, dt, *facts))
 
 
 def _judged(validation: Validation) -> tuple[list[Part], list[StatisticRule], float]:
@@ -208,15 +353,15 @@ def _judged(validation: Validation) -> tuple[list[Part], list[StatisticRule], fl
     return parts, rules_for(validation.model, lengths[len(lengths) // 10], dt), dt
 
 
-def _of_jumps(rules: Sequence[StatisticRule]) -> int:
-    """The rule by whose threshold jumps are promised: the energy over the longest window, of one step."""
-    return max(i for i, rule in enumerate(rules) if rule.kind == "energy" and rule.horizon == 1)
+def _of_jumps(rule: StatisticRule) -> bool:
+    """Whether jumps are promised by this rule, if it is the last such: the energy over the longest window, one step."""
+    return rule.kind == "energy" and rule.horizon == 1
 
 
-def _jumps(parts: Sequence[Part], width: str, threshold: Array) -> Array:
-    """Jumps (n,) that a state's energy sees where its bounds have the usual, or the median, width."""
-    widths = np.average([getattr(part, width) for part in parts], axis=0, weights=[part.judged for part in parts])
-    return np.asarray(widths / 2.0 * threshold)
+def _widths(parts: Sequence[Part], name: str) -> Array:
+    """The usual, or the median, width (n,) of the bounds on some parts."""
+    weights = [part.judged for part in parts]
+    return np.asarray(np.average([getattr(part, name) for part in parts], axis=0, weights=weights))
 
 
 def _mean(jumps: Array) -> float:
@@ -224,19 +369,10 @@ def _mean(jumps: Array) -> float:
 
 
 def _threshold(
-    rule: StatisticRule,
-    validation: Validation,
-    dt: float,
-    units: NDArray[np.intp],
-    left: Sequence[Array],
-    every: Sequence[Array],
+    rule: StatisticRule, n: int, blocks: bool, dt: float, peaks: Array, top: Array, median: Array, verdicts: float
 ) -> Array:
-    """Threshold (n,) or (1,) of one rule, of its sizes on the parts `left` out, and on `every` healthy data."""
-    peaks = _peaks(units, left)
-    sizes = np.concatenate(every)
-    top, median = sizes.max(axis=0), np.median(sizes, axis=0)
-    windows = max(3.0, len(sizes) / 2.0 / max(1, round(rule.window_s / dt)))
-    n, blocks = validation.model.n, validation.what == "block"
+    """Threshold (n,) or (1,) of one rule; as `Evidence` has them, of its sizes alone."""
+    windows = max(3.0, verdicts / 2.0 / max(1, round(rule.window_s / dt)))
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
     if windows < FEW:
         typical = np.exp(np.log(peaks).mean(axis=0))
@@ -258,46 +394,24 @@ def _of_next(peaks: Array, confidence: float) -> Array:
 
 
 def _peaks(units: NDArray[np.intp], values: Sequence[Array]) -> Array:
-    """The largest of the values (K,) or (K, n) of the parts of each unit, at least 1e-9."""
-    found = np.full((int(units.max()) + 1, *values[0].shape[1:]), 1e-9)
+    """The largest of the values (K,) or (K, n) of the parts of each unit, at least _NOTHING."""
+    found = np.full((int(units.max()) + 1, *values[0].shape[1:]), _NOTHING)
     for unit, each in zip(units.tolist(), values, strict=True):
         found[unit] = np.maximum(found[unit], each.max(axis=0, initial=0.0))
     return found
 
 
-def _factor(
-    shown: Sequence[tuple[Part, Array]], hours: float, rules: int, rate: float | None
-) -> tuple[float, float, int]:
-    """The lowest factor on the thresholds that keeps to a rate, the limit of the rate there, and alarms left out.
+def _limit(evidence: Evidence, rules: int) -> float:
+    """Limit of the rate of false alarms.
 
     A threshold that is the largest size of so many hours is passed about once in as many: every rule but one counts as
     a cluster of alarms, and those come in clusters as they do somewhat below the thresholds.
     """
-    if not shown:  # all that was left out lies far outside what was fitted
-        return 1.0, math.inf, 0
-    parts, levels = [part for part, _ in shown], [level for _, level in shown]
-    largest = np.sort(_peaks(unit_numbers(parts), levels))[::-1]
-    third = float(largest[:3][-1])
-
-    def raised(factor: float) -> Array:
-        return by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
-
-    def limit_at(factor: float) -> tuple[float, int]:
-        counts = raised(factor)
-        size = cluster_size(raised(min(factor, max(0.95 * third, NEARBY * factor))))
-        counted = counts + (rules - 1) * size / len(counts)
-        upper = rate_interval(counted, hours, CONFIDENCE, size, one_sided=True)[1] if hours else math.inf
-        return float(upper), int(counts.sum())
-
-    chosen = (1.0, *limit_at(1.0))
-    factor = 1.0
-    while rate is not None and chosen[1] <= rate and factor > _LEAST:
-        factor /= _FINE
-        upper, alarms = limit_at(factor)
-        if upper > rate:
-            break
-        chosen = factor, upper, alarms
-    return chosen
+    if not evidence.hours:  # all that was left out lies far outside what was fitted
+        return math.inf
+    size = cluster_size(evidence.near)
+    counted = evidence.counts + (rules - 1) * size / len(evidence.counts)
+    return float(rate_interval(counted, evidence.hours, CONFIDENCE, size, one_sided=True)[1])
 
 
 def _with_threshold(rule: StatisticRule, sizes: Array) -> StatisticRule:
