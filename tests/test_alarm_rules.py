@@ -130,7 +130,7 @@ def test_residuals_of_a_horizon_that_are_none_are_refused(residuals: Any, words:
         ({"threshold": []}, "threshold of energy"),
         ({"threshold": "1"}, "threshold of energy is '1'"),
         ({"horizon": 0}, "horizon is 0"),
-        ({"horizon": 1.5}, r"horizon' is 1.5; it must be a whole number"),
+        ({"horizon": 1.5}, r"horizon is 1.5; it must be a whole number"),
         ({"allowance": 0.1}, "unknown field 'alarm.rules\\[0\\].allowance'"),
         ({"margin": 1.0}, "unknown field 'alarm.rules\\[0\\].margin'"),
     ],
@@ -155,7 +155,7 @@ def test_a_rule_of_a_file_that_cannot_be_is_refused_by_name(change: dict[str, An
         ([{"kind": "cusum", "window_s": 0, "threshold": 1.0}], "window_s of cusum is 0; it must be a positive number"),
         ([{"kind": "mewma", "window_s": 1.0, "threshold": [1.0, 1.0]}], "mewma is one number for all states"),
         ([{"kind": "cusum", "window_s": 1.0, "threshold": 1.0, "allowance": -1}], "allowance is -1"),
-        ([{"kind": "containment", "violations": 1, "window": 1, "margin": "x"}], r"rules\[0\].margin' is 'x'"),
+        ([{"kind": "containment", "violations": 1, "window": 1, "margin": "x"}], r"rules\[0\]': margin is 'x'"),
         ([{"kind": "containment", "violations": 2, "window": 1, "margin": 1}], "violations is 2 of window 1"),
     ],
 )

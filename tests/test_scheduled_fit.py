@@ -384,6 +384,13 @@ def test_schedules_that_make_no_sense_are_refused(schedule, words):
         fit(drawn(THREE, 300, 1), schedule=schedule)
 
 
+def test_one_knot_of_a_further_signal_is_no_schedule():
+    plain = drawn(THREE, 300, 1)
+    further = Transient(plain.t_ns, plain.x, plain.u, s=np.linspace(0, 1, len(plain))[:, None])
+    model = fit(further, "qp", additive="noise", schedule={"s1": 1})
+    assert model.schedule is None and not model.signals.scheduling
+
+
 def test_knots_that_do_not_increase_are_named_in_recorded_units():
     transient = drawn(THREE, 300, 1)
     point = OperatingPoint(np.zeros(2), np.array([0.5, 0.0]), np.ones(2), np.array([2.0, 1.0]))

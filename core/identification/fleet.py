@@ -167,7 +167,23 @@ class DaskFleet(Fleet):
         done: Callable[[int], None] | None = None,
     ) -> list[T]:
         """Run tasks on the workers."""
-        return _gather(client, _submitted(client, tasks), done)
+        from distributed import as_completed
+        from distributed.client import FutureCancelledError
+        from distributed.comm.core import CommClosedError
+        from distributed.scheduler import KilledWorker
+
+        futures = _submitted(client, tasks)
+        try:
+            if done is not None:
+                for number, _ in enumerate(as_completed(futures), start=1):  # type: ignore[no-untyped-call]
+                    done(number)
+            results: list[T] = client.gather(futures)
+        except UncertainLTIError:
+            raise
+        except (KilledWorker, CommClosedError, FutureCancelledError, TimeoutError, OSError) as error:
+            text = f"the Dask cluster gave up ({type(error).__name__}); look at its workers' logs"
+            raise FitError(text) from None
+        return results
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments) on the workers."""
@@ -177,24 +193,6 @@ class DaskFleet(Fleet):
 
 def _submitted(client: Any, tasks: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]]) -> list[Any]:
     return [client.submit(function, *arguments, pure=False, retries=3) for function, arguments in tasks]
-
-
-def _gather(client: Any, futures: list[Any], done: Callable[[int], None] | None = None) -> list[Any]:
-    from distributed import as_completed
-    from distributed.client import FutureCancelledError
-    from distributed.comm.core import CommClosedError
-    from distributed.scheduler import KilledWorker
-
-    try:
-        if done is not None:
-            for number, _ in enumerate(as_completed(futures), start=1):  # type: ignore[no-untyped-call]
-                done(number)
-        results: list[Any] = client.gather(futures)
-    except UncertainLTIError:
-        raise
-    except (KilledWorker, CommClosedError, FutureCancelledError, TimeoutError, OSError) as error:
-        raise FitError(f"the Dask cluster gave up ({type(error).__name__}); look at its workers' logs") from None
-    return results
 
 
 def _facts(part: Partition) -> _Facts:

@@ -59,16 +59,18 @@ class AlarmRule:
     horizon: int = 1
 
     def __post_init__(self) -> None:
-        whole = isinstance(self.violations, int) and isinstance(self.window, int)
-        if not (whole and 1 <= self.violations <= self.window <= LONGEST_WINDOW):
+        m, n = self.violations, self.window
+        if not (_whole(m) and _whole(n) and 1 <= m <= n <= LONGEST_WINDOW):
             raise ModelError(
-                f"alarm: violations is {reprlib.repr(self.violations)} of window {reprlib.repr(self.window)}; it takes "
-                f"whole numbers, 1 <= violations <= window <= {LONGEST_WINDOW}"
+                f"alarm: violations is {reprlib.repr(m)} of window {reprlib.repr(n)}; it takes whole numbers, "
+                f"1 <= violations <= window <= {LONGEST_WINDOW}"
             )
-        if not 1 / LARGEST <= self.margin <= LARGEST:
+        if not (_number(self.margin) and 1 / LARGEST <= self.margin <= LARGEST):
             raise ModelError(
-                f"alarm: margin is {self.margin}; it must be a positive number, {1 / LARGEST:g} to {LARGEST:g}"
+                f"alarm: margin is {reprlib.repr(self.margin)}; it must be a positive number, {1 / LARGEST:g} to "
+                f"{LARGEST:g}"
             )
+        object.__setattr__(self, "margin", float(self.margin))
         _check_horizon(self.horizon)
 
     @property
@@ -227,16 +229,15 @@ def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
     needed = ("violations", "window", "margin") if kind == CONTAINMENT else ("window_s", "threshold")
     known = {"kind", "horizon", *needed} | ({"allowance"} if kind == "cusum" else set())
     object_of(data, name, known, needed, remedy=f"{kind} needs {' and '.join(needed)}")
-    for key in ("violations", "window", "horizon"):
-        if key in data and (isinstance(data[key], bool) or not isinstance(data[key], int)):
-            raise ModelError(f"field '{name}.{key}' is {reprlib.repr(data[key])}; it must be a whole number")
-    if "margin" in data and not _number(data["margin"]):
-        raise ModelError(f"field '{name}.margin' is {reprlib.repr(data['margin'])}; it must be a positive number")
     values = {key: value for key, value in data.items() if key != "kind"}
     try:
         return AlarmRule(**values) if kind == CONTAINMENT else StatisticRule(kind, **values)
     except ModelError as error:
         raise ModelError(f"field '{name}': {str(error).removeprefix('alarm: ')}") from None
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def _number(value: Any) -> bool:
@@ -247,8 +248,7 @@ def _number(value: Any) -> bool:
 
 
 def _check_horizon(horizon: Any) -> None:
-    whole = isinstance(horizon, int) and not isinstance(horizon, bool)
-    if not (whole and 1 <= horizon <= MOST_STEPS):
+    if not (_whole(horizon) and 1 <= horizon <= MOST_STEPS):
         raise ModelError(
             f"alarm: horizon is {reprlib.repr(horizon)}; it must be a whole number of steps, 1 to {MOST_STEPS}"
         )

@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.domain import Domain
-from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbroken_over, windows_of
+from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbroken_over
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns, normalised
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, Elements, Term
@@ -188,9 +188,25 @@ class Envelope(Elements):
         `k` (N,): sample that each transition begins with; where one does not follow the one before, windows end; `z`
         (n + m + q, N): normalised, in order of time; `dt` (N,): s; `steps`: lengths, increasing.
         """
-        judge, vectors = self._runner(), z[self._positions]
+        judge, vectors, n, m = self._runner(), z[self._positions], self.n, self.m
         begin = unbroken_over(k, vectors, self.schedule)
-        return windows_of(judge, z, vectors, dt, begin, steps, self.n, self.m)
+        run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
+        done, kept, by_transition = 0, None, np.asfortranarray(z)  # as `advance` reads them
+        for length in steps:
+            judge.advance(run, time, control, by_transition, dt, begin, done, length)
+            done = length
+            start = np.arange(len(dt) - length + 1)
+            whole = begin[start + (length - 1)] <= start
+            if whole.all():
+                count = len(start)
+                if kept is None:  # of a window but its controls are the same for all lengths
+                    kept = np.concatenate([z[:n], control, vectors])
+                np.divide(control[:, :count], time[:count], out=kept[n : n + m, :count])
+                yield Windows(length, start, kept[:, :count], run[:, :count], time[:count])
+            else:
+                start = start[whole]
+                of_each = np.concatenate([z[:n, start], control[:, start] / time[start], vectors[:, start]])
+                yield Windows(length, start, of_each, run[:, start], time[start])
 
     def over_horizons(self, k: NDArray[np.intp], z: Array, dt: Array, x_next: Array) -> tuple[Array, Array]:
         """Where the arrivals x_next (N, n) lie in the envelopes over several steps, and how far from their centres.

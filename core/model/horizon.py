@@ -22,7 +22,7 @@ step by the recorded scheduling vector, and the elements of the horizon by that 
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -32,7 +32,6 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
-from uncertain_lti.kernel.arithmetic import Judge
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import Elements, blocks_of, checked, object_of
 
@@ -102,36 +101,6 @@ def unbroken_over(k: NDArray[np.intp], vectors: Iterable[Array], schedule: Sched
         if axis.modes:
             broken[1:] |= s[1:] != s[:-1]
     return np.maximum.accumulate(np.where(broken, position, 0)) if len(k) else position
-
-
-def windows_of(
-    judge: Judge, z: Array, vectors: Array, dt: Array, begin: NDArray[np.int64], steps: Sequence[int], n: int, m: int
-) -> Iterator[Windows]:
-    """Windows of several lengths over the same transitions.
-
-    `z` (n + m + q, N): normalised [x; u; s] of the transitions, in order of time; `vectors` (axes, N): scheduling
-    vectors, normalised; `dt` (N,): s; `begin` (N,): of `unbroken_over`.
-    """
-    run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
-    done, kept, by_transition = 0, None, np.asfortranarray(z)  # as `advance` reads them
-    for length in steps:
-        judge.advance(run, time, control, by_transition, dt, begin, done, length)
-        done = length
-        last = np.arange(length - 1, len(dt))
-        start = last - (length - 1)
-        whole = begin[last] <= start
-        if whole.all():
-            count = len(start)
-            if kept is None:  # of a window but its controls are the same for all lengths
-                kept = np.concatenate([z[:n], control, vectors])
-            np.divide(control[:, :count], time[:count], out=kept[n : n + m, :count])
-            yield Windows(length, start, kept[:, :count], run[:, :count], time[:count])
-            continue
-        start = start[whole]
-        mean = control[:, start] / time[start]
-        yield Windows(
-            length, start, np.concatenate([z[:n, start], mean, vectors[:, start]]), run[:, start], time[start]
-        )
 
 
 _OF_RESIDUALS = ("mean", "covariance")

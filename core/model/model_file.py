@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import LARGEST, LONGEST_S, Array
+from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import kind_of, written
 from uncertain_lti.base.text import plural
@@ -204,13 +204,7 @@ def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:
         if not isinstance(rules, list):
             raise ModelError("field 'alarm.rules' must be a list of rules")
         return checked_rules([rule_from_dict(rule, f"alarm.rules[{i}]") for i, rule in enumerate(rules)])
-    alarm = object_of(data, "alarm", {"violations", "window", "margin"})
-    for key in ("violations", "window"):
-        if key in alarm and (isinstance(alarm[key], bool) or not isinstance(alarm[key], int)):
-            raise ModelError(f"alarm.{key} is {reprlib.repr(alarm[key])}; it must be a whole number")
-    if "margin" in alarm:
-        alarm["margin"] = _positive(alarm["margin"], "alarm.margin", null=False, most=LARGEST)
-    return (AlarmRule(**alarm),)
+    return (AlarmRule(**object_of(data, "alarm", {"violations", "window", "margin"})),)
 
 
 def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -284,16 +278,16 @@ def _text(value: Any, name: str) -> str:
     return value
 
 
-def _positive(value: Any, name: str, zero: bool = False, null: bool = True, most: float = LONGEST_S) -> float | None:
-    """A number that is positive, or not negative where zero is allowed; None for null where that is."""
-    if value is None and null:
+def _positive(value: Any, name: str, zero: bool = False) -> float | None:
+    """A number of seconds that is positive, or not negative where zero is allowed; None for null."""
+    if value is None:
         return None
     try:
         number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
     except OverflowError:
         number = math.nan
-    if not (0.0 < number <= most or (zero and number == 0.0)):
-        limit = f", at most {most:g}" if number > most else ""
+    if not (0.0 < number <= LONGEST_S or (zero and number == 0.0)):
+        limit = f", at most {LONGEST_S:g}" if number > LONGEST_S else ""
         raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")
     return number
 
