@@ -384,6 +384,7 @@ class Sends:
         self.alarms = [False]
         for name, output in self.node.outputs.publishers.items():
             output.send = self._sends(name)
+        self.sender.changed()
 
     def _sends(self, name: str) -> Any:
         def send(data: bytes) -> None:
@@ -425,6 +426,7 @@ def test_a_subscriber_that_stands_still_costs_outputs_and_no_verdict(
     assert sends.sender.problems
     for output in sends.node.outputs.publishers.values():
         output.listeners = 0
+    sends.sender.changed()
     assert not sends.sender.problems, "nobody listens that could stand still"
     stream_cases.end([sends.node])
 

@@ -92,7 +92,8 @@ class Node(node_module.EnvelopeMonitorNode):
         for name, output in self.outputs.publishers.items():
             output.send = self._keeps(name)
             output.listeners = int(name not in silent)
-            output.poll = lambda: None
+            output.poll = lambda: False
+        self.outputs.sender.changed()
         self.tick()
 
     def _keeps(self, name: str) -> Callable[[bytes], None]:

@@ -85,11 +85,10 @@ def run(args: argparse.Namespace) -> Result:
     t, what = _fault(bags / CHECK)
     left = offline.transient.t_ns[0] + t * 1e9
     after = offline.judged & (offline.transient.t_ns > left)
-    say(
-        f"at {t:.2f} s {what}: violated in {int((offline.violated & ~after).sum())} of "
-        f"{int((offline.judged & ~after).sum())} verdicts before and {int((offline.violated & after).sum())} of "
-        f"{int(after.sum())} after"
+    (early, of_early), (late, of_late) = (
+        [int((marks & part).sum()) for marks in (offline.violated, offline.judged)] for part in (~after, after)
     )
+    say(f"at {t:.2f} s {what}: violated in {early} of {of_early} verdicts before and {late} of {of_late} after")
     raised = offline.transient.t[offline.alarm]
     say(
         "the alarm is raised "
@@ -110,8 +109,8 @@ def run(args: argparse.Namespace) -> Result:
         "verdicts": len(expected),
         "equal_live_and_offline": same,
         "fault": {"t": t, "what": what},
-        "violated_before": int((offline.violated & ~after).sum()),
-        "violated_after": int((offline.violated & after).sum()),
+        "violated_before": early,
+        "violated_after": late,
         "first_alarm_t": float(raised[0]) if len(raised) else None,
         "figures": [str(output / name) for name in figures],
     }

@@ -277,17 +277,12 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     @_failures_noted
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Forget the model."""
+        """Release all resources, the model among them."""
         result = super().on_cleanup(state)
         self._release()
         return result
 
-    @_failures_noted
-    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
-        """Release all resources."""
-        result = super().on_shutdown(state)
-        self._release()
-        return result
+    on_shutdown = on_cleanup
 
     def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Release all resources; the node can be configured again."""

@@ -198,16 +198,16 @@ class _File:
         if self.began is None:
             self.began, self._first = time.monotonic(), log_time
         self._last = max(log_time, self._last)  # a clock that is set back must not reorder what was received
-        try:
-            self._writer.add_message(channel, self._last, bytes(data), self._last, self.count)
-        except OSError as error:
-            raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
+        self._to_disk(self._writer.add_message, channel, self._last, bytes(data), self._last, self.count)
         self.count += 1
         self.counts[self._topics[channel]] += 1
 
     def flush(self) -> None:
+        self._to_disk(self._writer.flush)
+
+    def _to_disk(self, write: Callable[..., None], *arguments: Any) -> None:
         try:
-            self._writer.flush()
+            write(*arguments)
         except OSError as error:
             raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
 

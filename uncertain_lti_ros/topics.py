@@ -165,8 +165,8 @@ class MatchedSubscription:
     `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw, and
     when it was published, ns by its publisher; `requested`: what the user requests; `raw`: whether the callback takes
     bytes; `received, lost, late`: messages received, those lost on the way or in the queue, and deadlines missed by
-    publishers; `last`: the last message; `publishers`: publishers of this type that the graph knows; `problems`:
-    publishers that cannot be heard and why, one sentence each.
+    publishers; `last`: the last message; `publishers`: publishers of this type that the graph knows; `qos`: what
+    is asked of them now; `problems`: publishers that cannot be heard and why, one sentence each.
 
     The middleware reports what its writer gives up, and not what full queues of this reader push out; the numbers that
     a publisher gives its messages show both, as long as it is the only one.
@@ -194,7 +194,6 @@ class MatchedSubscription:
         self.look_soon = False
         self._published: float | None = None  # since when there are publishers, steady time in s
         self._subscription: Subscription | None = None
-        self._events: PolledEvents | None = None
         self.look()
 
     def nothing_for(self) -> float:
@@ -205,11 +204,6 @@ class MatchedSubscription:
     def lost(self) -> int:
         """Messages lost on the way or in the queue; those that both ways of counting show count once."""
         return max(self._reported_lost, self._skipped)
-
-    @property
-    def qos(self) -> QoSProfile:
-        """What is asked of publishers now."""
-        return self._qos
 
     def look(self) -> None:
         """Compare the subscription with what publishers offer now, and replace it if it must change."""
@@ -227,13 +221,13 @@ class MatchedSubscription:
         if self._subscription is None:
             self._subscribe(choose_qos(offers, self._requested))
         elif offers:  # when the last publisher leaves, the next one is likely to offer the same
-            lasting = self._qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+            lasting = self.qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
             qos = choose_qos(offers, self._requested, history=lasting or not self.received)
-            if _policies(qos) != _policies(self._qos):
+            if _policies(qos) != _policies(self.qos):
                 self.destroy()
                 self._subscribe(qos)
         self.problems = sorted(
-            {f"{self.topic}: a publisher cannot be heard, {p}" for o in offers for p in incompatible(self._qos, o)}
+            {f"{self.topic}: a publisher cannot be heard, {p}" for o in offers for p in incompatible(self.qos, o)}
             | {
                 f"{self.topic}: a publisher sends {i.topic_type}, and {self.type_name} is wanted"
                 for i in infos
@@ -243,18 +237,18 @@ class MatchedSubscription:
 
     def destroy(self) -> None:
         """Stop receiving."""
-        if self._subscription is not None and self._events is not None:
+        if self._subscription is not None:
             self._events.destroy()
             self._node.destroy_subscription(self._subscription)
-            self._subscription = self._events = None
+            self._subscription = None
 
     def poll(self) -> None:
         """Read the events of the middleware: publishers that came or left, messages lost, deadlines missed."""
-        if self._events is not None:
+        if self._subscription is not None:
             self._events.poll()
 
     def _subscribe(self, qos: QoSProfile) -> None:
-        self._qos = qos
+        self.qos = qos
         events = SubscriptionEventCallbacks(
             incompatible_qos=self._changed,
             matched=self._changed,
@@ -309,40 +303,27 @@ def sendable(names: Sequence[str], velocities: bool = False) -> NamedVector:
 class OutputPublisher:
     """One topic of the node, and how many listen to it; takes serialised messages.
 
-    `node`: the node; `kind`: message class; `name`: of the topic, below the node's; `qos`: what is offered; `changed`:
-    called when there are more or fewer listeners; `send`: publishes the bytes of a message; `look`: logs who cannot
+    `node`: the node; `kind`: message class; `name`: of the topic, below the node's; `qos`: what is offered;
+    `listeners`: subscriptions at the last poll; `send`: publishes the bytes of a message; `look`: logs who cannot
     listen, by the events of the middleware.
     """
 
-    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile, changed: Callable[[], None]) -> None:
-        self._node, self._changed = node, changed
+    def __init__(self, node: LifecycleNode, kind: Any, name: str, qos: QoSProfile) -> None:
+        self._node, self.listeners = node, 0
         self._publisher = node.create_lifecycle_publisher(kind, f"~/{name}", qos)
         self._events = PolledEvents(node, self._publisher)
         self.look = self._events.poll
-        self.listeners = 0
         # Past the check of the lifecycle state: the node publishes only while it is active.
         self.send = self._publisher.handle.publish_raw
 
-    @property
-    def listeners(self) -> int:
-        """Subscriptions at the last poll."""
-        return self._listeners
-
-    @listeners.setter
-    def listeners(self, count: int) -> None:
-        """Take another number."""
-        self._listeners = count
-        self._changed()
-
-    def poll(self) -> None:
-        """Count the listeners; events would cost ten times as much."""
-        count = self._publisher.handle.get_subscription_count()
-        if count != self._listeners:
-            self.listeners = count
+    def poll(self) -> bool:
+        """Count the listeners, and whether there are more or fewer; events would cost ten times as much."""
+        before, self.listeners = self.listeners, self._publisher.handle.get_subscription_count()
+        return self.listeners != before
 
     def destroy(self, patience: float) -> None:
         """Stop publishing, once every reliable reader has everything."""
-        if self._listeners:
+        if self.listeners:
             self._publisher.wait_for_all_acked(Duration(seconds=patience))
         self._events.destroy()
         self._node.destroy_lifecycle_publisher(self._publisher)
@@ -367,9 +348,8 @@ class Outputs:
         kept = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         offers = {VIOLATION: beat, REASON: kept}
         for output in OUTPUTS:
-            offered = offers.get(output, qos)
-            kind = message_class(output.type)
-            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered, self.sender.changed)
+            kind, offered = message_class(output.type), offers.get(output, qos)
+            self.publishers[output.name] = OutputPublisher(self._node, kind, output.name, offered)
         self.sender.open(self.publishers)
 
     def prepare(self, session: Session) -> None:
@@ -379,8 +359,8 @@ class Outputs:
 
     def poll(self) -> None:
         """Update the numbers of listeners."""
-        for publisher in self.publishers.values():
-            publisher.poll()
+        if any([publisher.poll() for publisher in self.publishers.values()]):
+            self.sender.changed()
 
     def look(self) -> None:
         """Log who asks for what is not offered."""
