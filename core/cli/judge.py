@@ -111,6 +111,7 @@ def _judged(options: argparse.Namespace) -> Judged:
 def run_check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.reports.check import check_data, check_text, outcome
+    from uncertain_lti.reports.drift import drift_in_words
 
     judged = _judged(options)
     model, bags, deployed = judged.model, judged.bags, judged.deployed
@@ -134,10 +135,13 @@ def run_check(options: argparse.Namespace) -> Result:
     status = judged.status
     if status == DONE and any(r["outcome"] == "unknown" for r in results):
         status = UNKNOWN
+    drift = drift_in_words(model, results)
+    for text in drift:
+        options.say(text)
     of_all = "unknown" if status == BAD_INPUT else outcome(results)
     ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
     about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **ended}
-    return Result(status, {**about, "recordings": results, "not_checked": judged.refused})
+    return Result(status, {**about, "recordings": results, "drift": drift, "not_checked": judged.refused})
 
 
 # --- report ----------------------------------------------------------------------------------------------------------

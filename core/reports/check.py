@@ -70,6 +70,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     transient, judged = verdicts.transient, int(verdicts.judged.sum())
     data: dict[str, Any] = {
         "recording": transient.name,
+        "t_ns": int(transient.t_ns[0]),
         "samples": len(transient),
         "seconds": float(np.abs(np.diff(transient.t_ns)).sum()) * 1e-9,
         "verdicts": judged,
@@ -125,7 +126,8 @@ def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]
     change, largest = jumps(model, np.concatenate([np.full((1, model.n), np.nan), x[:-1]]), x)
     states = {}
     for i, name in enumerate(model.state_names):
-        bad, own = np.flatnonzero(verdicts.flags[:, i] == 1.0), int((~np.isnan(verdicts.flags[:, i])).sum())
+        there = ~np.isnan(verdicts.flags[:, i])
+        bad, own = np.flatnonzero(verdicts.flags[:, i] == 1.0), int(there.sum())
         width = (verdicts.upper - verdicts.lower)[verdicts.judged, i]
         mean = float(np.nanmean(width)) if own else None
         values = x[np.isfinite(x[:, i]), i]
@@ -139,6 +141,7 @@ def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]
             "range": span,
             "width_to_range": mean / span if span and mean is not None else None,
             "worst": _worst(verdicts, i, bad),
+            "largest": abs(_worst(verdicts, i, np.flatnonzero(there))["utilisation"] or 0.0),
             "unit": model.signals.states[i].unit,
             "jump": _jump(verdicts, name, bad, change[:, i], float(largest[i])),
         }

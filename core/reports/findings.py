@@ -24,6 +24,7 @@ from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import UNVOUCHED, check_data
+from uncertain_lti.reports.drift import drift_in_words
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -297,6 +298,8 @@ def _recording_reasons(
         yield NO, "recordings", text
     if outside > OUTSIDE_DOMAIN:
         yield CARE, "recordings", f"{_percent(outside)} of the verdicts are outside the ranges seen in the fit"
+    for text in drift_in_words(model, recordings):
+        yield CARE, "drift", text
     if silent > WITHOUT_VERDICT:
         yield CARE, "recordings", f"{_percent(silent)} of the samples have no verdict (gaps, missing values)"
 

@@ -1,0 +1,75 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Drift: how the largest utilisation moves over recordings, in words; a person decides to update the model."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+import numpy as np
+
+from uncertain_lti.base.text import plural, shortened
+from uncertain_lti.model.alarm_rule import StatisticRule
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+
+CHANCE, RECORDINGS = 0.01, 5
+"""Share of checks in which a state at most seems to move that does not, and recordings from which on one shows it."""
+_WEEK, _YEAR_2001, _FAR = 7 * 86_400e9, 978_307_200e9, 520
+"""ns; ns since 1970; weeks or recordings from which on nobody wants to know."""
+
+
+def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[str]:
+    """A sentence on each state whose largest utilisation moves, and when it reaches its threshold.
+
+    Its logarithm is a line over the weeks, or over the recordings where their stamps are no dates; `recordings`: as of
+    `check_data`.
+    """
+    from scipy.special import stdtrit  # scipy.stats takes a second to import
+
+    some = sorted((r for r in recordings if r["verdicts"]), key=lambda r: int(r["t_ns"]))
+    if len(some) < RECORDINGS:
+        return []
+    stamps = np.array([r["t_ns"] for r in some], dtype=np.float64)
+    dated = stamps[0] > _YEAR_2001 and stamps[-1] - stamps[0] > _WEEK
+    unit, at = ("week", (stamps - stamps[0]) / _WEEK) if dated else ("recording", np.arange(len(some)) * 1.0)
+    x, found = at - at.mean(), []
+    sure = float(stdtrit(len(x) - 2, 1.0 - CHANCE / (2 * model.n)))
+    for name, limit in zip(model.state_names, _limits(model), strict=True):
+        peaks = np.array([r["states"][name]["largest"] or math.nan for r in some])
+        y = np.log(peaks) - np.log(peaks).mean()
+        slope = float(x @ y / (x @ x))
+        error = float(np.linalg.norm(y - slope * x)) / math.sqrt((len(x) - 2) * float(x @ x))
+        if not abs(slope) > sure * error:  # not of what was not judged, either
+            continue
+        text = f"the largest utilisation of {shortened(name)} {'rises' if slope > 0.0 else 'falls'} by "
+        text += f"{100 * abs(math.expm1(slope)):.2g} % a {unit} over {plural(len(x), 'recording')}"
+        left = (math.log(limit) - float(np.log(peaks).mean())) / slope - float(x[-1])
+        if slope > 0.0 and left < _FAR:
+            when = f"in {plural(math.ceil(left), 'recording')}"
+            if dated:
+                when = f"on {datetime.fromtimestamp(stamps[-1] / 1e9, UTC) + timedelta(weeks=left):%Y-%m-%d}"
+            text += f"; at that rate it reaches its threshold of {limit:.3g} {when}" if left > 0.0 else "; it is past "
+            text += "" if left > 0.0 else f"its threshold of {limit:.3g}"
+            text += (
+                ", and the promised rate of false alarms no longer holds: if the machine is healthy, update the model"
+            )
+        found.append(text)
+    return found
+
+
+def _limits(model: UncertainLTI) -> list[float]:
+    """|utilisation| of each state in one verdict that raises the alarm."""
+    for rule in model.alarm:
+        if isinstance(rule, StatisticRule) and (rule.kind, rule.window_s, rule.horizon) == ("energy", 0.0, 1):
+            return [math.sqrt(threshold) for threshold in rule.thresholds(model.n)]
+    return [model.alarm_rule.margin] * model.n

@@ -1,0 +1,51 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Drift: `check` says how the largest utilisation moves over recordings, and when it reaches its threshold."""
+
+import numpy as np
+import pytest
+from test_update import runs_of
+
+from uncertain_lti import EnvelopeMonitor, Transient, fit
+from uncertain_lti.reports.check import check_data
+from uncertain_lti.reports.drift import drift_in_words
+
+
+@pytest.fixture(scope="module")
+def model():
+    return fit(runs_of(1, (3000, 3000)), "qp", additive="noise", alarm="containment")
+
+
+def checked(model, growth, apart, first=1_790_000_000.0, count=8):
+    """Facts of recordings of a healthy plant whose deviation in x1 grows from one to the next."""
+    found = []
+    for number, run in enumerate(runs_of(1, (1500,) * count, noise=0.003)):
+        x, t = run.x.copy(), run.t + first + number * apart
+        x[750, 0] += 0.004 * np.exp(growth * number)
+        found.append(check_data(model, EnvelopeMonitor(model).check(Transient(t, x, run.u)), samples=False))
+    return found
+
+
+def test_what_rises_is_said_with_the_day_on_which_it_is_too_much(model):
+    (text,) = drift_in_words(model, checked(model, 0.1, 7 * 86_400.0))
+    assert text.startswith("the largest utilisation of x1 rises by ") and "a week over 8 recordings" in text
+    assert "reaches its threshold of 1 on 2026-1" in text and "if the machine is healthy, update the model" in text
+
+
+def test_without_dates_recordings_are_counted(model):
+    (text,) = drift_in_words(model, checked(model, 0.1, 0.0, 0.0))
+    assert "a recording over 8 recordings" in text and "reaches its threshold of 1 in" in text
+    (text,) = drift_in_words(model, checked(model, 0.3, 0.0, 0.0))
+    assert "it is past its threshold of 1" in text
+
+
+def test_what_does_not_move_or_is_short_is_not_said(model):
+    assert drift_in_words(model, checked(model, 0.0, 7 * 86_400.0)) == []
+    assert drift_in_words(model, checked(model, 0.1, 7 * 86_400.0, count=4)) == []
