@@ -152,9 +152,10 @@ def fit(
             when = {"t": float(of.t[k]), "t_ns": int(of.t_ns[k])}
             discarded.append({"file": of.name, "k": k, **when, "effect": effect})
         problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
+    fleet = Fleet.of(problem) if method == "working-set" else Fleet([problem])
     with contradiction_named(where, signals):
         model = fit_fleet(
-            Fleet.of(problem) if method == "working-set" else Fleet([problem]),
+            fleet,
             signals,
             criterion,
             structure=structure,
@@ -189,7 +190,9 @@ def fit(
     if not horizons:
         model = model.replace(fit_summary=facts)
         plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
-        return model.replace(memory=_memory(model, problem, transients)) if plain and describe_data else model
+        return (
+            model.replace(memory=_memory(model, problem, transients, fleet.sums)) if plain and describe_data else model
+        )
     lengths = [int(h) for h in horizons]
     model = model.replace(run=better_run(model, problem, lengths, structure))
     over, facts["horizons"], dropped, solvers = fit_horizons(model, problem, lengths, widths, criterion, progress)
@@ -201,12 +204,14 @@ def fit(
     return model.replace(fit_summary=facts, horizons=over, run=model.run if over else None)
 
 
-def _memory(model: UncertainLTI, problem: Problem, transients: Sequence[Transient]) -> dict[str, Any] | None:
+def _memory(
+    model: UncertainLTI, problem: Problem, transients: Sequence[Transient], sums: Moments
+) -> dict[str, Any] | None:
     """What the file of a plain model keeps of its recordings."""
     edges = np.searchsorted(problem.source, np.arange(len(transients) + 1)).tolist()
     each = zip(transients, edges[:-1], edges[1:], strict=True)
     recordings = [Recording.of(t.name, problem.subset(slice(a, b))) for t, a, b in each]
-    return remembered(model, problem, recordings)
+    return remembered(model, problem, recordings, sums)
 
 
 @one_thread_each()

@@ -46,8 +46,10 @@ class Fleet:
     """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
 
     `partitions`: with the same columns, states and controls; `threads`: how many partitions a pass visits at a time,
-    which the kernel does without the interpreter's lock.
+    which the kernel does without the interpreter's lock; `sums`: those of the last `moments`.
     """
+
+    sums: Moments
 
     def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
         self.partitions = list(partitions)
@@ -80,7 +82,7 @@ class Fleet:
     def moments(self, stride: int) -> tuple[Moments, list[Samples]]:
         """One pass for sums over all transitions, and a sample of them."""
         results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
-        total = sum((sums for sums, _ in results[1:]), results[0][0])
+        self.sums = total = sum((sums for sums, _ in results[1:]), results[0][0])
         return total, [Samples.join([r[1][i] for r in results], self.p) for i in range(self.n)]
 
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:

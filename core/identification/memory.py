@@ -29,8 +29,10 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.columns import Columns
-from uncertain_lti.identification.passes import Moments, moments
+from uncertain_lti.identification.fleet import Fleet
+from uncertain_lti.identification.passes import Candidate, Moments, moments, scan
 from uncertain_lti.identification.problem import Block, Problem
+from uncertain_lti.kernel.arithmetic import boxes_of
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 
@@ -38,6 +40,10 @@ BYTES, _PER_STATE, _MOST = 720_000, 90_000, 8_000_000
 """What is kept at most, of all and per state, unless those that decide take more; in the file it takes a third more."""
 _STEPS = 254
 """In so many steps the range of a value is divided in the file; with one to round outwards they fill a byte."""
+_MANY = 20_000
+"""Transitions from which on it is first seen in about so many how near the nearest are."""
+_LOOKED_AT = 1000
+"""Transitions at least by which a recording is recognised, if it has as many."""
 _AGAIN = "fit again with all recordings"
 
 
@@ -50,7 +56,8 @@ class Recording(NamedTuple):
     @classmethod
     def of(cls, name: str, problem: Problem) -> Recording:
         """That of these transitions."""
-        return cls(name, _mark((problem.z_columns, problem.next_columns, problem.dt)))
+        some = problem.block(slice(None)).every(0, max(1, problem.N // _LOOKED_AT))
+        return cls(name, _mark((some.z, some.x_next, some.dt, np.array([problem.N]))))
 
 
 @dataclass(frozen=True)
@@ -67,10 +74,14 @@ class Boxes:
     source: NDArray[np.intp]
 
     @classmethod
-    def of(cls, model: UncertainLTI, block: Block, source: NDArray[np.intp], widest: Array | None) -> Boxes:
-        """Of each transition one."""
-        values = np.vstack([block.z * block.dt, block.dt])
-        return cls(values, values, _room(model, block, widest), source)
+    def of(
+        cls, model: UncertainLTI, block: Block, source: NDArray[np.intp], widest: Array | None, numbers: Index
+    ) -> Boxes:
+        """Of transitions that are in a box together; `numbers` (K,): that of each, in order, -1 for none."""
+        number, first = np.unique(numbers, return_index=True)
+        first, count = first[number >= 0], int(number[-1]) + 1
+        of = boxes_of(model.tables, block.z, block.dt, block.x_next, block.base, widest, numbers, count)
+        return cls(*of, source[first])
 
     @classmethod
     def join(cls, parts: Sequence[Boxes]) -> Boxes:
@@ -83,8 +94,7 @@ class Boxes:
 
     def fewer(self, first: int, share: float) -> Boxes:
         """About this share of them, those that follow each other in one; `first`: of those before these."""
-        number = (share * np.arange(first, first + len(self.source))).astype(np.intp)
-        starts = np.flatnonzero(np.diff(number, prepend=-1) | np.diff(self.source, prepend=-1))
+        starts = np.flatnonzero(np.diff(_numbers(self.source, first, share), prepend=-1))
         low, room = (np.minimum.reduceat(values, starts, axis=1) for values in (self.low, self.room))
         return Boxes(low, np.maximum.reduceat(self.high, starts, axis=1), room, self.source[starts])
 
@@ -133,11 +143,10 @@ class Boxes:
         return cls(least + step * low, least + step * high, top * (room / 255.0) ** 2, source)
 
 
-def _room(model: UncertainLTI, block: Block, widest: Array | None) -> Array:
-    """`Boxes.room` of each transition."""
-    centre, half = model.columns_centre_and_half(np.ascontiguousarray(block.z), block.dt)
-    above, narrower = block.x_next - centre, [] if widest is None else [widest[:, None] - half]
-    return np.vstack([half - above, half + above, *narrower])
+def _numbers(source: NDArray[np.intp], first: int, share: float) -> Index:
+    """Numbers (K,) from 0 of boxes, about this share of what goes into them, those of one recording that follow."""
+    number = (share * np.arange(first, first + len(source))).astype(np.intp)
+    return np.cumsum((np.diff(number, prepend=-1) | np.diff(source, prepend=-1)) != 0) - 1
 
 
 def _products(change: Array, low: Array, high: Array) -> tuple[Array, Array]:
@@ -217,13 +226,14 @@ def remembered(
     model: UncertainLTI,
     problem: Problem,
     recordings: Sequence[Recording],
+    sums: Moments,
     rest: Moments | None = None,
     boxes: Boxes | None = None,
 ) -> dict[str, Any] | None:
     """What the file of a model keeps of transitions, beside what was kept of others already.
 
     None if there is no room for those that decide. `problem`: `source` being the number of the recording, rising;
-    `boxes`: with the room that the model leaves.
+    `sums`: over its transitions; `boxes`: with the room that the model leaves.
     """
     n, p, widths = model.n, problem.p, model.fit_summary["criterion"] == "lp"
     unknowns, each, box = problem.columns.unknowns(p), 8 * (p + n + 3), 2 * (p + 1) + (3 if widths else 2) * n
@@ -233,17 +243,21 @@ def remembered(
         if most <= n * unknowns:
             return None
         widest = 0.5 * np.asarray(model.fit_summary["max_width"]) if widths else None
-        sums = moments(problem)[0]
         kept = _nearest(model, problem, sums if rest is None else sums + rest, widest, most)
         left = np.ones(problem.N, dtype=bool)
         left[kept] = False
+        if not problem.columns.half:  # at rest there is no room, and no model changes that
+            left &= problem.z_columns.any(axis=0)
         chosen, first = problem.subset(kept), 0 if boxes is None else len(boxes.source)
         share = min(max(room - most * each, room // 5) // box / (first + problem.N - len(kept)), 1.0)
         parts = [] if boxes is None else [boxes.fewer(0, share)]
         for block in problem.blocks():
             part = slice(block.start, block.start + len(block))
-            of = Boxes.of(model, block, problem.source[part], widest)[left[part]]
-            parts, first = [*parts, of.fewer(first, share)] if len(of.source) else parts, first + len(of.source)
+            numbers, of = np.full(len(block), -1), np.flatnonzero(left[part])
+            numbers[of] = _numbers(problem.source[part][of], first, share)
+            first += len(of)
+            if len(of):
+                parts.append(Boxes.of(model, block, problem.source[part], widest, numbers))
         others = sums - moments(chosen)[0]
         problem, rest, boxes = chosen, others if rest is None else rest + others, Boxes.join(parts)
     return Memory(problem, rest, boxes, tuple(recordings)).to_dict(model)
@@ -255,24 +269,28 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     The size of a transition is (Δt φ)ᵀ P⁻¹ (Δt φ) + (Δt ψ)ᵀ Q⁻¹ (Δt ψ), its root, P and Q the means of the squares
     over all: by so much its room may change as the elements do.
     """
-    n, count = model.n, -(-4 * most // model.n)
+    n, count, limit = model.n, -(-4 * most // model.n), None if widest is None else 2.0 * widest
+    unit, reach = 1.0 / np.where(sums.psi_scale > 0.0, sums.psi_scale, np.inf), np.full(n, np.inf)
+    theta, d = _elements(model, problem.columns)
+    part = problem.subset(np.arange(0, problem.N, -(-problem.N // _MANY)))
+    share = part.N / problem.N
+    if share < 1.0:  # of fewer transitions, how near those are that are wanted
+        some = Candidate(theta, d, unit, np.ones(n), limit, reach, reach, int(2 * share * count) + 50, np.arange(n))
+        reach = np.array([found for _, found in scan(part, some)])
+    candidate = Candidate(theta, d, unit, np.ones(n), limit, reach, reach, count, np.arange(n))
+    some = np.unique(np.concatenate([samples.index for samples, _ in Fleet.of(problem).scan(candidate)]))
+    of = problem.subset(some)
+    phi, psi = of.phi().T * of.dt, of.psi().T * of.dt
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
-    values = np.empty((n if widest is None else 2 * n, 0))
-    held = values.astype(np.intp)
-    for block in problem.blocks():
-        wide = np.square(to_half @ (problem.columns.psi(block.z, block.dt, None) * block.dt)).sum(axis=0)
-        size = np.square(to_nominal @ (problem.columns.phi(block.z, None) * block.dt)).sum(axis=0) + wide
-        room = _room(model, block, widest)
-        near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
-        near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
-        index = np.broadcast_to(np.arange(block.start, block.start + len(block)), near.shape)
-        values, held = np.hstack([values, near]), np.hstack([held, index])
-        if values.shape[1] > count:
-            least = np.argpartition(values, count, axis=1)[:, :count]
-            values, held = np.take_along_axis(values, least, axis=1), np.take_along_axis(held, least, axis=1)
-    ranked = np.take_along_axis(held, np.argsort(values, axis=1, kind="stable"), axis=1)
-    index, first = np.unique(ranked.T, return_index=True)
-    return np.sort(index[np.argsort(first)[:most]])
+    wide = np.square(to_half @ psi).sum(axis=0)
+    size = np.square(to_nominal @ phi).sum(axis=0) + wide
+    *_, room = boxes_of(
+        model.tables, of.z_columns, of.dt, of.next_columns, None, widest, np.arange(len(some)), len(some)
+    )
+    near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
+    near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
+    index, first = np.unique(np.argsort(near, axis=1, kind="stable")[:, :count].T, return_index=True)
+    return np.sort(some[index[np.argsort(first)[:most]]])
 
 
 def _root(gram: Array) -> Array:

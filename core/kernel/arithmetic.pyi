@@ -186,5 +186,15 @@ def verdicts(
     s: Array | None,
     roots: Array,
 ) -> tuple[Any, ...]: ...
+def boxes_of(
+    tables: tuple[Array, Array, Array],
+    z: Array,
+    dt: Array,
+    after: Array,
+    base: Array | None,
+    widest: Array | None,
+    numbers: NDArray[np.intp],
+    count: int,
+) -> tuple[Array, Array, Array]: ...
 def normalised_columns(values: Array, k: NDArray[np.intp], steady: Any, scale: Any, out: Array) -> float: ...
 def changes(values: Array, k: NDArray[np.intp]) -> tuple[NDArray[np.bool_], Array]: ...

@@ -254,6 +254,58 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     return outside, largest[0], largest[1], total, np.stack([mirrored(part) for part in products]), *widths
 
 
+def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):
+    """Ranges of [dt z; dt] over transitions that are in a box together, and the least room that bounds leave them.
+
+    `tables`: as of `centre_and_half`; `widest` (n,): largest half-widths, or None; `numbers` (K,): the box of each, of
+    so many; -1 for none. Returns low, high (p + 1, count) and (2 n or 3 n, count) the least distance of the next state
+    from the upper bound, from the lower one, and of the half-width from the largest.
+    """
+    cdef Elements elements = Elements(*tables)
+    cdef Tiles tiles = Tiles(elements.n, elements.p, z, dt, base, after)
+    cdef Py_ssize_t i, j, q, b, n = elements.n, p = tiles.p
+    cdef const Py_ssize_t[:] box = np.ascontiguousarray(numbers, dtype=np.intp)
+    cdef arrays.array most = doubles([] if widest is None else widest)
+    cdef bint limited = widest is not None
+    if len(numbers) != tiles.count or (limited and len(widest) != n) or (
+        tiles.count and not -1 <= np.min(numbers) <= np.max(numbers) < count
+    ):
+        raise ValueError("the boxes do not fit the transitions")
+    low, high = np.full((p + 1, count), np.inf), np.full((p + 1, count), -np.inf)
+    left = np.full(((3 if limited else 2) * n, count), np.inf)
+    cdef double[:, ::1] least = low
+    cdef double[:, ::1] largest = high
+    cdef double[:, ::1] room = left
+    cdef double* psi = room_for(elements.p + 2)
+    cdef double* centre = psi + elements.p * _TOGETHER
+    cdef double* half = centre + _TOGETHER
+    cdef double value
+    with nogil:
+        while tiles.take():
+            tiles.sizes(elements.p, psi)
+            for j in range(p + 1):
+                for q in range(tiles.many):
+                    b = box[tiles.index[q]]
+                    if b >= 0:
+                        value = tiles.step[q] * (tiles.phi[j * _TOGETHER + q] if j < p else 1.0)
+                        least[j, b] = value if value < least[j, b] else least[j, b]
+                        largest[j, b] = value if value > largest[j, b] else largest[j, b]
+            for i in range(n):
+                tiles.bounds(elements, i, psi, centre, half)
+                for q in range(tiles.many):
+                    b = box[tiles.index[q]]
+                    if b >= 0:
+                        value = half[q] - (tiles.end[i * _TOGETHER + q] - centre[q])
+                        room[i, b] = value if value < room[i, b] else room[i, b]
+                        value = half[q] + (tiles.end[i * _TOGETHER + q] - centre[q])
+                        room[n + i, b] = value if value < room[n + i, b] else room[n + i, b]
+                        if limited:
+                            value = most.data.as_doubles[i] - half[q]
+                            room[2 * n + i, b] = value if value < room[2 * n + i, b] else room[2 * n + i, b]
+    free(psi)
+    return low, high, left
+
+
 def normalised_columns(values, k, steady, scale, out):
     """Rows k (K,) of recorded values (N, n), normalised, into columns (n, K); the sum of their squares."""
     cdef const double[:, :] rows = values
