@@ -269,16 +269,17 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     The size of a transition is (Δt φ)ᵀ P⁻¹ (Δt φ) + (Δt ψ)ᵀ Q⁻¹ (Δt ψ), its root, P and Q the means of the squares
     over all: by so much its room may change as the elements do.
     """
-    n, count, limit = model.n, -(-4 * most // model.n), None if widest is None else 2.0 * widest
+    n, count = model.n, -(-4 * most // model.n)
     unit, reach = 1.0 / np.where(sums.psi_scale > 0.0, sums.psi_scale, np.inf), np.full(n, np.inf)
     theta, d = _elements(model, problem.columns)
     part = problem.subset(np.arange(0, problem.N, -(-problem.N // _MANY)))
     share = part.N / problem.N
     if share < 1.0:  # of fewer transitions, how near those are that are wanted
-        some = Candidate(theta, d, unit, np.ones(n), limit, reach, reach, int(2 * share * count) + 50, np.arange(n))
-        reach = np.array([found for _, found in scan(part, some)])
-    candidate = Candidate(theta, d, unit, np.ones(n), limit, reach, reach, count, np.arange(n))
-    some = np.unique(np.concatenate([samples.index for samples, _ in Fleet.of(problem).scan(candidate)]))
+        some = Candidate(theta, d, unit, np.ones(n), None, reach, reach, int(2 * share * count) + 50, np.arange(n))
+        reach = np.array([least for _, least in scan(part, some)])
+    candidate = Candidate(theta, d, unit, np.ones(n), None, reach, reach, count, np.arange(n))
+    found = [samples.index for samples, _ in Fleet.of(problem).scan(candidate)]
+    some = np.unique(np.concatenate(found if widest is None else [*found, _widest(problem, d, count)]))
     of = problem.subset(some)
     phi, psi = of.phi().T * of.dt, of.psi().T * of.dt
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
@@ -291,6 +292,19 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
     index, first = np.unique(np.argsort(near, axis=1, kind="stable")[:, :count].T, return_index=True)
     return np.sort(some[index[np.argsort(first)[:most]]])
+
+
+def _widest(problem: Problem, d: Array, count: int) -> Index:
+    """The transitions of the largest half-widths, so many in each row."""
+    values, held = np.empty((problem.n, 0)), np.empty((problem.n, 0), np.intp)
+    for block in problem.blocks():
+        half = d.T @ problem.columns.psi(block.z, block.dt, None) * block.dt
+        index = np.broadcast_to(np.arange(block.start, block.start + len(block)), half.shape)
+        values, held = np.hstack([values, half]), np.hstack([held, index])
+        if values.shape[1] > count:
+            most = np.argpartition(values, -count, axis=1)[:, -count:]
+            values, held = np.take_along_axis(values, most, axis=1), np.take_along_axis(held, most, axis=1)
+    return np.unique(held)
 
 
 def _root(gram: Array) -> Array:
