@@ -275,8 +275,9 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     part = problem.subset(np.arange(0, problem.N, -(-problem.N // _MANY)))
     share = part.N / problem.N
     if share < 1.0:  # of fewer transitions, how near those are that are wanted
-        some = Candidate(theta, d, unit, np.ones(n), None, reach, reach, int(2 * share * count) + 50, np.arange(n))
-        reach = np.array([least for _, least in scan(part, some)])
+        wanted = int(2 * share * count) + 50
+        few = Candidate(theta, d, unit, np.ones(n), None, reach, reach, wanted, np.arange(n))
+        reach = np.array([least for _, least in scan(part, few)])
     candidate = Candidate(theta, d, unit, np.ones(n), None, reach, reach, count, np.arange(n))
     found = [samples.index for samples, _ in Fleet.of(problem).scan(candidate)]
     some = np.unique(np.concatenate(found if widest is None else [*found, _widest(problem, d, count)]))
