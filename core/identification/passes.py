@@ -75,34 +75,15 @@ class Moments:
         return replace(self, **{name: getattr(self, name) - getattr(other, name) for name in names})
 
     def one_block(self) -> Moments:
-        """The sums of the same transitions with one block for all: the weights of a schedule add up to 1."""
+        """The sums with one block for all, but those of weights: the weights of a schedule add up to 1."""
         count = len(self.visits)
-        if count == 1:
-            return self
-        n = len(self.rate_square)
 
-        def fold(sums: Array, *axes: int) -> Array:
-            for axis in axes:
-                size = sums.shape[axis] // count
-                split = (*sums.shape[:axis], count, size, *sums.shape[axis + 1 :])
-                sums = sums.reshape(split).sum(axis=axis)
-            return sums
+        def fold(sums: Array) -> Array:
+            return np.asarray(sums.reshape(count, len(sums) // count, -1).sum(axis=0))
 
-        coupled = None
-        if self.coupled is not None:
-            q = len(self.plain_gram)
-            folded = fold(self.coupled.reshape(n, q, n, q), 1, 3)
-            coupled = folded.reshape(n * q // count, n * q // count)
-        return replace(
-            self,
-            plain_gram=fold(self.plain_gram, 0, 1),
-            gram=None if self.gram is None else fold(self.gram, 1, 2),
-            coupled=coupled,
-            centre=fold(self.centre, 0, 1),
-            target=fold(self.target, 0),
-            width_sum=fold(self.width_sum, 0),
-            visits=np.array([self.count]),
-        )
+        centre, plain = (fold(fold(square).T).T for square in (self.centre, self.plain_gram))
+        sums = replace(self, plain_gram=plain, gram=None, coupled=None, centre=centre, target=fold(self.target))
+        return replace(sums, width_sum=fold(self.width_sum).ravel(), visits=np.array([self.count]))
 
     @property
     def phi_scale(self) -> Array:

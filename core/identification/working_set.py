@@ -123,22 +123,24 @@ class WorkingSet:
         self._solve(self._settle_quadratic)
         gaps = np.array(on_cores(Programmes.duality_gap, [(own,) for own in self.programmes]))
         again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
-        if again:
-            before = {row.i: (row.answer(), self._lifted(row)) for row in again}
-            self._again(again, self._settle_quadratic)
-            for row in again:
-                gaps[row.i] = self.programmes[row.i].duality_gap()
-                if not gaps[row.i] + row.lifted_loss() <= GOOD:
-                    gaps[row.i] = min(gaps[row.i], self.programmes[row.i].linear_gap())
-                answer, value = before[row.i]
-                now = self._lifted(row) if row.outside() <= max(1e-6, row.tolerance) else np.inf
-                if value <= now * (1.0 + GOOD):  # nothing gained: the elements stay
-                    gaps[row.i] = max(gaps[row.i] + value / max(now, 1e-300) - 1.0, 0.0) if now < np.inf else np.inf
-                    row.keep(answer)
+        for row, answer, value in self._again(again, self._settle_quadratic, self._lifted):
+            gaps[row.i] = self.programmes[row.i].duality_gap()
+            if not gaps[row.i] + row.lifted_loss() <= GOOD:
+                gaps[row.i] = min(gaps[row.i], self.programmes[row.i].linear_gap())
+            now = self._lifted(row) if row.outside() <= max(1e-6, row.tolerance) else np.inf
+            if value <= now * (1.0 + GOOD):  # nothing gained: the elements stay
+                gaps[row.i] = max(gaps[row.i] + value / max(now, 1e-300) - 1.0, 0.0) if now < np.inf else np.inf
+                row.keep(answer)
         return replace(self._solution(), gap=float(gaps.max(initial=0.0)))
 
-    def _again(self, rows: list[Row], settle: Settle) -> None:
-        """Solve rows once more, in refined coordinates; what a solver cannot improve stays as it was."""
+    def _again(
+        self, rows: list[Row], settle: Settle, value: Callable[[Row], float]
+    ) -> list[tuple[Row, tuple[Array, Array, float], float]]:
+        """Solve rows once more, in refined coordinates; what a solver cannot improve stays as it was.
+
+        Returns each row with its answer of before, and the value that this had.
+        """
+        before = [(row, row.answer(), value(row)) for row in rows]
 
         def improve(row: Row) -> None:
             theta, d, limit = row.theta.copy(), row.d.copy(), row.limit
@@ -147,9 +149,10 @@ class WorkingSet:
             except FitError:
                 row.take(theta, d, limit)
 
-        for group in self._groups(rows):
+        for group in self._groups(rows) if rows else []:
             on_cores(self._refine, [(row,) for row in group if not row.refined])
             self._settle_and_prove(improve, group)
+        return before
 
     def _refine(self, row: Row) -> None:
         """Refine a row with the first samples at hand, which it may have released."""
@@ -300,16 +303,12 @@ class WorkingSet:
             and (self.programmes[row.i].collinear() or not self._above(row, bounds) <= GOOD)
             and not row.refined
         ]
-        if again:
-            before = {row.i: (row.answer(), self._largest_width(row)) for row in again}
-            for row in again:
-                self.programmes[row.i].exact = True
-            self._again(again, settle)
-            for row in again:
-                bounds[row.i] = self._least_width(row)
-                answer, width = before[row.i]
-                if width <= self._largest_width(row) * (1.0 + GOOD):  # nothing gained: the elements stay
-                    row.keep(answer)
+        for row in again:
+            self.programmes[row.i].exact = True
+        for row, answer, width in self._again(again, settle, self._largest_width):
+            bounds[row.i] = self._least_width(row)
+            if width <= self._largest_width(row) * (1.0 + GOOD):  # nothing gained: the elements stay
+                row.keep(answer)
         return self._solution(np.minimum(deltas, bounds))
 
     def _least_width(self, row: Row) -> float:
