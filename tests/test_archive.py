@@ -180,6 +180,18 @@ def test_on_a_cluster_as_in_memory(bags, cluster, criterion):
     equal(fit_archive(paths, signals, criterion, client=cluster[1]), model)
 
 
+@pytest.mark.slow
+def test_on_a_cluster_the_recording_that_leaves_rest_is_named(cluster, tmp_path):
+    """Also where a recording before it has no transition."""
+    (tmp_path / "s.yaml").write_text(SIGNALS)
+    short = engine_bag(tmp_path / "a.mcap", 1, 3)
+    still = engine_bag(tmp_path / "b.mcap", 60, change=lambda k, x: x * 0 + (1.0 if k == 40 else 0.0))
+    control = engine_bag(tmp_path / "c.mcap", 60, 3)
+    for where in ({"client": cluster[1]}, {"cache": tmp_path / "cache"}):
+        with pytest.raises(FitError, match=r"^transition \d+ of \S*b\.mcap begins at rest"):
+            fit_archive([short, still, control], tmp_path / "s.yaml", **where)
+
+
 def steps_of(lines, what):
     """The numbers `k of 8` of the lines that begin with these words."""
     return [int(line.split("(")[-1].split(" of 8")[0]) for line in lines if line.startswith(what)]

@@ -182,11 +182,11 @@ def fit_archive(
         constant = additive == "both" and all(visit("steps of", _constant_dt, signals))
         columns = Columns.of(additive, constant, regimes)
         tasks = [(load, (recording, signals, columns)) for recording in recordings]
-        fleet = DaskFleet(client, tasks, counting("reading"))
-        counts, dt = fleet.counts, None
+        fleet = on_workers = DaskFleet(client, tasks, counting("reading"))
+        counts, dt, named = fleet.counts, None, [recordings[number] for number in on_workers.kept]
     else:
         assert cache is not None
-        counts, steps = [], []
+        counts, steps, named = [], [], recordings
 
         def problems() -> Iterator[Problem]:
             for number, recording in enumerate(recordings, start=1):
@@ -204,7 +204,7 @@ def fit_archive(
 
     def where(index: int) -> str:
         which = int(np.searchsorted(starts, index, side="right")) - 1
-        return f"transition {index - starts[which]} of {recordings[which][0]}"
+        return f"transition {index - starts[which]} of {named[which][0]}"
 
     check_solvable(fleet, where, [s.name for s in signals.states])
     with contradiction_named(where, signals):

@@ -144,7 +144,7 @@ class DaskFleet(Fleet):
     A partition is the result of a pure task, so a worker that is lost costs the time to make its partitions again.
 
     `client`: the cluster; `tasks`: function and arguments; each makes one `Problem`; `done`: called with the number of
-    those made so far.
+    those made so far. `kept`: numbers of the tasks whose problems have transitions.
     """
 
     def __init__(
@@ -156,11 +156,11 @@ class DaskFleet(Fleet):
         self._client = client
         made = _submitted(client, tasks)
         facts = self.run(client, [(_facts, (part,)) for part in made], done)
-        kept = [(part, fact) for part, fact in zip(made, facts, strict=True) if fact[0]]
-        if not kept:
+        self.kept = [number for number, (count, *_) in enumerate(facts) if count]
+        if not self.kept:
             raise FitError("no usable transition in any recording; check the signals file")
-        self._parts = [part for part, _ in kept]
-        self._describe([fact for _, fact in kept])
+        self._parts = [made[number] for number in self.kept]
+        self._describe([facts[number] for number in self.kept])
 
     @staticmethod
     def run(
