@@ -24,10 +24,10 @@ import platform
 import signal
 import tempfile
 import threading
-import time
 from pathlib import Path
 
 import numpy as np
+from measure import best, table
 from recorded import JAZZY, Topic, message, write
 
 from uncertain_lti import read_transients
@@ -80,13 +80,6 @@ def bags(folder, samples):
     return paths
 
 
-def timed(function):
-    """Wall time, s, and the result."""
-    began = time.perf_counter()
-    result = function()
-    return time.perf_counter() - began, result
-
-
 def killing(cluster, lines):
     """Progress that kills a worker at the first pass."""
     pid = next(iter(cluster.workers.values())).process.process.pid
@@ -130,28 +123,30 @@ def main():
             rows.append([name, criterion, f"{took:.1f} s", f"{elements:.0e}", f"{objective:.0e}", str(outside)])
 
         models, failed = {}, []
-        reading, transients = timed(lambda: read_transients(paths, SIGNALS))
+        reading, transients = best(lambda: read_transients(paths, SIGNALS), 1)
         for criterion in ("qp", "lp"):
-            took, models[criterion] = timed(lambda c=criterion: fit(transients, c))
+            took, models[criterion] = best(lambda c=criterion: fit(transients, c), 1)
             row("in memory", criterion, reading + took, models[criterion])
             cache = folder / f"cache_{criterion}"
-            row("cache", criterion, *timed(lambda c=criterion, f=cache: fit_archive(paths, SIGNALS, c, cache=f)))
+            row("cache", criterion, *best(lambda c=criterion, f=cache: fit_archive(paths, SIGNALS, c, cache=f), 1))
         local = dict(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
         local["silence_logs"] = logging.CRITICAL  # of the worker that is killed
         with LocalCluster(**local) as cluster, Client(cluster) as client:
             for criterion in ("qp", "lp"):
-                row("two workers", criterion, *timed(lambda c=criterion: fit_archive(paths, SIGNALS, c, client=client)))
+                row(
+                    "two workers",
+                    criterion,
+                    *best(lambda c=criterion: fit_archive(paths, SIGNALS, c, client=client), 1),
+                )
             for criterion in ("qp", "lp"):
                 say, killed = killing(cluster, [])
-                took, model = timed(
-                    lambda c=criterion, s=say: fit_archive(paths, SIGNALS, c, client=client, progress=s)
+                took, model = best(
+                    lambda c=criterion, s=say: fit_archive(paths, SIGNALS, c, client=client, progress=s), 1
                 )
                 assert killed.is_set()
                 row("two workers, one killed", criterion, took, model)
-    print(f"\n{BAGS} bags, {sum(t.transitions().k.size for t in transients)} transitions, n = 5, m = 4\n")
     header = ["way", "criterion", "reading and fit", "elements differ", "objective differs", "outside"]
-    for entry in (header, ["---"] * len(header), *rows):
-        print("| " + " | ".join(entry) + " |")
+    table(f"{BAGS} bags, {sum(t.transitions().k.size for t in transients)} transitions, n = 5, m = 4", header, rows)
     if failed:
         raise SystemExit(f"not the same model to 1e-9, nor objective to 1e-12: {'; '.join(failed)}")
 

@@ -11,7 +11,6 @@
 
 python benchmarks/fit.py million      # fit() on 1e6 transitions, n = 5, m = 4, against numpy.linalg.lstsq
 python benchmarks/fit.py scheduled    # the same with 5 knots, against lstsq on the same 45 and 50 regressors
-python benchmarks/fit.py horizons     # ten horizons besides one step, against one step alone
 python benchmarks/fit.py joint        # 1e5 transitions, against the joint problem in cvxpy with Clarabel
 python benchmarks/fit.py pyipm        # n = 10, m = 3, 1e5 transitions, against PyIPM (pip install PyIPM)
 python benchmarks/fit.py large        # n = 50, m = 10, 1e5 transitions
@@ -36,7 +35,6 @@ from pathlib import Path
 import numpy as np
 from measure import best, peak_memory, table
 
-from uncertain_lti import EnvelopeMonitor
 from uncertain_lti.identification import fit, formulation
 from uncertain_lti.identification.archive import write_cache
 from uncertain_lti.identification.columns import Columns
@@ -194,45 +192,6 @@ def scheduled(scale):
                 )
     header = ["noise", "additive", "criterion", "regressors", "lstsq", "fit()", "ratio", "passes", "optimality gap"]
     table(f"fit() with 5 knots on {N} transitions, n = 5, m = 4: CPU time", [*header, "outside"], rows)
-
-
-HORIZONS = (2, 3, 4, 5, 7, 10, 14, 20, 28, 40)
-
-
-def horizons(scale):
-    """Ten horizons besides one step, against one step alone: CPU time, and time that passes on all cores."""
-    N = int(1e6 * scale)
-    clean, rows = recorded(N), []
-    x = clean.x + 1e-4 * np.random.default_rng(1).standard_normal(clean.x.shape)
-    transient = Transient(clean.t_ns, x, clean.u)
-    for criterion in ("qp", "lp"):
-        for widths in ("growing", "constant"):
-            one, many, passed = np.inf, np.inf, [np.inf, np.inf]
-            for _ in range(2):
-                for k, lengths in enumerate(((), HORIZONS)):
-                    began, clock = time.process_time(), time.perf_counter()
-                    model = fit(transient, criterion, additive="noise", horizons=lengths, widths=widths if k else None)
-                    spent = time.process_time() - began
-                    passed[k] = min(passed[k], time.perf_counter() - clock)
-                    one, many = (min(one, spent), many) if not k else (one, min(many, spent))
-            table_of = EnvelopeMonitor(model).check(transient).horizon_utilisation[:, 1:]
-            left = int((np.abs(np.nan_to_num(table_of)) > 1.0).sum())
-            gaps = [h["optimality_gap"] for h in model.fit_summary["horizons"]]
-            row = [criterion, widths, f"{one:.2f} s", f"{many:.2f} s", f"{many / one:.1f}"]
-            rows.append([*row, f"{passed[1] / passed[0]:.1f}", f"{max(gaps):.0e}", str(left)])
-    header = [
-        "criterion",
-        "half-widths",
-        "one step",
-        "with ten horizons",
-        "ratio, CPU",
-        "ratio, time",
-        "gap",
-        "outside",
-    ]
-    table(
-        f"fit() with horizons of {', '.join(map(str, HORIZONS))} steps on {N} transitions, n = 5, m = 4", header, rows
-    )
 
 
 def joint(scale):
@@ -397,7 +356,7 @@ def disk_fit(folder, N, parts):
     table(f"{N} transitions, n = 5, m = 4", [*header, "objective differs", "elements differ"], rows)
 
 
-CLAIMS = {f.__name__: f for f in (million, scheduled, horizons, joint, pyipm, large, coupled, growth, disk)}
+CLAIMS = {f.__name__: f for f in (million, scheduled, joint, pyipm, large, coupled, growth, disk)}
 
 
 def main():

@@ -22,9 +22,9 @@ from measure import peak_memory, table
 from uncertain_lti import Transient, fit
 
 
-def plant(n, m, count):
+def plant(n, m, count, seed=0):
     """A recording of a random stable plant whose steps are disturbed within a box."""
-    rng = np.random.default_rng(0)
+    rng = np.random.default_rng(seed)
     dt = 0.01
     A, B = rng.normal(size=(n, n)) / np.sqrt(n) - 2 * np.eye(n), rng.normal(size=(n, m))
     x, u = np.zeros((count + 1, n)), np.zeros((count + 1, m))
