@@ -52,7 +52,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED
+from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION, VerdictMessages
 
 STATE, CONTROL = "/bench/state", "/bench/control"
 TYPE = "sensor_msgs/msg/JointState"
@@ -384,10 +384,11 @@ class Child:
 
 
 TOPICS = [output.name for output in OUTPUTS]
+PUBLISHED = [VIOLATION.name, *VerdictMessages(["x0"]).outputs]  # for each sample, of a model without horizons
 SUBJECTS = {
     "bare, default executor": ("take", "default", []),
     "bare, events executor": ("take", "events", []),
-    "publishing only, all outputs": ("relay", "", TOPICS),
+    "publishing only, all outputs": ("relay", "", PUBLISHED),
     "publishing only, ~/violation": ("relay", "", ["violation"]),
     "monitor, all outputs heard": ("monitor", "", TOPICS),
     "monitor, ~/violation heard": ("monitor", "", ["violation"]),

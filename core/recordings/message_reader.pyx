@@ -143,6 +143,7 @@ cdef class Plan:
     cdef int64_t* places
     cdef double[::1] row  # slots and places of a message alone
     cdef int64_t[::1] place
+    cdef Py_ssize_t[::1] slot_of  # of each path; -1 where a function takes several
 
     def __init__(self, type_name, paths, type_fields):
         self.fields_of, self.unwanted, self.able = type_fields, {}, True
@@ -158,6 +159,8 @@ cdef class Plan:
         for parts, function in zip(self.parts, self.functions):
             if function is not None and any(self.codes[slot] in "qQ" for slot in parts.values()):
                 self.able = False  # a function of whole numbers takes them without rounding
+        found = [parts[0] if path.function is None else -1 for path, parts in zip(paths, self.parts)]
+        self.slot_of = np.array(found, dtype=np.intp)
         self.row, self.place = np.empty(len(self.codes)), np.empty(2 * len(self.every), np.int64)
 
     def stamp(self, type_name, number):
@@ -444,16 +447,16 @@ cdef class Plan:
     cpdef tuple read(self, bytes data):
         """What a message is, and if it is whole, its stamp (ns or None) and values."""
         cdef Py_ssize_t what = self.alone(data)
-        cdef Py_ssize_t slot
+        cdef Py_ssize_t slot, number
         if what != WHOLE or not self.able:
             return what, None
         values = []
-        for number, function in enumerate(self.functions):
-            if function is None:
-                slot = self.parts[number][0]
+        for number in range(self.slot_of.shape[0]):
+            slot = self.slot_of[number]
+            if slot >= 0:
                 values.append(self.slots[slot])
             else:
-                values.append(self.computed(number, function, self.row, np.asarray(self.place), data))
+                values.append(self.computed(number, self.functions[number], self.row, np.asarray(self.place), data))
         stamp = None
         if self.seconds >= 0:
             stamp = <int64_t>self.slots[self.seconds] * 1_000_000_000 + <int64_t>self.slots[self.nanoseconds] or None
