@@ -183,9 +183,11 @@ def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
         star = "*" if parameter.fixed else " "
         lines.append(f" {star}{parameter.name} = {_shown(parameter.default)}   {parameter.wanted}")
         lines += textwrap.wrap(parameter.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
+    first = parameters[0]
+    value = "machine.model.json" if first.name == "model" else first.example
     lines += [
         "",
-        f"Example: {name} --ros-args -p {parameters[0].name}:={_example(parameters[0])} -r __node:=my_{name}",
+        f"Example: {name} --ros-args -p {first.name}:={value} -r __node:=my_{name}",
         f"Exit status: 0 ended by a signal or done, {BAD_USAGE} bad usage.",
     ]
     return "\n".join(lines)
@@ -193,10 +195,6 @@ def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
 
 def _shown(default: object) -> str:
     return "''" if default == "" else str(default).lower() if isinstance(default, bool) else str(default)
-
-
-def _example(parameter: Declared) -> str:
-    return "machine.model.json" if parameter.name == "model" else parameter.example
 
 
 def _check(given: Sequence[str], name: str) -> None:

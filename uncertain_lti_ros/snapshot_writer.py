@@ -67,16 +67,13 @@ class Snapshots:
         """Keep one more message; call it while `recent` is not None."""
         assert self.recent is not None
         self.recent.add(entry)
-        if raised and self._due is None and self._is_first_alarm(entry.now):
+        # no alarm for as long as a snapshot goes back: one that flaps must not replace the first file
+        if raised and self._due is None and entry.now - self._alarmed >= self._settings.real("snapshot.seconds"):
             self._due = entry.now + self._settings.real("snapshot.after")
 
     def alarm_over(self, now: float) -> None:
         """The alarm is over."""
         self._alarmed = now
-
-    def _is_first_alarm(self, now: float) -> bool:
-        """No alarm for as long as a snapshot goes back: one that flaps must not replace the first file."""
-        return now - self._alarmed >= self._settings.real("snapshot.seconds")
 
     def write_due(self, session: Session | None) -> None:
         """Begin to write the snapshot of an alarm, if it is due."""

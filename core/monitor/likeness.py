@@ -187,10 +187,6 @@ class Explainer:
         self._model = model
         self._steps = (1, *(horizon.steps for horizon in model.horizons))
         self._per_width = 0.5 / model.operating_point.X
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget every alarm."""
         self.pattern: Pattern | None = None
         self._first: tuple[str, ...] = ()
 

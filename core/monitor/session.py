@@ -241,7 +241,7 @@ class Session(Stream):
             counts.setdefault(name, str(count))
         lags = self.lags
         for topic in self.types:
-            counts[f"received {topic}"] = str(self.received[topic])
+            counts[f"received {topic}"] = str(self.received.get(topic, 0))
             if self.unreadable[topic]:
                 counts[f"unreadable {topic}"] = str(self.unreadable[topic])
             if self.future[topic]:

@@ -131,7 +131,7 @@ class Stream:
     reasons: Reasons = cython.declare(object, visibility="readonly")
     arming: Arming = cython.declare(object, visibility="readonly")
     period: Period = cython.declare(object, visibility="readonly")
-    received: Counter[str] = cython.declare(object, visibility="readonly")
+    received: dict[str, int] = cython.declare(dict, visibility="readonly")
     unreadable: Counter[str] = cython.declare(object, visibility="readonly")
     future: Counter[str] = cython.declare(object, visibility="readonly")
     why_unreadable: dict[str, str] = cython.declare(object, visibility="readonly")
@@ -196,7 +196,7 @@ class Stream:
         self.unreadable: Counter[str] = Counter()
         self.why_unreadable: dict[str, str] = {}
         self.future: Counter[str] = Counter()
-        self.received: Counter[str] = Counter()
+        self.received: dict[str, int] = {}  # setting an item of a Counter is slow
         self.verdicts = self.alarms = self.failures = 0
         self.violations = [0] * self.model.n
         self.last: Verdict | None = None
@@ -384,7 +384,7 @@ class Stream:
 
     def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
         """Take one serialised message."""
-        self.received[topic] += 1
+        self.received[topic] = self.received.get(topic, 0) + 1
         self._heard[topic] = now
         if topic == self.enable_topic and self._reads_condition is not None:
             self._learn_condition(topic, data)
