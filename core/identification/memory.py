@@ -120,10 +120,11 @@ class Boxes:
 
     def to_dict(self, recordings: int) -> dict[str, Any]:
         """As it is in the file, rounded to the side of less room."""
-        least, top = self.low.min(axis=1)[:, None], self.room.max(axis=1, initial=0.0)[:, None]
-        step = (self.high.max(axis=1)[:, None] - least) / _STEPS
-        low, high = ((end - least) / np.where(step > 0.0, step, 1.0) for end in (self.low, self.high))
-        room = 255.0 * np.sqrt(np.maximum(self.room, 0.0) / np.where(top > 0.0, top, 1.0))
+        low, high = (np.sign(end) * np.sqrt(np.abs(end)) for end in (self.low, self.high))  # finest near 0, at rest
+        least, top = low.min(axis=1)[:, None], self.room.max(axis=1, initial=0.0)[:, None]
+        step = (high.max(axis=1)[:, None] - least) / _STEPS
+        low, high = ((end - least) / np.where(step > 0.0, step, 1.0) for end in (low, high))
+        room = 255.0 * (np.maximum(self.room, 0.0) / np.where(top > 0.0, top, 1.0)) ** 0.25
         parts = {"low": np.floor(low - 1e-6), "high": np.ceil(high + 1e-6), "room": np.floor(room - 1e-6)}
         counts = np.bincount(self.source, minlength=recordings)
         return {
@@ -140,7 +141,8 @@ class Boxes:
         least, step, top, counts = (of_text(data[name]) for name in ("least", "step", "top", "counts"))
         low, high, room = (of_text(data[name], "u1") for name in ("low", "high", "room"))
         source = np.repeat(np.arange(len(counts)), counts.astype(np.intp))
-        return cls(least + step * low, least + step * high, top * (room / 255.0) ** 2, source)
+        low, high = ((least + step * end) * np.abs(least + step * end) for end in (low, high))
+        return cls(low, high, top * (room / 255.0) ** 4, source)
 
 
 def _numbers(source: NDArray[np.intp], first: int, share: float) -> Index:
