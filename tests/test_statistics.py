@@ -18,7 +18,7 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.fleet import likelier_alone
-from uncertain_lti.kernel.arithmetic import LIMIT, Statistic, Statistics, Window
+from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.reports.check import check_data, check_text
@@ -28,6 +28,7 @@ from uncertain_lti.sampling.sampler import Step
 
 C = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.3], [0.0, -0.3, 0.5]])
 MEAN = np.array([0.1, -0.2, 0.0])
+LIMIT = 10.0  # standard deviations, as the theory page says
 
 
 def statistic(kind: str, window: float = 1.0, threshold: float = 1.0, n: int = 3, allowance: float = 0.0) -> Statistic:
