@@ -240,8 +240,10 @@ def remembered(
     n, p, widths = model.n, problem.p, model.fit_summary["criterion"] == "lp"
     unknowns, each, box = problem.columns.unknowns(p), 8 * (p + n + 3), 2 * (p + 1) + (3 if widths else 2) * n
     room = min(n * _PER_STATE, BYTES) - 32 * (p + 2) ** 2
+    first = 0 if boxes is None else len(boxes.source)
     most = max(room // 2, min(12 * n * unknowns * (p + n + 3), _MOST)) // each
-    if problem.N > (most if boxes else max(room // each, most)):
+    most = max(most, (room - (problem.N + first) * box) // (each - box))  # where all others have a box of their own
+    if problem.N > most:
         if most <= n * unknowns:
             return None
         widest = 0.5 * np.asarray(model.fit_summary["max_width"]) if widths else None
@@ -250,7 +252,7 @@ def remembered(
         left[kept] = False
         if not problem.columns.half:  # at rest there is no room, and no model changes that
             left &= problem.z_columns.any(axis=0)
-        chosen, first = problem.subset(kept), 0 if boxes is None else len(boxes.source)
+        chosen = problem.subset(kept)
         share = min(max(room - most * each, room // 5) // box / (first + problem.N - len(kept)), 1.0)
         parts = [] if boxes is None else [boxes.fewer(0, share)]
         for block in problem.blocks():
