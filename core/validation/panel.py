@@ -98,18 +98,12 @@ class Evidence:
         share = other.verdicts / (self.verdicts + other.verdicts)
         judged = self.judged + other.judged
         return Evidence(
-            np.vstack([self.peaks, other.peaks]),
-            np.maximum(self.top, other.top),
-            (1.0 - share) * self.median + share * other.median,
-            self.verdicts + other.verdicts,
-            (self.judged * self.widths + other.judged * other.widths) / judged,
-            judged,
-            self.hours + other.hours,
-            self.dt,
-            self.factor,
-            np.append(self.counts, other.counts),
-            np.append(self.near, other.near),
-        )
+            np.vstack([self.peaks, other.peaks]), np.maximum(self.top, other.top),
+            (1.0 - share) * self.median + share * other.median, self.verdicts + other.verdicts,
+            (self.judged * self.widths + other.judged * other.widths) / judged, judged,
+            self.hours + other.hours, self.dt, self.factor,
+            np.append(self.counts, other.counts), np.append(self.near, other.near),
+        )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the memory of a model."""
@@ -179,31 +173,17 @@ class Panel:
 
     @classmethod
     def of(
-        cls,
-        evidence: Evidence,
-        rules: Sequence[StatisticRule],
-        what: str,
-        unlike: Sequence[str],
-        asked: float | None,
+        cls, evidence: Evidence, rules: Sequence[StatisticRule], what: str, unlike: Sequence[str], asked: float | None
     ) -> Panel:
         """That of these rules; `what`: of `Validation.what`."""
         thresholds = evidence.thresholds(rules, evidence.widths.shape[1], what)
         at = max(i for i, rule in enumerate(rules) if _of_jumps(rule))
         usual, median = evidence.widths / 2.0 * (evidence.factor * thresholds[at])
         return cls(
-            evidence.learnt(rules, what),
-            _limit(evidence, len(rules)),
-            int(evidence.counts.sum()),
-            evidence.hours,
-            len(evidence.peaks),
-            what,
-            usual,
-            max(rules[at].window_s, evidence.dt),
-            _mean(median),
-            evidence,
-            tuple(unlike),
-            asked,
-        )
+            evidence.learnt(rules, what), _limit(evidence, len(rules)), int(evidence.counts.sum()), evidence.hours,
+            len(evidence.peaks), what, usual, max(rules[at].window_s, evidence.dt), _mean(median), evidence,
+            tuple(unlike), asked,
+        )  # fmt: skip
 
     def summary(self, model: UncertainLTI) -> dict[str, Any]:
         """What `fit_summary["alarm"]` of its model says."""
