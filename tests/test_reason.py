@@ -10,6 +10,7 @@
 """Reasons in words: what holds the alarm and why there is no verdict, live as over a recording."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -156,3 +157,24 @@ def test_a_jump_larger_than_any_of_the_fit_is_named_with_its_limit() -> None:
         assert check_data(model, EnvelopeMonitor(model).check(quiet), samples=False)["states"]["x1"]["jump"] is None
     drifting = model.replace(domain=replace(model.domain, step_max=None))
     assert "jumped" not in check_text(check_data(drifting, EnvelopeMonitor(drifting).check(transient), samples=False))
+
+
+@pytest.mark.parametrize(
+    ("steps", "change", "remedy"),
+    [
+        (1, {}, "a verdict needs two samples: check a longer recording"),
+        (50, {"u": np.full((50, 1), np.nan)}, "compare `uncertain-lti topics` with max_hold and max_skew"),
+        (50, {"max_gap": 0.01}, "is a topic slower than in the fit"),
+        (50, {"t": round(3e9) * np.arange(50)}, "check a recording at the rate of the fit"),
+    ],
+)
+def test_where_no_verdict_was_possible_the_reason_comes_with_a_remedy(
+    steps: int, change: dict[str, Any], remedy: str
+) -> None:
+    rng = np.random.default_rng(6)
+    t, x, u = round(1e8) * np.arange(400), np.cumsum(rng.normal(size=(400, 1)), axis=0), rng.normal(size=(400, 1))
+    model = fit([Transient(t, x, u)], additive="noise")
+    given = {"t": t[:steps], "x": x[:steps], "u": u[:steps]} | change
+    data = check_data(model, EnvelopeMonitor(model).check(Transient(**given)), samples=False)
+    assert data["outcome"] == "unknown" and data["reason"].startswith("no verdict was possible, so nothing is known; ")
+    assert remedy in data["reason"]

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import islice
 from typing import Any
@@ -55,6 +56,19 @@ MOST_EPISODES, MOST_EXPLAINED = 1000, 100
 """Episodes, and patterns of alarms, in the data."""
 MOST_SHOWN = 5
 """Frozen repeats, patterns and rules that the text names."""
+_REMEDIES = {
+    Status.FIRST: "a verdict needs two samples: check a longer recording",
+    Status.GAP: "every step is longer than max_gap: is a topic slower than in the fit, or was recording interrupted? see "
+    "`uncertain-lti topics`",
+    Status.RESET: "time steps back: name the runs in it as recordings of their own",
+    Status.MISSING: "a signal is missing, stale or not finite: compare `uncertain-lti topics` with max_hold and max_skew "
+    "in the signals file",
+    Status.STEP: "check a recording at the rate of the fit, or fit recordings at this rate",
+    Status.MODE: "fit recordings of this mode too",
+    Status.FROZEN: "states repeat exactly: see whether their sensors and drivers still send",
+    Status.UNASKED: "ask for a longer time with --from and --to",
+}
+"""What to do where no verdict was possible, by the reason that most samples have."""
 OUTCOMES = ("alarm", "unknown", "violations", "quiet")
 """What a check can come to, from what weighs most."""
 
@@ -287,7 +301,9 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     judged = data["verdicts"]
     steps = max((data["samples"] if verdicts.asked is None else int(verdicts.asked.sum())) - 1, 1)
     if not judged:
-        return "; ".join(["no verdict was possible, so nothing is known", *data["unknown"]])
+        met = Counter(verdicts.statuses())
+        most = max(met, key=lambda s: (s not in (Status.FIRST, Status.UNASKED), met[s]), default=Status.FIRST)
+        return "; ".join(["no verdict was possible, so nothing is known", *data["unknown"], _REMEDIES[most]])
     if judged < JUDGED * steps:
         why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
         return f"only {judged} of {steps} steps could be judged{why}"

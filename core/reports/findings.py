@@ -147,7 +147,7 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     judged, bad, state = recording["verdicts"], recording["violated"], recording["outcome"]
     text = f"{plural(judged, 'verdict')} over {number(recording['seconds'])} s: "
     if not judged:
-        text = "no verdict was possible"
+        text = recording["reason"]
     elif not bad:
         text += "every one inside all bounds"
     else:
