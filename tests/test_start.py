@@ -82,3 +82,10 @@ def test_a_recording_that_cannot_be_reported_on_ends_with_its_reason(folder, cap
     assert main(["start", *HEALTHY, "--check", "broken.mcap"]) == 2
     said = capsys.readouterr().err
     assert "broken.mcap" in said and "Traceback" not in said
+
+
+def test_what_is_to_note_of_a_recording_is_said_once(folder, capsys):
+    whole = (folder / HEALTHY[0]).read_bytes()
+    (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])
+    assert main(["start", *HEALTHY]) == 0
+    assert capsys.readouterr().err.count(f"{HEALTHY[0]}: cut after ") == 1

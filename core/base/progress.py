@@ -55,6 +55,7 @@ class Progress:
         self._stream = stream or sys.stderr or io.StringIO()  # a process may have none
         self._began = time.perf_counter()
         self._bars: list[Any] = []
+        self._noted: set[str] = set()
 
     def __enter__(self) -> Progress:
         return self
@@ -70,9 +71,11 @@ class Progress:
         return not self.quiet and self._stream.isatty()
 
     def note(self, *texts: str) -> None:
-        """Remarks that the reader should know, unless quiet."""
+        """Remarks that the reader should know, unless quiet, each once: `start` reads a recording several times."""
         for text in texts if not self.quiet else ():
-            self.write(f"note: {printable(text)}")
+            if text not in self._noted:
+                self._noted.add(text)
+                self.write(f"note: {printable(text)}")
 
     def say(self, text: str) -> None:
         """Part of the result, on standard output, unless quiet; a bar stays below it."""
