@@ -218,6 +218,17 @@ def test_labels_of_one_alarm_are_all_different() -> None:
     assert labels([rule, replace(rule, window_s=2.0), replace(rule, horizon=9)]) == ("mean", "mean#2", "mean@9")
 
 
+def test_the_words_of_an_alarm_tell_rules_of_one_kind_by_their_windows() -> None:
+    rules = [StatisticRule("energy", 0.1, 0.5), StatisticRule("energy", 2.0, 0.5), StatisticRule("mean", 0.0, 0.5)]
+    alarm = Alarm(rules, two_states(), np.ones(2, dtype=bool))
+    why = alarm.reasons([0, 1, 2], [3.0, 0.0, 2.0, 0.0, 4.0, 0.0], ZEROS, np.zeros(2))
+    assert [raised.words for raised in why] == [
+        "energy of x1 (over 0.1 s) at 3 times its threshold",
+        "energy of x1 (over 2 s) at 2 times its threshold",
+        "mean of x1 at 4 times its threshold",
+    ]
+
+
 def test_the_nearest_statistic_is_the_one_with_the_largest_share_of_its_threshold() -> None:
     model = two_states()
     rule = StatisticRule("mean", 0.0, (2.0, 0.5))

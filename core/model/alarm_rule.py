@@ -79,10 +79,15 @@ class AlarmRule:
         return CONTAINMENT
 
     @property
+    def span(self) -> str:
+        """Its window in words."""
+        return f"{self.violations} of {self.window} verdicts"
+
+    @property
     def words(self) -> str:
         """The rule in words, without its margin."""
         over = "" if self.horizon == 1 else f" over {self.horizon} steps"
-        return f"at least {self.violations} of {self.window} verdicts violated{over}"
+        return f"at least {self.span} violated{over}"
 
     def to_dict(self) -> dict[str, Any]:
         """The rule as the model file holds it."""
@@ -166,14 +171,18 @@ class StatisticRule:
         return self.threshold
 
     @property
+    def span(self) -> str:
+        """Its window in words."""
+        return f"over {self.window_s:.3g} s" if self.window_s else "of one verdict"
+
+    @property
     def words(self) -> str:
         """The rule in words."""
         over = "" if self.horizon == 1 else f" at {self.horizon} steps"
         what = f"{_WORDS[self.kind]} of the utilisation{over}"
-        span = f"over {self.window_s:.3g} s" if self.window_s else "of one verdict"
         limits = self.threshold if isinstance(self.threshold, tuple) else (self.threshold,)
         low, high = f"{min(limits):.3g}", f"{max(limits):.3g}"
-        return f"{what} {span} above {low if low == high else f'{low} to {high}'}"
+        return f"{what} {self.span} above {low if low == high else f'{low} to {high}'}"
 
     def to_dict(self) -> dict[str, Any]:
         """The rule as the model file holds it."""

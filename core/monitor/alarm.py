@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import operator
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -41,7 +42,8 @@ class Raised:
 
     `label`: of the rule, as of `alarm_rule.labels`; `kind`: of the rule; `horizon`: of the rule, in steps; `state`: the
     state; empty for all together, and where no state of this verdict is to blame; `value`: the statistic over its
-    threshold, with its sign; 1 of containment.
+    threshold, with its sign; 1 of containment; `span`: the window of the rule in words, if another rule of its kind and
+    horizon has to be told from it.
     """
 
     label: str
@@ -49,15 +51,15 @@ class Raised:
     horizon: int
     state: str
     value: float
+    span: str = ""
 
     @property
     def words(self) -> str:
         """`energy of fan_speed over 40 steps at 1.3 times its threshold`, for example."""
         state = f" of {self.state}" if self.state else ""
         over = f" over {self.horizon} steps" if self.horizon > 1 else ""
-        if self.kind == "containment":
-            return f"containment{state}{over}"
-        return f"{self.kind}{state}{over} at {abs(self.value):.3g} times its threshold"
+        what = f"{self.kind}{state}{over}" + f" ({self.span})" * bool(self.span)
+        return what if self.kind == "containment" else f"{what} at {abs(self.value):.3g} times its threshold"
 
 
 class Nearest(NamedTuple):
@@ -98,6 +100,8 @@ class Alarm:
         self.rules, self.labels, self.alarm = tuple(rules), labels(rules), False
         self._model, self._counted = model, counted
         self._rows = [row_of(rule, model) for rule in self.rules]
+        alike = Counter((rule.kind, rule.horizon) for rule in self.rules)
+        self._spans = [rule.span if alike[rule.kind, rule.horizon] > 1 else "" for rule in self.rules]
         names = list[str]()
         self._begins: list[int] = []  # of each rule, where its numbers begin in `values`
         for rule, label in zip(self.rules, self.labels, strict=True):
@@ -174,19 +178,19 @@ class Alarm:
         found = []
         names = self._model.state_names
         for i in rules:
-            rule, label = self.rules[i], self.labels[i]
+            rule, label, span = self.rules[i], self.labels[i], self._spans[i]
             if isinstance(rule, AlarmRule):
                 left = flags == 1.0 if rule.horizon == 1 else np.abs(sizes[row_of(rule, self._model)]) > rule.margin
                 blamed = [names[j] for j in np.flatnonzero(left & self._counted)]
-                found += [Raised(label, rule.kind, rule.horizon, name, 1.0) for name in blamed or [""]]
+                found += [Raised(label, rule.kind, rule.horizon, name, 1.0, span) for name in blamed or [""]]
                 continue
             begin = self._begins[i]
             if rule.kind in JOINT:
-                found.append(Raised(label, rule.kind, rule.horizon, "", float(values[begin])))
+                found.append(Raised(label, rule.kind, rule.horizon, "", float(values[begin]), span))
                 continue
             for j in np.flatnonzero(self._counted).tolist():
                 if abs(values[begin + j]) > 1.0:
-                    found.append(Raised(label, rule.kind, rule.horizon, names[j], float(values[begin + j])))
+                    found.append(Raised(label, rule.kind, rule.horizon, names[j], float(values[begin + j]), span))
         return tuple(found)
 
     def over(
