@@ -58,11 +58,10 @@ MOST_SHOWN = 5
 """Frozen repeats, patterns and rules that the text names."""
 _REMEDIES = {
     Status.FIRST: "a verdict needs two samples: check a longer recording",
-    Status.GAP: "every step is longer than max_gap: is a topic slower than in the fit, or was recording interrupted? see "
-    "`uncertain-lti topics`",
+    Status.GAP: "every step is longer than max_gap: is a topic slower than in the fit? see `uncertain-lti topics`",
     Status.RESET: "time steps back: name the runs in it as recordings of their own",
-    Status.MISSING: "a signal is missing, stale or not finite: compare `uncertain-lti topics` with max_hold and max_skew "
-    "in the signals file",
+    Status.MISSING: "a signal is missing, stale or not finite: compare `uncertain-lti topics` with max_hold and "
+    "max_skew in the signals file",
     Status.STEP: "check a recording at the rate of the fit, or fit recordings at this rate",
     Status.MODE: "fit recordings of this mode too",
     Status.FROZEN: "states repeat exactly: see whether their sensors and drivers still send",
