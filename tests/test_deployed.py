@@ -181,6 +181,7 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
         (["--enable", "mode is 3"], "write TOPIC FIELD OPERATOR NUMBER"),
         (["--enable", "/nowhere data == 3"], "there is no topic /nowhere"),
         (["--enable", "/mode date == 3"], "date"),
+        (["--enable", "/engine/state position[fan_sped] > 1"], "there is no 'fan_sped' in the message's names"),
         (["--grace", "-1"], "grace is -1"),
         (["--grace", "nan"], "grace is nan"),
         (["--from", "5", "--to", "4"], "leaves nothing to judge"),

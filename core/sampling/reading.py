@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import math
 import multiprocessing
 import os
 import signal
@@ -98,14 +97,18 @@ def refuse_absent(
         if not len(read):
             raise BagError(f"{bag.path}: {name} has no message; record it, or choose another topic or recording")
         for path, column in zip(columns, read.T, strict=True):
-            looked_up = any(kind != "attribute" for kind, _ in path.steps)
-            if not looked_up or not math.isnan(column[0]) or not np.isnan(column).all():
-                continue
-            notes = bag.reading_notes
-            _, _, first = next(iter(bag.messages([name])))
-            bag.restore_notes(*notes)
-            if absent := path.absent(first):
-                raise SignalError(f"field '{path.text}' of {name} in {bag.path}: {absent}")
+            _refuse_absent(bag, name, path, column)
+
+
+def _refuse_absent(bag: Recording, topic: str, path: FieldPath, column: NDArray[np.float64]) -> None:
+    looked_up = any(kind != "attribute" for kind, _ in path.steps)
+    if not looked_up or not np.isnan(column[:1]).any() or not np.isnan(column).all():
+        return
+    notes = bag.reading_notes
+    _, _, first = next(iter(bag.messages([topic])))
+    bag.restore_notes(*notes)
+    if absent := path.absent(first):
+        raise SignalError(f"field '{path.text}' of {topic} in {bag.path}: {absent}")
 
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -302,6 +305,7 @@ def read_field(
         topics.append(clock)
         paths.append([FieldPath(signals.signals[signals.on(clock)[0]].field)])
     columns = recording.columns(topics, paths)
+    _refuse_absent(recording, topic, field, columns.values[0][:, 0])
     of_field = columns.topic == 0
     is_clock = of_field if clock == topic else ~of_field
     came = np.cumsum(is_clock)[of_field] - (clock == topic)  # clock messages before it; it goes with its own
