@@ -436,3 +436,16 @@ def test_info_on_odd_leaves_of_the_fit_is_no_defect(folder, tmp_path):
         path.write_text(json.dumps(data))
         statuses.add(main(["info", str(path)]))
     assert statuses <= {0, 2}, statuses
+
+
+def test_a_recording_whose_name_is_not_utf8_can_be_drawn(folder, tmp_path):
+    strange = tmp_path / "a\udcffb.mcap"
+    strange.write_bytes((folder / "run.mcap").read_bytes())
+    image = str(tmp_path / "p.png")
+    assert main(["plot", str(folder / "m.model.json"), str(strange), "--output", image]) == 0
+
+
+def test_a_file_that_cannot_be_made_is_named_as_it_was_given(folder, capsys):
+    where = "/proc/uncertain-lti.png"
+    assert main(["plot", str(folder / "m.model.json"), str(folder / "run.mcap"), "--output", where]) == 2
+    assert f"plot: {where}: " in capsys.readouterr().err

@@ -46,7 +46,10 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     folder, name = os.path.split(path)
     beginning = f".{name[:100]}-"
     _clear(folder, beginning)
-    descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=beginning, suffix=".tmp")
+    try:
+        descriptor, temporary = tempfile.mkstemp(dir=folder, prefix=beginning, suffix=".tmp")
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, path) from None
     try:
         with suppress(OSError):  # a file system without locks
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -29,7 +29,7 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.base.text import shortened
+from uncertain_lti.base.text import printable, shortened
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports import charts
@@ -486,7 +486,7 @@ def _brief(value: float) -> str:
 
 def _plain(text: str) -> str:
     """Text of a file, which is never a formula and never a line break."""
-    return " ".join(text.split()).replace("$", r"\$")
+    return printable(" ".join(text.split())).replace("$", r"\$")
 
 
 def _short(text: str, longest: int = 34) -> str:
