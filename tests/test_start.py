@@ -66,6 +66,8 @@ def test_an_edited_signals_file_is_used_as_it_is(folder, capsys):
     ("words", "sentence"),
     [
         (["absent.mcap"], "absent.mcap"),
+        ([*HEALTHY, "--check", "absent.mcap"], "absent.mcap"),
+        (["a\udcffb.mcap"], "this name is not UTF-8, and a model file names its recordings; rename it"),
         ([*HEALTHY, "--output", "models/"], "names no file"),
         ([*HEALTHY, "--output", "no_such_folder/m"], "no_such_folder"),
     ],
@@ -89,3 +91,26 @@ def test_what_is_to_note_of_a_recording_is_said_once(folder, capsys):
     (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])
     assert main(["start", *HEALTHY]) == 0
     assert capsys.readouterr().err.count(f"{HEALTHY[0]}: cut after ") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["fit", "a\udcffb.mcap", "--signals", "s.yaml", "--output", "m"], r"a\udcffb.mcap: this name is not UTF-8"),
+        (["tune", "a\udcffb.mcap", "--signals", "s.yaml", "--output", "m"], r"a\udcffb.mcap: this name is not UTF-8"),
+        (["init", *HEALTHY, "--output", "no_such_folder/s.yaml"], "the folder no_such_folder is not there; make it"),
+        (["watch", "--outptu", "m"], "unrecognized arguments: --outptu\n"),
+    ],
+)
+def test_what_cannot_be_written_is_found_before_the_work(folder, capsys, monkeypatch, words, sentence):
+    def work(*_, **__):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("uncertain_lti.proposal.init.propose", work)
+    monkeypatch.setattr("uncertain_lti.sampling.reading.read_transients", work)
+    monkeypatch.setattr("uncertain_lti.read_transients", work, raising=False)
+    try:
+        assert main(words) == 2
+    except SystemExit as end:
+        assert end.code == 2
+    assert sentence in capsys.readouterr().err

@@ -157,11 +157,14 @@ def read_labelled(
             yield label, transient
 
 
-def model_target(path: str, force: bool) -> Path:
-    """Where a model file goes; with force an older one is replaced, and nothing else ever."""
+def model_target(path: str, force: bool, bags: Iterable[str] = ()) -> Path:
+    """Where a model file of some recordings goes; with force an older one is replaced, and nothing else ever."""
     from uncertain_lti.base.errors import BagError
     from uncertain_lti.base.files import target
 
+    for bag in bags:
+        if bag.encode(errors="ignore").decode() != bag:
+            raise BagError(f"{bag}: this name is not UTF-8, and a model file names its recordings; rename it first")
     chosen = target(path, holds=b'"uncertain-lti/', kind="model file", example="machine.model.json")
     if not force and chosen.is_file() and chosen.stat().st_size:
         raise BagError(f"{path}: a model is there already; choose another name, or write over it with --force")

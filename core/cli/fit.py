@@ -36,7 +36,7 @@ def run_fit(options: argparse.Namespace) -> Result:
     """Fit a model and write it."""
     from uncertain_lti.reports.model_text import fit_text, next_text
 
-    output = model_target(options.output, options.force)
+    output = model_target(options.output, options.force, options.bags)
     if options.workers is not None and options.workers < 1:
         raise FitError(f"--workers is {options.workers}; give 1 or more")
     if options.update is not None:
@@ -175,7 +175,9 @@ def run_tune(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.model_text import alarm_text, headline_text, tune_text
     from uncertain_lti.validation.groups import resolve_groups
 
-    output: Path | None = None if options.output is None else model_target(options.output, options.force)
+    output: Path | None = None
+    if options.output is not None:
+        output = model_target(options.output, options.force, options.bags)
     healthy = [bag for bag in options.bags if _label(bag) is None]
     if not healthy:
         raise FitError("no recording of the healthy machine is named; give at least one without a label")
@@ -256,7 +258,7 @@ def run_validate(options: argparse.Namespace) -> Result:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
     if options.output is not None:
         own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
-        model_target(options.output, options.force or own)
+        model_target(options.output, options.force or own, bags)
     reading = options.progress.iterate("reading")
     transients = [
         read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags, layout=model.signals.table)

@@ -158,7 +158,8 @@ class _Parser(argparse.ArgumentParser):
             commands: list[dict[str, argparse.ArgumentParser]] = [
                 a.choices for a in self._actions if isinstance(a.choices, dict)
             ]
-            known = {o for group in commands for p in group.values() for o in p._option_string_actions}
+            chosen = next((p for group in commands for name, p in group.items() if name in self._given), self)
+            known = chosen._option_string_actions
             word = message.split(": ")[1].split()[0].partition("=")[0]
             takes = sorted({name for g in commands for name, p in g.items() if word in p._option_string_actions})
             message += f" (an option of {', '.join(takes)})" if takes else meant(word, known, 1)

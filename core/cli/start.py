@@ -68,13 +68,15 @@ def run_topics(options: argparse.Namespace) -> Result:
 
 def run_init(options: argparse.Namespace) -> Result:
     """Write or print the proposed signals file."""
-    from uncertain_lti.base.files import written
+    from uncertain_lti.base.files import target, written
     from uncertain_lti.base.text import shortlist
     from uncertain_lti.proposal.init import propose
 
     output = options.output
-    if output is not None and os.path.exists(output):
-        raise SignalError(f"{output}: is there already; choose another output, or move it away")
+    if output is not None:
+        if os.path.exists(output):
+            raise SignalError(f"{output}: is there already; choose another output, or move it away")
+        target(output, holds=b"", kind="signals file", example="signals.yaml")
     reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
     proposal = propose(options.bags, reading, **chosen, like=options.like)
     options.progress.note(*proposal.warnings)
@@ -107,18 +109,20 @@ def run_init(options: argparse.Namespace) -> Result:
 
 def run_start(options: argparse.Namespace) -> Result:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
+    from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.findings import findings_text
     from uncertain_lti.reports.pages import page_target
 
     signals, model, page = (f"{options.output}{ending}" for ending in (".yaml", ".model.json", ".html"))
     if not os.path.basename(options.output):
         raise SignalError(f"--output '{options.output}' names no file; give a name such as machine or models/machine")
-    model_target(model, options.force)  # what cannot be written is found before the work
+    model_target(model, options.force, options.bags)  # what cannot be written is found before the work
     page_target(page, model, [])
     parts: dict[str, Any] = {"signals": signals, "model": model, "report": page}
     if os.path.exists(signals):
         options.say(f"signals: as {signals} has them")
     else:
+        group_recordings(options.check or [])
         parts["init"] = _part(options, ["init", *options.bags, "--output", signals]).data
         for kind in ("states", "controls"):
             names = ", ".join(signal["name"] for signal in parts["init"][kind])
