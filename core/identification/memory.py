@@ -41,7 +41,7 @@ BYTES, _PER_STATE, _MOST = 720_000, 90_000, 8_000_000
 _STEPS = 254
 """In so many steps the range of a value is divided in the file; with one to round outwards they fill a byte."""
 _MANY = 20_000
-"""Transitions from which on it is first seen in about so many how near the nearest are."""
+"""Transitions from which on it is first seen in about so many how near the nearest are, and how wide the widest."""
 _LOOKED_AT = 1000
 """Transitions at least by which a recording is recognised, if it has as many."""
 _AGAIN = "fit again with all recordings"
@@ -274,17 +274,22 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     over all: by so much its room may change as the elements do.
     """
     n, count = model.n, -(-4 * most // model.n)
-    unit, reach = 1.0 / np.where(sums.psi_scale > 0.0, sums.psi_scale, np.inf), np.full(n, np.inf)
     theta, d = _elements(model, problem.columns)
-    part = problem.subset(np.arange(0, problem.N, -(-problem.N // _MANY)))
-    share = part.N / problem.N
-    if share < 1.0:  # of fewer transitions, how near those are that are wanted
-        wanted = int(2 * share * count) + 50
-        few = Candidate(theta, d, unit, np.ones(n), None, reach, reach, wanted, np.arange(n))
-        reach = np.array([least for _, least in scan(part, few)])
-    candidate = Candidate(theta, d, unit, np.ones(n), None, reach, reach, count, np.arange(n))
-    found = [samples.index for samples, _ in Fleet.of(problem).scan(candidate)]
-    some = np.unique(np.concatenate(found if widest is None else [*found, _widest(problem, d, count)]))
+    some = np.arange(problem.N)
+    if problem.N > _MANY:
+        unit, reach = 1.0 / np.where(sums.psi_scale > 0.0, sums.psi_scale, np.inf), np.full(n, np.inf)
+        few = problem.subset(np.arange(0, problem.N, -(-problem.N // _MANY)))  # they tell how near and how wide
+        wanted = min(2 * count * few.N // problem.N + 50, few.N - 1)
+        candidate = Candidate(theta, d, unit, np.ones(n), None, reach, reach, wanted, np.arange(n))
+        reach = np.array([least for _, least in scan(few, candidate)])
+        candidate = replace(candidate, reach=reach, most=count)
+        found = [samples.index for samples, _ in Fleet.of(problem).scan(candidate)]
+        if widest is not None:
+            halves = (d.T @ (block.dt * problem.columns.psi(block.z, block.dt, None)) for block in problem.blocks())
+            least = np.partition(d.T @ (few.psi().T * few.dt), -wanted, axis=1)[:, [-wanted]]
+            rows = [np.flatnonzero(row) for row in np.hstack([half >= least for half in halves])]
+            found += [row[:: max(1, len(row) // (4 * count))] for row in rows]  # all of them where widths are constant
+        some = np.unique(np.concatenate(found))
     of = problem.subset(some)
     phi, psi = of.phi().T * of.dt, of.psi().T * of.dt
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
@@ -297,19 +302,6 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
     index, first = np.unique(np.argsort(near, axis=1, kind="stable")[:, :count].T, return_index=True)
     return np.sort(some[index[np.argsort(first)[:most]]])
-
-
-def _widest(problem: Problem, d: Array, count: int) -> Index:
-    """The transitions of the largest half-widths, so many in each row."""
-    values, held = np.empty((problem.n, 0)), np.empty((problem.n, 0), np.intp)
-    for block in problem.blocks():
-        half = d.T @ problem.columns.psi(block.z, block.dt, None) * block.dt
-        index = np.broadcast_to(np.arange(block.start, block.start + len(block)), half.shape)
-        values, held = np.hstack([values, half]), np.hstack([held, index])
-        if values.shape[1] > count:
-            most = np.argpartition(values, -count, axis=1)[:, -count:]
-            values, held = np.take_along_axis(values, most, axis=1), np.take_along_axis(held, most, axis=1)
-    return np.unique(held)
 
 
 def _root(gram: Array) -> Array:
