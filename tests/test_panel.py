@@ -337,3 +337,10 @@ def test_fresh_plants_keep_to_the_stated_limit_within_what_was_recorded():
             hours += float(fresh.sum()) * DT / 3600
         kept.append(count / max(hours, 1e-9) <= model.fit_summary["alarm"]["limit_per_hour"])
     assert sum(kept) >= 2
+
+
+def test_recordings_in_which_no_state_moves_give_a_model_that_says_so() -> None:
+    rng = np.random.default_rng(1)
+    still = Transient(0.025 * np.arange(300), np.full((300, 2), 5.0), rng.uniform(size=(300, 2)))
+    alarm = fit([still]).fit_summary["alarm"]
+    assert alarm["worth"] == "none" and "nothing that is judged moves in the recordings" in alarm["headline"]

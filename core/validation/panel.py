@@ -137,7 +137,7 @@ class Evidence:
             return self
         thresholds = np.concatenate(self.thresholds(rules, self.widths.shape[1], what))
         reached = self.peaks[(self.peaks > _NOTHING).any(axis=1)] / thresholds
-        third = float(np.sort(reached.max(axis=1))[::-1][:3][-1])
+        third = float(min(np.sort(reached.max(axis=1))[::-1][:3], default=0.0))
         parts, levels = [part for part, _ in shown], [(sizes / thresholds).max(axis=1) for _, sizes in shown]
         counts, near = (
             by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
