@@ -111,6 +111,12 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
     assert watch.wait() == 0
 
 
+def test_a_name_that_no_node_has_is_refused(world):
+    watch = world.start("watch", "-m", "uncertain_lti.cli.main", "watch", "a b", "--port", "0")
+    assert watch.wait() == 2
+    assert "'a b' is no topic name; write letters" in watch.output and "Traceback" not in watch.output
+
+
 def test_a_port_that_is_taken_is_named(world):
     address = address_of(world.command("watch", "--port", "0"))
     port = address.rsplit(":", 1)[1].strip("/")

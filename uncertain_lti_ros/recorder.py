@@ -58,7 +58,7 @@ def run(args: argparse.Namespace) -> Result:
     if output.suffix != ".mcap":
         output = output.with_name(f"{output.name}.mcap")
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
-        topics = list(dict.fromkeys(_resolved(life.node, topic) for topic in args.topics))
+        topics = list(dict.fromkeys(resolved_name(life.node, topic) for topic in args.topics))
         types = _wait_for(life, topics, args.wait, args.progress.note)
         subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
         if subscriptions:
@@ -79,7 +79,8 @@ def run(args: argparse.Namespace) -> Result:
     return Result(data={"bag": str(output), **counts})
 
 
-def _resolved(node: Node, topic: str) -> str:
+def resolved_name(node: Node, topic: str) -> str:
+    """The name in full; raises ArgumentError where it is none."""
     try:
         return node.resolve_topic_name(topic)
     except (RuntimeError, ValueError):  # RuntimeError: what rcl raises, under names that rclpy does not export

@@ -38,6 +38,7 @@ from uncertain_lti.monitor.outputs import NODE
 from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
 from uncertain_lti_ros.messages import stamp_ns
 from uncertain_lti_ros.process import living, seconds
+from uncertain_lti_ros.recorder import resolved_name
 
 _EVERY = 1000  # ms between two looks of the page
 _MOST = 100_000  # samples kept
@@ -68,7 +69,7 @@ class Watched:
     """
 
     def __init__(self, node: Node, name: str, window: float) -> None:
-        self.name, self._window = node.resolve_topic_name(name), window
+        self.name, self._window = resolved_name(node, name), window
         self._lock = threading.Lock()
         self._said = _Said([])
         self._heard, self._reason = 0.0, ""

@@ -388,7 +388,10 @@ def propose(
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
-        raise BagError(f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})")
+        raise BagError(
+            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); "
+            f"record the machine at work, or name the topics of its states with --states"
+        )
     chosen, doubt = choose(measured, commands, like)
     doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
