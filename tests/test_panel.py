@@ -176,7 +176,7 @@ def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
 def test_the_hours_that_would_show_a_rate_show_it():
     hours, asked = 6.0, 0.1
     limit = rate_interval(np.zeros(8), hours, CONFIDENCE, one_sided=True)[1]
-    panel = Panel((), limit, 0, hours, 8, "recording", np.ones(1), 1.0, 1.0, asked=asked)
+    panel = Panel((), limit, 0, hours, 8, "recording", np.ones(1), 1.0, 1.0, None, asked=asked)
     needed = panel.needed_hours
     assert needed > hours and rate_interval(np.zeros(8), needed, CONFIDENCE, one_sided=True)[1] == pytest.approx(asked)
 
