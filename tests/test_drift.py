@@ -15,7 +15,7 @@ from test_update import runs_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, fit
 from uncertain_lti.reports.check import check_data
-from uncertain_lti.reports.drift import drift_in_words
+from uncertain_lti.reports.drift import _student, drift_in_words
 
 
 @pytest.fixture(scope="module")
@@ -49,3 +49,10 @@ def test_without_dates_recordings_are_counted(model):
 def test_what_does_not_move_or_is_short_is_not_said(model):
     assert drift_in_words(model, checked(model, 0.0, 7 * 86_400.0)) == []
     assert drift_in_words(model, checked(model, 0.1, 7 * 86_400.0, count=4)) == []
+
+
+@pytest.mark.parametrize("freedom", [3, 7, 60])
+def test_chance_is_that_of_students_distribution(freedom):
+    stdtrit = pytest.importorskip("scipy.special", reason="scipy, the reference, is not installed").stdtrit
+    for chance in (0.01, 1e-4):
+        assert _student(freedom, chance) == pytest.approx(stdtrit(freedom, 1.0 - chance / 2.0), rel=1e-7)

@@ -12,6 +12,7 @@
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -168,6 +169,16 @@ def test_init_needs_no_solver(tmp_path):
     assert done.returncode == 0, done.stderr
     assert "states:" in (tmp_path / "signals.yaml").read_text()
     assert "not tried: the Python package" in done.stderr and "pip install '.[fit]'" in done.stderr
+
+
+def test_check_needs_no_solver(folder, tmp_path):
+    """Of one recording, nor of as many as tell a drift: a robot has numpy alone."""
+    check, model, bag = commands(folder)["check"]
+    bags = [shutil.copy(bag, tmp_path / f"{number}.mcap") for number in range(5)]
+    for some in (bags[:1], bags):
+        done = without(SOLVERS, [check, model, *map(str, some)])
+        assert done.returncode == run([check, model, *map(str, some)], capture_output=True).returncode, done.stderr
+        assert "not installed" not in done.stderr
 
 
 def test_a_hint_names_an_extra_that_setup_py_has(folder):
