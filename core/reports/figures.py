@@ -324,7 +324,7 @@ def _drawn(chart: Chart, event: tuple[float, str] | None = None) -> Any:
         else:
             _panel(axis, panel, chart.columns)
         axis.set_title(_short(panel.heading, 60), loc="left", fontsize=8, pad=3)
-        axis.set_title(_short(panel.note, 60), loc="right", fontsize=8, pad=3, color=VIOLATED if panel.count else "k")
+        axis.set_title(_short(panel.note, 100), loc="right", fontsize=8, pad=3, color=VIOLATED if panel.count else "k")
         axis.tick_params(labelsize=7)
         if event is not None:
             axis.axvline(event[0], color=RECORDED, linestyle="--", linewidth=1.0)
