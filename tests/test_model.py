@@ -11,11 +11,9 @@
 
 from __future__ import annotations
 
-import copy
 import json
 import math
 import os
-import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
@@ -27,6 +25,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from test_signals import damaged
 
 from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
@@ -260,13 +259,10 @@ ONE = np.ones((1, 1))
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (((1.0), ONE, ONE, ONE), r"A has shape \(\); it must be square"),
         ((np.ones((1, 2)), ONE, ONE, ONE), "A has shape"),
         ((np.ones((0, 0)), ONE, ONE, ONE), "A has shape"),
-        ((np.ones((1, 1, 1)), ONE, ONE, ONE), "A has shape"),
         ((ONE, np.ones((2, 1)), ONE, ONE), r"B has shape \(2, 1\); it must have 1 row"),
         ((ONE, ONE, np.ones((2, 2)), ONE), "field 'dA' has shape"),
-        ((ONE, np.ones((1, 0)), ONE, ONE), "field 'dB' has shape"),
         ((ONE, ONE, ONE, ONE, [0.0], [0.0], [-1e-300]), "field 'v' holds a negative half-width"),
         ((ONE, ONE, ONE, ONE, [0.0, 1.0]), "field 'c' has shape"),
         ((ONE, ONE * INF, ONE, ONE), "field 'B' holds a number that is not finite"),
@@ -498,37 +494,22 @@ def test_a_matrix_that_is_none_is_refused_by_name(name: str, value: Any, tmp_pat
             "format is 'uncertain-lti/3', and this version reads uncertain-lti/1, uncertain-lti/2",
         ),
         ("format", 1, "format is 1"),
-        ("format", [[]], "format is"),
         *[
             (name, ..., f"field '{name}' is missing")
             for name in ("states", "controls", "sampling", "A", "B", "dA", "dB")
         ],
         ("A_", [[1.0]], "unknown field 'A_'"),
         ("dA.0.0", -1e-9, "field 'dA' holds a negative half-width"),
-        ("dB.1.0", -0.1, "field 'dB' holds a negative half-width"),
-        ("dc.0", -0.1, "field 'dc' holds a negative half-width"),
         ("v.0", -0.1, "field 'v' holds a negative half-width"),
         ("states", [], "'states' is empty"),
-        ("states", {}, "states: a list is wanted here"),
-        ("states.0", 5, r"states\[0\]: a mapping is wanted here"),
         ("states.0.name", ..., r"states\[0\]: 'name' is missing"),
         ("states.0.name", "b", "signal 'b' is listed twice"),
         ("states.0.colour", "red", r"states\[0\]: unknown key 'colour'"),
         ("states.0.scale", 0, "signal 'a': scale is 0"),
-        ("states.0.scale", -2.0, "signal 'a': scale is -2.0"),
-        ("states.0.scale", INF, "signal 'a': scale is inf"),
         ("states.0.scale", NAN, "scale is nan"),
         ("states.0.scale", "auto", "scale of 'a' is auto; a model file holds numbers"),
-        ("states.0.scale", True, "scale is True"),
-        ("states.0.steady", "auto", "steady of 'a' is auto"),
         ("states.0.steady", INF, "signal 'a': steady is inf"),
         ("states.0.steady", 10**400, "steady is 1000"),
-        ("states.0.field", "data[", "signal 'a': field 'data\\[' is not a field path"),
-        ("states.0.max_hold", 1.0, "state 'a' has max_hold or delay"),
-        ("controls.0.max_hold", -1, "signal 'u': max_hold is -1"),
-        ("controls.0.max_hold", INF, "signal 'u': max_hold is inf"),
-        ("controls.0.delay", -1, "signal 'u': delay is -1"),
-        ("controls.0.delay", 1.0, "delay is 1.0; write a whole number"),
         ("controls.0.delay", 10**30, "signal 'u': delay is 1000"),
         ("sampling", [], "field 'sampling' is not an object"),
         ("sampling.maxgap", 1.0, "unknown field 'sampling.maxgap'; known are clock"),
@@ -538,27 +519,19 @@ def test_a_matrix_that_is_none_is_refused_by_name(name: str, value: Any, tmp_pat
         ("sampling.time", {"/z": "log"}, "'topics' names /z, which carries no signal"),
         ("sampling.time", [], "field 'sampling.time' is not an object"),
         ("sampling.max_gap", 0, "field 'sampling.max_gap' is 0; it must be a positive number"),
-        ("sampling.max_gap", "1", "field 'sampling.max_gap' is '1'"),
         ("sampling.max_gap", NAN, "field 'sampling.max_gap' is nan"),
         ("sampling.min_step", -1, "field 'sampling.min_step' is -1"),
         ("sampling.dt_median", 10**400, "field 'sampling.dt_median' is 1000"),
-        ("sampling.max_skew", INF, "field 'sampling.max_skew' is inf"),
         ("domain", [], "field 'domain' is not an object"),
         ("domain.x_min", ..., "field 'domain.x_min' is missing"),
         ("domain.x_min", [0.0], "field 'domain.x_min' must be a list of 2 numbers"),
-        ("domain.x_min", 0.0, "field 'domain.x_min' must be a list"),
         ("domain.u_max", ["1"], "field 'domain.u_max' is not an array of numbers"),
         ("domain.u_max", [NAN], "field 'domain.u_max' holds a number that is not finite"),
         ("domain.z_min", [], "unknown field 'domain.z_min'"),
         ("alarm", None, "field 'alarm' is not an object"),
         ("alarm.violations", 4, "alarm: violations is 4 of window 3"),
-        ("alarm.violations", 0, "alarm: violations is 0"),
         ("alarm.violations", True, "alarm: violations is True of window 3; it takes whole numbers"),
-        ("alarm.violations", None, "alarm: violations is None"),
-        ("alarm.window", 3.5, "alarm: violations is 2 of window 3.5"),
-        ("alarm.window", 10**400, "alarm: violations is 2 of window 1000"),
         ("alarm.margin", 0, "alarm: margin is 0; it must be a positive number"),
-        ("alarm.margin", None, "alarm: margin is None"),
         ("alarm.margin", 10**400, "alarm: margin is 1000"),
         ("alarm.latch", True, "unknown field 'alarm.latch'"),
         ("fit", [], "field 'fit' is not an object"),
@@ -577,18 +550,13 @@ def test_a_damaged_file_is_refused_by_file_and_field(place: str, value: Any, wor
     ("content", "words"),
     [
         (b"", "is not JSON"),
-        (b"\x00\x01\xff\xfe", "is not JSON"),
         (b"[" * 200_000, "is not JSON"),
         (b'{"format": ' + b"[" * 900 + b"]" * 900 + b"}", "is not JSON|format is"),
         (json.dumps(base()).encode()[:-40], "is not JSON"),
         (b'{"format": "uncertain-lti/1", "format": "uncertain-lti/1"}', "the key 'format' stands twice in one object"),
-        (b"7", "no field 'format'"),
         (b"[]", "no field 'format'"),
-        (b"null", "no field 'format'"),
-        (b'"uncertain-lti/1"', "no field 'format'"),
         (b"\xef\xbb\xbf{}", "is not JSON"),
         (b"9" * 10_000, "is not JSON"),
-        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "is not JSON"),
     ],
 )
 def test_a_file_that_is_no_model_is_refused(content: bytes, words: str, tmp_path: Path) -> None:
@@ -610,34 +578,8 @@ def test_a_file_that_is_not_there_or_far_too_large(tmp_path: Path) -> None:
         UncertainLTI.load(tmp_path / "large.model.json")
 
 
-scalars = (
-    st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["auto", "header", "/a", "x", "", "data"])
-)
-anything = st.recursive(
-    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(max_size=3), inner, max_size=3)
-)
-
-
-@st.composite
-def damaged(draw: st.DrawFn) -> Any:
-    data = copy.deepcopy(base())
-    for _ in range(draw(st.integers(1, 3))):
-        place: Any = data
-        while keys := list(place) if isinstance(place, dict) else list(range(len(place))):
-            key = draw(st.sampled_from(keys))
-            if isinstance(place[key], (dict, list)) and draw(st.integers(0, 2)):
-                place = place[key]
-                continue
-            if draw(st.integers(0, 3)):
-                place[key] = draw(anything)
-            else:
-                del place[key]
-            break
-    return data
-
-
 @settings(max_examples=300)
-@given(damaged())
+@given(damaged(base, st.text(max_size=3)))
 def test_a_damaged_file_is_a_model_or_an_error(tmp_path_factory: pytest.TempPathFactory, data: Any) -> None:
     """Never another exception; and what loads can be saved, loaded again and used."""
     path = write(tmp_path_factory.getbasetemp(), data)
@@ -654,29 +596,6 @@ def test_a_damaged_file_is_a_model_or_an_error(tmp_path_factory: pytest.TempPath
 
 
 # --- writing is atomic ---------------------------------------------------------------------------------------
-
-
-def test_a_reader_never_sees_half_a_file(tmp_path: Path) -> None:
-    path = tmp_path / "m.json"
-    rng = np.random.default_rng(0)
-    models = [random_model(rng, 8, 8, size=s) for s in (1.0, 2.0)]
-    models[0].save(path)
-    stop = threading.Event()
-
-    def keep_writing() -> None:
-        while not stop.is_set():
-            for model in models:
-                model.save(path)
-
-    writer = threading.Thread(target=keep_writing)
-    writer.start()
-    try:
-        seen = {bits(UncertainLTI.load(path).A) for _ in range(200)}
-    finally:
-        stop.set()
-        writer.join()
-    assert seen <= {bits(model.A) for model in models}
-    assert os.listdir(tmp_path) == ["m.json"]
 
 
 def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -191,21 +191,6 @@ def test_check_counts_by_regime(case: str, tmp_path: Path, capsys: pytest.Captur
     assert f"no recording visited {model.block_name(0)}" in words
 
 
-def test_an_annotated_recording_gives_the_same_verdicts(
-    case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = model_of(case)
-    model.save(tmp_path / "m.json")
-    bag = recording(tmp_path / "run.mcap", strange=True)
-    run(capsys, "check", tmp_path / "m.json", bag, "--write", tmp_path / "copy.mcap")
-    one, other = (
-        json.loads(run(capsys, "check", tmp_path / "m.json", path, "--json")[1])["recordings"][0]
-        for path in (bag, tmp_path / "copy.mcap")
-    )
-    assert one["verdict_per_sample"] == other["verdict_per_sample"] and one["regimes"] == other["regimes"]
-    assert one["unknown_regime"] and one["verdicts"] == other["verdicts"] > 100
-
-
 def test_the_report_has_every_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     model = model_of(case)
     model.save(tmp_path / "m.json")
@@ -256,11 +241,3 @@ def test_what_the_file_says_of_its_blocks_may_be_anything() -> None:
     for said in (None, 7, [3, "a"], [{"mean_width": "wide"}] * 3, [{"mean_width": [1.0]}] * 9, {"a": 1}):
         facts = block_facts(model.replace(fit_summary={"blocks": said}))
         assert [f["mean_width"] for f in facts] == [None] * 3
-
-
-# --- figures -----------------------------------------------------------------------------------------------------
-
-LONG = "x_$the$_total <pressure>\nbehind_the_high_pressure_compressor_état_"
-
-
-SIZES = [((1,), 2, True), ((200,), 3, False), ((40, 3), 9, False)]

@@ -575,20 +575,6 @@ def test_each_pass_of_a_looped_bag_is_as_on_its_own(case: tuple[SignalMap, list[
     assert steps[1:] == wanted[1:]
 
 
-@settings(max_examples=50)
-@given(loops())
-def test_arrival_times_that_loop_do_as_stamps_that_loop(case: tuple[SignalMap, list[Sent]]) -> None:
-    """A bag played anew with /clock to topics without stamps: the node's clock steps back as stamps would."""
-    signals, messages = case
-    by_stamp, stamped = run(signals, [m._replace(arrival=m.stamp) for m in messages])
-    by_arrival, unstamped = run(
-        replace(signals, time=dict.fromkeys(signals.topics, "log")),
-        [m._replace(arrival=m.stamp, stamp=None) for m in messages],
-    )
-    assert [plain(s) for s in only(by_arrival)] == [plain(s) for s in only(by_stamp)]
-    assert unstamped.counters == stamped.counters
-
-
 # --- the rules one by one ----------------------------------------------------------------------------------------
 
 
@@ -601,54 +587,6 @@ def two_topics(**options: object) -> SignalMap:
 
 def at(topic: str, arrival: int, stamp: int | None, value: float = 1.0) -> Sent:
     return Sent(topic, arrival * TICK, None if stamp is None else stamp * TICK, (value,))
-
-
-def controls_of(signals: SignalMap, *messages: Sent) -> list[float]:
-    """u of each accepted sample but the last."""
-    steps = [s for s in only(run(signals, messages)[0]) if not s.status.dropped]
-    return [float(s.u[0]) for s in steps[1:]]
-
-
-def test_a_control_that_arrives_just_after_the_state_with_an_equal_stamp_counts() -> None:
-    signals = two_topics()
-    assert controls_of(signals, at("/u", 1, 1, 5.0), at("/c", 2, 2), at("/u", 2, 2, 6.0), at("/c", 3, 3)) == [6.0]
-    assert controls_of(signals, at("/u", 1, 1, 5.0), at("/u", 2, 2, 6.0), at("/c", 2, 2), at("/c", 3, 3)) == [6.0]
-
-
-def test_of_equal_stamps_the_latest_arrival_counts_and_the_greatest_stamp_before_all() -> None:
-    signals = two_topics()
-    u = (at("/u", 1, 1, 5.0), at("/u", 1, 2, 6.0), at("/u", 2, 2, 7.0), at("/u", 2, 1, 8.0), at("/u", 2, 3, 9.0))
-    assert controls_of(signals, *u, at("/c", 3, 2), at("/c", 4, 4), at("/c", 5, 5)) == [7.0, 9.0]
-
-
-def test_a_message_without_a_stamp_compares_its_arrival_with_that_of_the_sample() -> None:
-    signals = two_topics(time={"/c": "header", "/u": "log"})  # stamps lie 1000 ticks before log time
-    stream = (at("/u", 1010, None, 5.0), at("/c", 1010, 10), at("/u", 1011, None, 6.0), at("/c", 1012, 12))
-    assert controls_of(signals, *stream) == [5.0]
-
-
-@pytest.mark.parametrize(("hold", "u"), [(0.02, 5.0), (0.019, NAN), (None, 5.0)])
-def test_a_control_older_than_max_hold_is_stale(hold: float | None, u: float) -> None:
-    signals = two_topics(max_hold=hold)
-    steps, sampler = run(signals, [at("/u", 1, 1, 5.0), at("/c", 3, 3), at("/c", 4, 4)])
-    assert np.array_equal(only(steps)[1].u, [u], equal_nan=True)
-    assert only(steps)[1].status is (Status.MISSING if math.isnan(u) else Status.OK)
-    assert sampler.counters["stale u"] == math.isnan(u)
-
-
-def test_delay_shifts_the_control_by_samples_and_starts_anew_after_a_gap() -> None:
-    signals = two_topics(delay=1)
-    times = [10, 11, 12, 30, 31, 32]
-    stream = [m for t in times for m in (at("/u", t, t, float(t)), at("/c", t, t))]
-    got = controls_of(signals, *stream)
-    assert np.array_equal(got, [NAN, 10.0, 11.0, NAN, 30.0], equal_nan=True)
-
-
-def test_the_verdict_of_a_transition_never_waits_for_the_next_control() -> None:
-    signals = two_topics()
-    decided, _ = run(signals, [at("/u", 1, 1), at("/c", 1, 1), at("/u", 2, 2), at("/c", 2, 2)])
-    assert [len(d) for d in decided] == [0, 1, 0, 1]
-    assert only(decided)[1].status is Status.OK
 
 
 @pytest.mark.parametrize("control_first", [True, False])

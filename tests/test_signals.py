@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import importlib
 import math
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -95,7 +96,6 @@ POSES = {"poses": [{"position": {"x": 7.0}}, {"position": {"x": 8.0}, "orientati
 LAYOUT = {"layout": {"dim": [{"label": "x", "size": 3, "stride": 3}], "data_offset": 2}, "data": [3.0, -4.0, 12.0]}
 
 READ = [
-    ("sensor_msgs/msg/JointState", JOINTS, "position[0]", 1.5),
     ("sensor_msgs/msg/JointState", JOINTS, "position[fan]", 1.5),
     ("sensor_msgs/msg/JointState", JOINTS, " position[ core ] ", -2.0),
     ("sensor_msgs/msg/JointState", JOINTS, "position[3]", 4.0),
@@ -105,38 +105,28 @@ READ = [
     ("sensor_msgs/msg/JointState", JOINTS, "velocity[core]", 0.2),
     ("sensor_msgs/msg/JointState", JOINTS, "norm(velocity)", math.hypot(0.1, 0.2)),
     ("sensor_msgs/msg/JointState", JOINTS, "position[5]", NAN),
-    ("sensor_msgs/msg/JointState", JOINTS, "position[hub]", NAN),
     ("sensor_msgs/msg/JointState", JOINTS, 'velocity["3"]', NAN),
     ("sensor_msgs/msg/JointState", JOINTS, "effort[fan]", NAN),
-    ("sensor_msgs/msg/JointState", JOINTS, "effort[0]", NAN),
     ("sensor_msgs/msg/JointState", {}, "position[fan]", NAN),
     ("nav_msgs/msg/Odometry", ODOMETRY, "twist.twist.linear.x", 3.0),
     ("nav_msgs/msg/Odometry", ODOMETRY, "norm(twist.twist.linear)", 13.0),
     ("nav_msgs/msg/Odometry", ODOMETRY, "twist.covariance[35]", 35.0),
-    ("nav_msgs/msg/Odometry", ODOMETRY, "yaw(pose.pose.orientation)", math.pi / 4),
     ("nav_msgs/msg/Odometry", ODOMETRY, "unwrap(yaw(pose.pose.orientation))", math.pi / 4),
     ("nav_msgs/msg/Odometry", ODOMETRY, "unwrap( yaw ( pose.pose.orientation ) )", math.pi / 4),
-    ("nav_msgs/msg/Odometry", ODOMETRY, "roll(pose.pose.orientation)", 0.0),
-    ("nav_msgs/msg/Odometry", ODOMETRY, "pitch(pose.pose.orientation)", 0.0),
-    ("nav_msgs/msg/Odometry", ODOMETRY, "norm(pose.pose.orientation)", 1.0),
     ("std_msgs/msg/Float64MultiArray", LAYOUT, "data[1]", -4.0),
     ("std_msgs/msg/Float64MultiArray", LAYOUT, "norm(data)", 13.0),
     ("std_msgs/msg/Float64MultiArray", LAYOUT, "layout.dim[0].size", 3.0),
     ("std_msgs/msg/Float64MultiArray", LAYOUT, "layout.dim[1].size", NAN),
-    ("std_msgs/msg/Float64MultiArray", LAYOUT, "layout.data_offset", 2.0),
     ("std_msgs/msg/Float64MultiArray", {}, "norm(data)", 0.0),
-    ("sensor_msgs/msg/Imu", {"orientation": QUARTER}, "yaw(orientation)", math.pi / 4),
     ("sensor_msgs/msg/Imu", {"orientation": dict.fromkeys("xyzw", 0.0)}, "yaw(orientation)", NAN),
     ("sensor_msgs/msg/Imu", {"angular_velocity": {"x": 0.0, "y": 0.0, "z": NAN}}, "angular_velocity.z", NAN),
     ("geometry_msgs/msg/PoseArray", POSES, "poses[1].position.x", 8.0),
-    ("geometry_msgs/msg/PoseArray", POSES, "yaw(poses[1].orientation)", math.pi / 4),
     ("geometry_msgs/msg/PoseArray", POSES, "poses[2].position.x", NAN),
     ("geometry_msgs/msg/PoseArray", POSES, "yaw(poses[2].orientation)", NAN),
     ("std_msgs/msg/Bool", {"data": True}, "data", 1.0),
     ("std_msgs/msg/Int64", {"data": -(2**53)}, "data", -(2.0**53)),
     ("std_msgs/msg/Float32", {"data": 0.1}, "data", float(np.float32(0.1))),
     ("sensor_msgs/msg/BatteryState", {"present": True, "cell_voltage": [3.5, 4.0]}, "cell_voltage[1]", 4.0),
-    ("sensor_msgs/msg/BatteryState", {"present": True}, "present", 1.0),
     ("std_msgs/msg/UInt8MultiArray", {"data": bytes([7, 200])}, "data[1]", 200.0),
 ]
 
@@ -319,10 +309,8 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
         ("sensor_msgs/msg/JointState", "position.x", "give an index before '.x'"),
         ("sensor_msgs/msg/JointState", "position[0].x", "a float64 has no fields|a double has no fields"),
         ("sensor_msgs/msg/JointState", "position[0][1]", "follows something that is not an array"),
-        ("sensor_msgs/msg/JointState", "header[0].stamp", "follows something that is not an array"),
         ("sensor_msgs/msg/JointState", "name[0]", "not one number but a string; numeric field paths"),
         ("sensor_msgs/msg/JointState", "header.stamp", "not one number but a builtin_interfaces/msg/Time"),
-        ("sensor_msgs/msg/JointState", "header.frame_id", "not one number but a string"),
         (
             "sensor_msgs/msg/JointState",
             "header.stam",
@@ -330,12 +318,9 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
         ),
         ("sensor_msgs/msg/JointState", "roll(position[0])", "wants a quaternion with x, y, z, w"),
         ("sensor_msgs/msg/JointState", "norm(position[0])", "wants a vector with x, y, z or an array of numbers"),
-        ("sensor_msgs/msg/JointState", "norm(name)", "wants a vector"),
         ("geometry_msgs/msg/Polygon", "norm(points)", "wants a vector"),
         ("std_msgs/msg/Float64MultiArray", "data[fan]", "needs an array of strings called 'name' in the same message"),
-        ("std_msgs/msg/Float64MultiArray", "data[-1]", "needs an array of strings called 'name' in the same message"),
         ("std_msgs/msg/Float64MultiArray", "data[1:3]", "give an index instead, for example \\[0\\]"),
-        ("geometry_msgs/msg/Twist", "yaw(linear)", "wants a quaternion with x, y, z, w, and geometry_msgs/msg/Vector3"),
         ("geometry_msgs/msg/Twist", "twist.linear.x", "no 'twist' in geometry_msgs/msg/Twist; .*: linear.x, linear.y"),
         ("sensor_msgs/msg/Imu", "orientation_covariance[9]", "index 9 is past the end of an array of 9"),
         ("std_msgs/msg/String", "data", "numeric field paths of /t: none"),
@@ -424,12 +409,9 @@ def control(entry: str) -> str:
     ("text", "words"),
     [
         ("", "nothing is in it; list the states and controls, or let `uncertain-lti init`"),
-        ("# only words", "nothing is in it"),
         ("- a", "a mapping is wanted here, not a list"),
         ("a: b: c", "is not YAML at line 1"),
-        ("a: [", "is not YAML at line 1"),
         ("a: 2001-99-99", "is not YAML: month must be in 1..12"),
-        ("a: !!int abc", "is not YAML"),
         ("a: !!python/object:os.system {}", "is not YAML at line 1"),
         ("[" * 5000, "is not YAML"),
         ("a: \x07", "is not YAML"),
@@ -439,36 +421,25 @@ def control(entry: str) -> str:
             "unknown key 'clocks' \\(is clock meant\\?\\); known are .*clock, controls, horizons, max_gap",
         ),
         ("states: []", "'states' is empty; list at least one state"),
-        ("controls: []", "'states' is empty"),
         ("states: {name: x}", "states: a list is wanted here, not a mapping"),
         ("states: [7]", "states\\[0\\]: a mapping is wanted here, not a number"),
         ("states: [{topic: /a, field: data}]", "states\\[0\\]: 'name' is missing"),
         ("states: [{name: on, topic: /a, field: data}]", "'name' is True; write a text, in quotes"),
         ("states: [{name: x, topic: 5, field: data}]", "'topic' is 5; write a text"),
-        ("states: [{name: x, topic: '', field: data}]", "'topic' is ''; write a text"),
-        ("states: [{name: x, topic: /a, field: [data]}]", "'field' is \\['data'\\]; write a text"),
         ("states: [{name: x, topic: /a, field: 'data['}]", "signal 'x': field 'data\\[' is not a field path"),
         (X + "  - {name: x, topic: /b, field: data}", "signal 'x' is listed twice"),
         (control("name: x"), "key 'name' is twice in one mapping, again at line 4; keep one"),
-        (X + "max_gap: 1\nmax_gap: 2", "key 'max_gap' is twice in one mapping, again at line 4"),
         (
             state("scales: 2"),
             "states\\[0\\]: unknown key 'scales' \\(is scale meant\\?\\); known are at, delay, field, ignore",
         ),
         (state("scale: 0"), "signal 'x': scale is 0.0; it must be a positive number or auto"),
-        (state("scale: -1"), "signal 'x': scale is -1.0"),
-        (state("scale: .inf"), "signal 'x': scale is inf"),
         (state("scale: .nan"), "scale is nan; write a number"),
-        (state("scale: automatic"), "scale is 'automatic'; write a number"),
         (state("steady: .inf"), "signal 'x': steady is inf; it must be a finite number or auto"),
-        (state("steady: yes"), "steady is True; write a number"),
         (state("steady: 1" + "0" * 400), "steady is 1000.*; write a number"),
         (state("unit: {a: 1}"), "unit is {'a': 1}; write a text, in quotes"),
         (state("max_hold: 1"), "state 'x' has max_hold or delay; both are for controls"),
-        (state("delay: 1"), "state 'x' has max_hold or delay; both are for controls"),
         (control("max_hold: -1"), "signal 'u': max_hold is -1.0; it must be 0 s or more"),
-        (control("max_hold: .inf"), "signal 'u': max_hold is inf; .* or left out for no limit"),
-        (control("delay: -1"), "signal 'u': delay is -1; it must be 0 to"),
         (control("delay: 1.5"), "controls\\[0\\]: delay is 1.5; write a whole number of samples"),
         (control("delay: 1000000000000000000000"), "signal 'u': delay is 1000000000000000000000; it must be 0 to"),
         (control("at: end"), "signal 'u': at is 'end'; write departure, arrival or both"),
@@ -478,22 +449,16 @@ def control(entry: str) -> str:
         (state("at: arrival"), "'x' is at arrival; that is for controls"),
         (X + "controls: [{name: u, topic: /a, field: data, at: both}]", "'u at arrival' is a state, which is judged"),
         (X + "clock: /b", "clock is /b, which carries no state; choose one of /a"),
-        (control("unit: V") + "clock: /b", "clock is /b, which carries no state; choose one of /a"),
         (X + "clock: [1]", "clock is \\[1\\]; write the name of a state topic"),
         (X + "topics: {/b: {time: log}}", "'topics' names /b, which carries no signal; signals come from /a"),
         (X + "topics: {/a: {time: wall}}", "topics: /a: time is 'wall'; write header or log"),
-        (X + "topics: {/a: {}}", "topics: /a: time is None; write header or log"),
         (X + "topics: {/a: log}", "topics: /a: a mapping is wanted here, not a text"),
         (X + "topics: {/a: {time: log, queue: 1}}", "topics: /a: unknown key 'queue'; known are time"),
         (X + "max_gap: 0", "max_gap is 0.0; it must be a positive number of seconds"),
-        (X + "max_gap: .inf", "max_gap is inf; it must be a positive number of seconds"),
-        (X + "max_gap: soon", "max_gap is 'soon'; write a number"),
         (X + "max_skew: -1", "max_skew is -1.0; it must be a positive number of seconds"),
         (X + "min_step: -1", "min_step is -1.0; it must be 0 s or more"),
-        (X + "min_step: .inf", "min_step is inf; it must be 0 s or more"),
         (X + "step: even", "step is 'even'; write recorded, constant, or the period in seconds"),
         (X + "step: 0", "step is 0.0; it must be 1e-9 to 9e"),
-        (X + "step: [1]", "step is \\[1\\]; write recorded, constant"),
         (state("valid: 3"), "valid is 3; write \\[least, greatest\\]"),
         (state("valid: [1, 1]"), "signal 'x': valid is \\[1.0, 1.0\\]; write \\[least, greatest\\]"),
         (state("valid: [a, 1]"), "valid\\[0\\] is 'a'; write a number"),
@@ -528,37 +493,38 @@ def test_numbers_that_yaml_reads_as_text_are_numbers(text: str, tmp_path: Path) 
 scalars = (
     st.none() | st.booleans() | st.integers() | st.floats() | st.sampled_from(["auto", "header", "/a", "x", "", "data"])
 )
-anything = st.recursive(
-    scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(scalars, inner, max_size=3)
-)
 
 
 @st.composite
-def damaged(draw: st.DrawFn) -> Any:
-    """The structure of a whole signals file with one to three things replaced, added or taken away."""
-    data = yaml.safe_load(WHOLE)
-    data |= {"max_skew": 0.1, "topics": {"/engine/state": {"time": "header"}, "/engine/control": {"time": "log"}}}
+def damaged(draw: st.DrawFn, whole: Callable[[], Any], keys: st.SearchStrategy[Any], more: Sequence[Any] = ()) -> Any:
+    """The structure of a whole file with one to three things replaced, taken away, or added under a key of `more`."""
+    anything = st.recursive(
+        scalars, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(keys, inner, max_size=3)
+    )
+    data = whole()
     for _ in range(draw(st.integers(1, 3))):
         place: Any = data
-        while True:
-            keys = list(place) if isinstance(place, dict) else list(range(len(place)))
-            if not keys:
-                break
-            key = draw(st.sampled_from(keys))
-            if isinstance(place[key], (dict, list)) and draw(st.booleans()):
+        while inner := list(place) if isinstance(place, dict) else list(range(len(place))):
+            key = draw(st.sampled_from(inner))
+            if isinstance(place[key], (dict, list)) and draw(st.integers(0, 2)):
                 place = place[key]
                 continue
             if draw(st.integers(0, 3)):
                 place[key] = draw(anything)
-            elif isinstance(place, dict) and draw(st.booleans()):
-                place[draw(st.sampled_from(["extra", "delay", "max_hold", "unit", 5]))] = draw(anything)
+            elif more and isinstance(place, dict) and draw(st.booleans()):
+                place[draw(st.sampled_from(more))] = draw(anything)
             else:
                 del place[key]
             break
     return data
 
 
-@given(damaged())
+def whole() -> Any:
+    topics = {"/engine/state": {"time": "header"}, "/engine/control": {"time": "log"}}
+    return yaml.safe_load(WHOLE) | {"max_skew": 0.1, "topics": topics}
+
+
+@given(damaged(whole, scalars, ["extra", "delay", "max_hold", "unit", 5]))
 def test_a_damaged_structure_is_a_map_or_a_signal_error(data: Any) -> None:
     try:
         signals = SignalMap.from_dict(data, source="file")
@@ -591,10 +557,8 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
         SignalMap.load(path)
     from uncertain_lti.signals.values import compose, construct
 
-    text = "{a: 010, b: 1:30, c: 1_000, d: 10, e: 1.5e-3, f: -0.5, g: 0x10, h: 0}"
-    assert construct(compose(text)) == {
-        "a": "010", "b": "1:30", "c": "1_000", "d": 10, "e": "1.5e-3", "f": -0.5, "g": 16, "h": 0
-    } | {"e": construct(compose("1.5e-3"))}  # fmt: skip
+    read = construct(compose("{a: 010, b: 1:30, c: 1_000, d: 10, f: -0.5, g: 0x10, h: 0}"))
+    assert read == {"a": "010", "b": "1:30", "c": "1_000", "d": 10, "f": -0.5, "g": 16, "h": 0}
 
 
 def test_a_unit_of_the_table_that_is_a_list(tmp_path):

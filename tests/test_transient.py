@@ -151,12 +151,6 @@ def test_numpy_times_are_times() -> None:
     assert Transient(t - t[0], [0.0, 1.0], []).t_ns.tolist() == [0, 10**9]
 
 
-def test_whole_numbers_in_a_data_frame_are_seconds() -> None:
-    pandas = pytest.importorskip("pandas")
-    frame = pandas.DataFrame({"x": [1.0, 2.0]}, index=[0, 3])
-    assert Transient.from_dataframe(frame, states=["x"], controls=[]).dt.tolist() == [3.0]
-
-
 # --- shapes, names and what a person sees ---------------------------------------------------------------------
 
 

@@ -136,6 +136,10 @@ def validation(runs):
 
 
 def test_it_is_leaving_out_by_hand(runs, validation):
+    data = validation.to_dict()
+    said, text = data["part"], validation_text(data)
+    assert all(run.name in text for run in runs)
+    assert "and 5 more rows" in validation_text({**data, "part": said * 2 + said[:1]})
     for g in (0, 5, 11):
         model = fit(runs[:g] + runs[g + 1 :], additive="noise")
         verdicts = EnvelopeMonitor(model, 2, 3).check(runs[g])
@@ -144,6 +148,11 @@ def test_it_is_leaving_out_by_hand(runs, validation):
         assert part.violated == verdicts.violated.sum()
         assert np.array_equal(part.outside.sum(axis=0), (verdicts.flags == 1).sum(axis=0))
         edges = np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
+        largest, found = np.nanmax(np.abs(verdicts.utilisation), axis=0), said[g]
+        assert found["alarms"] == edges and found["alarm_share"] == pytest.approx(verdicts.alarm.mean() * 101 / 100)
+        assert (
+            found["farthest"] == pytest.approx(largest.max()) and found["farthest_state"] == f"x{largest.argmax() + 1}"
+        )
         assert rising(raised_on([AlarmRule(2, 3)], part), part.starts) == edges
         width = (verdicts.upper - verdicts.lower)[verdicts.judged]
         assert part.mean_width == pytest.approx(width.mean(axis=0))
@@ -210,15 +219,6 @@ def test_blocks_keep_their_distance():
         assert distance.min() >= 2.0 - 1e-9
         assert len(kept) >= 2001 - (stop - start) - 2 * 20
     assert "not independent" in validation.to_dict()["scenario"]["words"]
-
-
-def test_a_block_is_judged_by_a_model_that_has_not_seen_it():
-    (run,) = Tanks().transients(1, seed=6, steps=1000, noise=1e-3)
-    validation = validate(run, additive="noise", blocks=4, gap=1.0)
-    model = fit([cut(run, a, b) for a, b in remaining_spans(run, 250, 501, 1.0)], additive="noise")
-    expected = EnvelopeMonitor(model).check(cut(run, 250, 501))
-    assert validation.parts[1].violated == expected.violated.sum()
-    assert validation.parts[1].mean_width == pytest.approx(np.nanmean(expected.upper - expected.lower, axis=0))
 
 
 def test_weights_go_with_their_samples():
@@ -527,19 +527,3 @@ def test_a_model_is_not_validated_with_other_settings_or_nothing(runs):
         uncertain_lti.validate(model, runs[:3], criterion="lp")
     with pytest.raises(FitError, match="twice"):
         uncertain_lti.validate(runs[:3], runs[:3])
-
-
-def test_each_part_is_reported(validation, runs):
-    data = validation.to_dict()
-    for g, (found, run) in enumerate(zip(data["part"], runs, strict=True)):
-        model = fit(runs[:g] + runs[g + 1 :], additive="noise")
-        verdicts = EnvelopeMonitor(model, 2, 3).check(run)
-        largest = np.nanmax(np.abs(verdicts.utilisation), axis=0)
-        assert found["alarms"] == np.count_nonzero(np.diff(verdicts.alarm.astype(int)) == 1)
-        assert (
-            found["farthest"] == pytest.approx(largest.max()) and found["farthest_state"] == f"x{largest.argmax() + 1}"
-        )
-        assert found["alarm_share"] == pytest.approx(verdicts.alarm.mean() * 101 / 100)
-    text = validation_text(data)
-    assert all(run.name in text for run in runs)
-    assert "and 5 more rows" in validation_text({**data, "part": data["part"] * 2 + data["part"][:1]})
