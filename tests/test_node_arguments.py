@@ -15,7 +15,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -27,23 +27,33 @@ from ros_processes import World, open_world, own_domain
 from uncertain_lti_ros import envelope_monitor, parameters, plant
 
 NODES = {"envelope_monitor": parameters.PARAMETERS, **plant.PARAMETERS}
+MAINS = {"envelope_monitor": envelope_monitor.main, "plant": plant.plant, "turbofan": plant.turbofan}
+Start = Callable[..., subprocess.CompletedProcess]
 
 
 @pytest.fixture
-def start(tmp_path: Path) -> Callable[..., subprocess.CompletedProcess]:
-    """Start a node with these arguments and come back when it has ended."""
+def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Iterator[Start]:
+    """Run the function of a console script with these arguments, until it comes back."""
 
     def call(*arguments: str, node: str = "envelope_monitor", **environment: str) -> subprocess.CompletedProcess:
-        code = f"import sys; from uncertain_lti_ros.nodes import {node}; sys.exit({node}())"
-        own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log")}
-        with own_domain() as domain:
-            return subprocess.run(
-                [sys.executable, "-c", code, *arguments],
-                env=os.environ | own | {"ROS_DOMAIN_ID": str(domain)} | environment,
-                cwd=tmp_path, capture_output=True, text=True, timeout=300,
-            )  # fmt: skip
+        for name, value in environment.items():
+            monkeypatch.setenv(name, value)
+        status = MAINS[node](list(arguments))
+        return subprocess.CompletedProcess(arguments, status, *capfd.readouterr())
 
-    return call
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "log"))
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "")  # the node sets it
+    with own_domain() as domain:
+        monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
+        yield call
+
+
+def process(tmp_path: Path, code: str, *arguments: str) -> subprocess.CompletedProcess:
+    with own_domain() as domain:
+        own = {"ROS_DOMAIN_ID": str(domain), "ROS_LOG_DIR": str(tmp_path / "log")}
+        command = [sys.executable, "-c", code, *arguments]
+        return subprocess.run(command, env=os.environ | own, cwd=tmp_path, capture_output=True, text=True, timeout=300)
 
 
 def refusal(result: subprocess.CompletedProcess, node: str = "envelope_monitor") -> str:
@@ -90,9 +100,7 @@ def refusal(result: subprocess.CompletedProcess, node: str = "envelope_monitor")
         (["--params-file", "nowhere.yaml"], ["--params-file nowhere.yaml is not a file"]),
     ],
 )  # fmt: skip
-def test_a_ros_argument_that_cannot_be_used(
-    start: Callable[..., subprocess.CompletedProcess], arguments: list[str], says: list[str]
-) -> None:
+def test_a_ros_argument_that_cannot_be_used(start: Start, arguments: list[str], says: list[str]) -> None:
     sentence = refusal(start("--ros-args", *arguments))
     assert all(text in sentence for text in says), sentence
 
@@ -108,9 +116,7 @@ def test_a_ros_argument_that_cannot_be_used(
         (["--ros-args", "-p", "model:=x", "--", "rest"], ["argument rest"]),
     ],
 )
-def test_an_argument_outside_the_ros_arguments(
-    start: Callable[..., subprocess.CompletedProcess], arguments: list[str], says: list[str]
-) -> None:
+def test_an_argument_outside_the_ros_arguments(start: Start, arguments: list[str], says: list[str]) -> None:
     sentence = refusal(start(*arguments))
     assert all(text in sentence for text in says), sentence
 
@@ -126,27 +132,23 @@ def test_an_argument_outside_the_ros_arguments(
         ("/**:\n  ros__parameters:\n    margin: -2\n", "parameter margin is -2.0"),
     ],
 )
-def test_a_wrong_parameter_file(
-    start: Callable[..., subprocess.CompletedProcess], tmp_path: Path, text: str, says: str
-) -> None:
+def test_a_wrong_parameter_file(start: Start, tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "given.yaml").write_text(text)
     sentence = refusal(start("--ros-args", "--params-file", "given.yaml"))
     assert says in sentence, sentence
     assert "given.yaml" in sentence or "parameter" in sentence
 
 
-def test_a_setting_of_the_environment_that_rcl_refuses(start: Callable[..., subprocess.CompletedProcess]) -> None:
+def test_a_setting_of_the_environment_that_rcl_refuses(start: Start) -> None:
     assert "ROS_DOMAIN_ID is not an integral number" in refusal(start(ROS_DOMAIN_ID="abc"))
     assert "from 0 to 232" in refusal(start(ROS_DOMAIN_ID="999"))
 
 
 @pytest.mark.parametrize("node", NODES)
-@pytest.mark.parametrize("arguments", [["--help"], ["-h"], ["--ros-args", "--help"]])
-def test_help_describes_every_parameter(
-    start: Callable[..., subprocess.CompletedProcess], node: str, arguments: list[str]
-) -> None:
-    result = start(*arguments, node=node)
-    assert (result.returncode, result.stderr) == (0, "")
+def test_help_describes_every_parameter(start: Start, node: str) -> None:
+    for arguments in (["--help"], ["-h"], ["--ros-args", "--help"]):
+        result = start(*arguments, node=node)
+        assert (result.returncode, result.stderr) == (0, "")
     assert result.stdout.startswith(f"usage: {node} ") and max(map(len, result.stdout.splitlines())) <= 120
     words = " ".join(result.stdout.split())
     for parameter in NODES[node]:
@@ -154,13 +156,20 @@ def test_help_describes_every_parameter(
 
 
 @pytest.mark.parametrize("node", ["plant", "turbofan"])
-def test_the_other_nodes_refuse_in_the_same_way(start: Callable[..., subprocess.CompletedProcess], node: str) -> None:
+def test_the_other_nodes_refuse_in_the_same_way(start: Start, node: str) -> None:
     assert "parameter rate is 'two'" in refusal(start("--ros-args", "-p", "rate:=two", node=node), node)
     assert "did you mean seed?" in refusal(start("--ros-args", "-p", "sed:=2", node=node), node)
     assert "argument now" in refusal(start("now", node=node), node)
 
 
-def test_the_turbofan_refuses_a_manoeuvre_that_there_is_not(start: Callable[..., subprocess.CompletedProcess]) -> None:
+@pytest.mark.parametrize("node", NODES)
+def test_a_process_ends_with_the_sentence_too(tmp_path: Path, node: str) -> None:
+    code = f"import sys; from uncertain_lti_ros.nodes import {node}; sys.exit({node}())"
+    name = NODES[node][1].name
+    assert f"parameter {name} is " in refusal(process(tmp_path, code, "--ros-args", "-p", f"{name}:=[a]"), node)
+
+
+def test_the_turbofan_refuses_a_manoeuvre_that_there_is_not(start: Start) -> None:
     assert "loop" in refusal(start("--ros-args", "-p", "manoeuvre:=loop", node="turbofan"), "turbofan")
 
 
@@ -203,29 +212,21 @@ with process.living(lambda: Stuck("stuck")) as life:
 
 
 def test_a_middleware_that_does_not_come_down_does_not_keep_the_process(tmp_path: Path) -> None:
-    own = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_LOG_DIR": str(tmp_path / "log")}
-    with own_domain() as domain:
-        done = subprocess.run(
-            [sys.executable, "-c", _STUCK], env=os.environ | own | {"ROS_DOMAIN_ID": str(domain)}, cwd=tmp_path,
-            capture_output=True, text=True, timeout=300,
-        )  # fmt: skip
+    done = process(tmp_path, _STUCK)
     assert (done.stdout, done.returncode) == ("it ends\n", -signal.SIGALRM), done
 
 
-def test_every_console_script_takes_its_arguments_or_those_of_the_process(capsys: pytest.CaptureFixture[str]) -> None:
-    for main in (envelope_monitor.main, plant.plant, plant.turbofan):
-        assert main(["--help"]) == 0
-        assert capsys.readouterr().out.startswith("usage: ")
-
-
-@pytest.mark.parametrize("node", NODES)
-def test_without_rclpy_a_program_says_what_to_install(node: str) -> None:
-    for module, fake, says in (
+@pytest.mark.parametrize(
+    ("module", "fake", "says"),
+    [
         ("rclpy", "None", "the Python package rclpy is not installed"),
         ("sensor_msgs.msg", "type(sys)('empty')", "cannot import name 'JointState'"),
-    ):
-        code = f"import sys; sys.modules[{module!r}] = {fake}; from uncertain_lti_ros.nodes import {node} as run"
-        done = subprocess.run([sys.executable, "-c", f"{code}; sys.exit(run())"], capture_output=True, text=True)
-        (line,) = done.stderr.splitlines()
-        assert done.returncode == 2 and line.startswith(f"{node}: {says}")
+    ],
+)
+def test_without_rclpy_a_program_says_what_to_install(tmp_path: Path, module: str, fake: str, says: str) -> None:
+    code = f"import sys; sys.modules[{module!r}] = {fake}; from uncertain_lti_ros import nodes"
+    done = process(tmp_path, f"{code}; print([getattr(nodes, node)() for node in {[*NODES]}])")
+    assert done.stdout == "[2, 2, 2]\n"
+    for node, line in zip(NODES, done.stderr.splitlines(), strict=True):
+        assert line.startswith(f"{node}: {says}")
         assert line.endswith("; source a ROS 2 Jazzy installation, or in the checkout: pip install '.[ros]'")
