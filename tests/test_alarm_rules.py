@@ -10,7 +10,6 @@
 """Rules of the alarm: in the model, and in its file."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -102,20 +101,7 @@ def test_chi2_needs_the_covariance() -> None:
     assert learnt.replace(alarm=RULES).to_dict() == two_states(alarm=RULES).to_dict()
 
 
-@pytest.mark.parametrize(
-    ("residuals", "words"),
-    [
-        ([], r"'horizons\[0\].residuals' is not an object"),
-        ({"mean": [0.0, 0.0]}, r"'horizons\[0\].residuals.covariance' is missing"),
-        ({"mean": [0.0, 0.0], "covariance": ZEROS.tolist(), "odd": 1}, r"unknown field 'horizons\[0\].residuals.odd'"),
-        ({"mean": [0.0], "covariance": [[1.0]]}, "horizon of 4 steps: residuals of 1 state for 2 states"),
-    ],
-)
-def test_residuals_of_a_horizon_that_are_none_are_refused(residuals: Any, words: str) -> None:
-    data = json.loads(json.dumps(two_states().to_dict()))
-    data["horizons"][0]["residuals"] = residuals
-    with pytest.raises(ModelError, match=words):
-        UncertainLTI.from_dict(data)
+ENERGY = {"kind": "energy", "window_s": 1.0, "threshold": 0.5}
 
 
 @pytest.mark.parametrize(
@@ -124,24 +110,20 @@ def test_residuals_of_a_horizon_that_are_none_are_refused(residuals: Any, words:
         ({"kind": "median"}, "kind.* is 'median'; it must be one of containment, energy"),
         ({"window_s": -1}, "window_s of energy is -1; it must be a number of seconds, 0 for one verdict"),
         ({"window_s": True}, "window_s of energy is True"),
-        ({"window_s": 1e10}, "window_s of energy is"),
         ({"threshold": -1}, "threshold of energy is -1"),
         ({"threshold": [1.0, None]}, "threshold of energy"),
-        ({"threshold": []}, "threshold of energy"),
-        ({"threshold": "1"}, "threshold of energy is '1'"),
-        ({"horizon": 0}, "horizon is 0"),
         ({"horizon": 1.5}, r"horizon is 1.5; it must be a whole number"),
         ({"allowance": 0.1}, "unknown field 'alarm.rules\\[0\\].allowance'"),
-        ({"margin": 1.0}, "unknown field 'alarm.rules\\[0\\].margin'"),
+        ({"kind": "cusum", "window_s": 0}, "window_s of cusum is 0; it must be a positive number"),
+        ({"kind": "cusum", "allowance": -1}, "allowance is -1"),
+        ({"kind": "chi2", "threshold": [1.0, 1.0]}, "chi2 is one number for all states"),
     ],
 )
 def test_a_rule_of_a_file_that_cannot_be_is_refused_by_name(change: dict[str, Any], words: str) -> None:
     data = two_states().to_dict()
-    rule = {"kind": "energy", "window_s": 1.0, "threshold": 0.5}
-    data["alarm"] = {"rules": [rule]}
-    assert UncertainLTI.from_dict(data).alarm == (StatisticRule("energy", 1.0, 0.5),)
+    assert UncertainLTI.from_dict({**data, "alarm": {"rules": [ENERGY]}}).alarm == (StatisticRule("energy", 1.0, 0.5),)
     with pytest.raises(ModelError, match=words) as error:
-        UncertainLTI.from_dict({**data, "alarm": {"rules": [{**rule, **change}]}})
+        UncertainLTI.from_dict({**data, "alarm": {"rules": [ENERGY | change]}})
     assert "alarm.rules[0]" in str(error.value) and len(str(error.value).splitlines()) == 1
 
 
@@ -151,10 +133,6 @@ def test_a_rule_of_a_file_that_cannot_be_is_refused_by_name(change: dict[str, An
         (7, "must be a list"),
         ([7], r"alarm.rules\[0\]' is not an object"),
         ([{"kind": "chi2", "window_s": 1.0}], r"rules\[0\].threshold' is missing"),
-        ([{"kind": "chi2", "window_s": 1.0, "threshold": [1.0, 1.0]}], "chi2 is one number for all states"),
-        ([{"kind": "cusum", "window_s": 0, "threshold": 1.0}], "window_s of cusum is 0; it must be a positive number"),
-        ([{"kind": "mewma", "window_s": 1.0, "threshold": [1.0, 1.0]}], "mewma is one number for all states"),
-        ([{"kind": "cusum", "window_s": 1.0, "threshold": 1.0, "allowance": -1}], "allowance is -1"),
         ([{"kind": "containment", "violations": 1, "window": 1, "margin": "x"}], r"rules\[0\]': margin is 'x'"),
         ([{"kind": "containment", "violations": 2, "window": 1, "margin": 1}], "violations is 2 of window 1"),
     ],
@@ -167,11 +145,10 @@ def test_rules_of_a_file_that_cannot_be_are_refused(rules: Any, words: str) -> N
 @pytest.mark.parametrize(
     ("residuals", "words"),
     [
+        ([], "residuals' is not an object"),
         ({"mean": [0.0, 0.0]}, "residuals.covariance' is missing"),
-        (
-            {"mean": [0.0, 0.0], "covariance": ZEROS.tolist(), "relative": 1},
-            "residuals.relative' is 1; it must be true",
-        ),
+        ({"mean": [0.0, 0.0], "covariance": ZEROS.tolist(), "odd": 1}, "unknown field '.*residuals.odd'"),
+        ({"mean": [0.0, 0.0], "covariance": ZEROS.tolist(), "relative": 1}, "relative' is 1; it must be true"),
         ({"mean": [0.0], "covariance": [[1.0]]}, "residuals of 1 state for 2 states"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [0.0, 1.0]]}, "not symmetric"),
         ({"mean": [0.0, 0.0], "covariance": [[1.0, 2.0], [2.0, 1.0]]}, "negative variance"),
@@ -180,8 +157,11 @@ def test_rules_of_a_file_that_cannot_be_are_refused(rules: Any, words: str) -> N
     ],
 )
 def test_residuals_that_cannot_be_are_refused(residuals: Any, words: str) -> None:
-    with pytest.raises(ModelError, match=words):
-        UncertainLTI.from_dict({**two_states().to_dict(), "residuals": residuals})
+    data = two_states().to_dict()
+    horizon = data["horizons"][0] | {"residuals": residuals}
+    for section in ({"residuals": residuals}, {"horizons": [horizon]}):
+        with pytest.raises(ModelError, match=words):
+            UncertainLTI.from_dict({**data, **section})
 
 
 @pytest.mark.parametrize("counted", [(True, True, True), (True, False, True), (False, False, True)])
@@ -211,11 +191,6 @@ def test_the_fit_stores_mean_and_covariance_of_its_utilisation(scheduled: bool) 
     assert model.residuals is not None and model.residuals.relative
     assert model.residuals.mean == pytest.approx(r.mean(axis=0), abs=1e-12)
     assert model.residuals.covariance == pytest.approx(np.cov(r.T, bias=True), rel=1e-9)
-
-
-def test_labels_of_one_alarm_are_all_different() -> None:
-    rule = StatisticRule("mean", 1.0, 1.0)
-    assert labels([rule, replace(rule, window_s=2.0), replace(rule, horizon=9)]) == ("mean", "mean#2", "mean@9")
 
 
 def test_the_words_of_an_alarm_tell_rules_of_one_kind_by_their_windows() -> None:
@@ -261,15 +236,6 @@ def test_two_of_three_verdicts_of_a_horizon_and_no_verdict_changes_nothing() -> 
     window.reset()
     window.push_all(every, rows[:, 2:], every, again)
     assert again.tolist() == alarms
-
-
-def test_a_value_is_known_to_another_condition_on_the_same_field() -> None:
-    arming = Arming(Condition.parse("/machine/mode data == 3"), 0)
-    assert arming.said_on(arming.condition) is None
-    arming.learn(3.0)
-    for text, known in (("/machine/mode data > 1", 3.0), ("/machine/mode other == 3", None), ("/a data == 3", None)):
-        assert arming.said_on(Condition.parse(text)) == known
-    assert arming.said_on(None) is None and Arming(None, 0).said_on(arming.condition) is None
 
 
 def test_a_verdict_counts_while_the_condition_holds_and_its_grace_is_over() -> None:
