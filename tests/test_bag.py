@@ -54,11 +54,10 @@ from mcap.opcode import Opcode
 from mcap.records import Channel
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
-from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
-from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.message_types import RawMessage
@@ -122,7 +121,7 @@ def error_of(path: Path) -> str:
 # --- whole files --------------------------------------------------------------------------------------------
 
 
-@examples(150)
+@examples(80)
 @given(messages=MESSAGES, layout=LAYOUTS)
 def test_any_file_reads_as_the_stable_sort_of_what_was_written(
     messages: list[Message], layout: Layout, tmp_path: Path
@@ -140,7 +139,7 @@ def test_any_file_reads_as_the_stable_sort_of_what_was_written(
     assert bag.warnings == []
 
 
-@examples(60)
+@examples(30)
 @given(messages=MESSAGES, cuts=st.lists(st.integers(0, 60), max_size=3), layout=LAYOUTS)
 def test_parts_read_as_one_in_the_order_of_metadata_yaml(
     messages: list[Message], cuts: list[int], layout: Layout, tmp_path: Path
@@ -166,7 +165,7 @@ def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
     text = Topic("/a", "std_msgs/msg/UInt8MultiArray")
     layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
     data = cdr(text.type, layout=layout, data=np.frombuffer(payload, np.uint8))
-    late_by_one = [i + 1 if i % 50 == 0 else i - 1 if i % 50 == 1 else i for i in range(8_000)]
+    late_by_one = [i + 1 if i % 50 == 0 else i - 1 if i % 50 == 1 else i for i in range(4_000)]
     file = write([text], [Message("/a", t, data) for t in late_by_one], Layout(chunk_size=100_000))
     path = file.save(tmp_path / "x.mcap")
     size = path.stat().st_size
@@ -179,7 +178,7 @@ def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
     finally:
         tracemalloc.stop()
     assert times == sorted(late_by_one)
-    assert size > 8_000_000 and peak < 3_000_000
+    assert size > 4_000_000 and peak < 3_000_000
 
 
 def test_attachments_metadata_and_private_records_are_passed_over(tmp_path: Path) -> None:
@@ -204,7 +203,7 @@ def count_by_mcap(data: bytes) -> int:
     return number
 
 
-@examples(250)
+@examples(100)
 @given(messages=MESSAGES, layout=LAYOUTS, where=st.floats(0, 1, exclude_max=True))
 def test_a_cut_file_reads_as_a_prefix(messages: list[Message], layout: Layout, where: float, tmp_path: Path) -> None:
     file = write(TWO, messages, layout)
@@ -224,15 +223,13 @@ def test_a_cut_file_reads_as_a_prefix(messages: list[Message], layout: Layout, w
 
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_the_chunk_that_a_cut_goes_through_is_read_as_far_as_it_goes(compression: str, tmp_path: Path) -> None:
-    noise = random.Random(1)
-    messages = [Message("/a", i, float64(noise.random())) for i in range(15_000)]
-    file = write([Topic("/a")], messages, Layout(compression, chunk_size=10**9))
-    chunk = next(place for place in places(file.data) if place.opcode == Opcode.CHUNK)
-    cut = (chunk.begin + chunk.end) // 2
+    file = chunked(compression, 15_000, 10**9)
+    ((begin, end),) = chunks(file.data)
+    cut = (begin + end) // 2
     assert count_by_mcap(file.data[:cut]) <= 1
     bag = Bag(file.save(tmp_path / "x.mcap", cut))
     got = read_all(bag)
-    assert 5_000 < len(got) < 10_000 and got == in_order(messages[: len(got)])
+    assert 5_000 < len(got) < 10_000 and got == in_order(file.messages[: len(got)])
     number = f"{len(got):,}".replace(",", " ")
     assert bag.warnings == [f"{tmp_path / 'x.mcap'}: cut after {number} messages (no footer); read up to the cut"]
 
@@ -259,10 +256,10 @@ def test_zeros_after_a_power_cut_end_the_reading(tmp_path: Path) -> None:
 # --- damaged files ------------------------------------------------------------------------------------------
 
 
-def chunked(compression: str = "zstd", number: int = 1000, **options: bool) -> File:
+def chunked(compression: str = "zstd", number: int = 1000, size: int = 3000, **options: bool) -> File:
     noise = random.Random(2)
     messages = [Message("/a", i * SECOND, float64(noise.random())) for i in range(number)]
-    return write([Topic("/a")], messages, Layout(compression, chunk_size=3000, **options))
+    return write([Topic("/a")], messages, Layout(compression, chunk_size=size, **options))
 
 
 def chunks(data: bytes) -> list[tuple[int, int]]:
@@ -294,10 +291,9 @@ def test_a_flipped_bit_outside_chunks_is_told(tmp_path: Path) -> None:
     assert any("checksum of the file is wrong" in warning for warning in bag.warnings)
 
 
-@pytest.mark.parametrize("length", [1 << 60, 2**64 - 1, 1 << 33, 5, 0, 4000])
-@pytest.mark.parametrize("compression", COMPRESSIONS)
-def test_a_record_that_lies_about_its_length_costs_one_chunk(compression: str, length: int, tmp_path: Path) -> None:
-    file = chunked(compression)
+@pytest.mark.parametrize("length", [2**64 - 1, 1 << 33, 5, 0, 4000])
+def test_a_record_that_lies_about_its_length_costs_one_chunk(length: int, tmp_path: Path) -> None:
+    file = chunked()
     begin, end = chunks(file.data)[3]
     assert length != end - begin - 9
     first, last = struct.unpack_from("<QQ", file.data, begin + 9)
@@ -321,7 +317,7 @@ def bounded(seconds: float, memory: int) -> Iterator[None]:
     assert peak < memory
 
 
-@pytest.mark.parametrize("size", [1 << 60, 2**64 - 1, 1 << 33, 1 << 29, 10_000_000, 100, 0])
+@pytest.mark.parametrize("size", [2**64 - 1, 1 << 29, 10_000_000, 100, 0])
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_a_chunk_that_lies_about_its_decompressed_size_is_left_out(compression: str, size: int, tmp_path: Path) -> None:
     file = chunked(compression)
@@ -337,10 +333,9 @@ def test_a_chunk_that_lies_about_its_decompressed_size_is_left_out(compression: 
 @pytest.mark.parametrize("stated", [1000, 1 << 60])
 @pytest.mark.parametrize("whole", [True, False])
 def test_a_bomb_is_not_blown_up(compression: str, stated: int, whole: bool, tmp_path: Path) -> None:
-    zeros = bytes(1 << 28)
+    zeros = bytes(1 << 26)
     packed = lz4.frame.compress(zeros) if compression == "lz4" else zstandard.compress(zeros)
     packed = packed * (4 if compression == "zstd" else 1)
-    del zeros
     name = compression.encode()
     chunk = struct.pack("<QQQII", 0, 1, stated, 0, len(name)) + name + struct.pack("<Q", len(packed)) + packed
     file = chunked()
@@ -351,7 +346,7 @@ def test_a_bomb_is_not_blown_up(compression: str, stated: int, whole: bool, tmp_
     path = tmp_path / "x.mcap"
     path.write_bytes(data)
     # Where a cut goes through a chunk, its checksum tells nothing, and it is read up to the limit.
-    limit = 12_000_000 if whole or stated == 1000 else 3 << 28
+    limit = 12_000_000 if whole or stated == 1000 else 3 * len(zeros)
     with bounded(seconds=20, memory=limit):
         bag = Bag(path)
         got = read_all(bag)
@@ -359,9 +354,8 @@ def test_a_bomb_is_not_blown_up(compression: str, stated: int, whole: bool, tmp_
     assert got == in_order(file.messages[: len(got)]) if not whole else set(got) <= set(in_order(file.messages))
 
 
-@pytest.mark.parametrize("length", [1 << 60, 2**32 - 1])
-def test_strings_and_arrays_that_lie_about_their_length(length: int, tmp_path: Path) -> None:
-    number = struct.pack("<I", length & 0xFFFFFFFF)
+def test_strings_and_arrays_that_lie_about_their_length(tmp_path: Path) -> None:
+    number = struct.pack("<I", 2**32 - 1)
     text = b"\x00\x01\x00\x00" + number + b"abc\x00"
     array = b"\x00\x01\x00\x00" + bytes(8) + number + bytes(16)
     topics = [Topic("/text", "std_msgs/msg/String"), Topic("/array", "std_msgs/msg/Float64MultiArray")]
@@ -395,66 +389,6 @@ def test_channels_of_a_damaged_chunk_are_found_in_the_summary(tmp_path: Path) ->
     file = chunked("none", summary=False, indexes=False)
     begin, end = chunks(file.data)[0]
     assert "its checksum is wrong" in error_of(patched(file, end - 100, bytes(50)).save(tmp_path / "y.mcap"))
-
-
-def mutate(data: bytes, dice: random.Random) -> bytes:
-    changed = bytearray(data)
-    for _ in range(dice.choice([1, 1, 1, 2, 5, 30])):
-        at = dice.randrange(len(changed))
-        kind = dice.randrange(6)
-        if kind == 0:
-            changed[at] ^= 1 << dice.randrange(8)
-        elif kind == 1:
-            changed[at] = dice.choice([0, 255, dice.randrange(256)])
-        elif kind == 2:
-            changed[at : at + 8] = dice.choice([b"\xff" * 8, b"\0" * 8, struct.pack("<Q", 1 << dice.randrange(64))])
-        elif kind == 3:
-            del changed[at : at + dice.randrange(1, 40)]
-        elif kind == 4:
-            changed[at:at] = dice.randbytes(dice.randrange(1, 40))
-        else:
-            other = dice.randrange(len(changed))
-            changed[at : at + 30] = changed[other : other + 30]
-    return bytes(changed)
-
-
-FUZZED = [
-    Layout(compression, chunked, chunk_size=400, summary=summary)
-    for compression, chunked in (("none", True), ("lz4", True), ("zstd", True), ("none", False))
-    for summary in (True, False)
-]
-
-
-@pytest.mark.parametrize("layout", FUZZED, ids=str)
-def test_fuzzed_files_give_a_reading_or_one_sentence(layout: Layout, tmp_path: Path) -> None:
-    joints = Topic("/j", "sensor_msgs/msg/JointState")
-
-    def state(i: int) -> bytes:
-        values = np.array([i, i / 2])
-        return cdr(joints.type, header=header(i), name=["a", "b"], position=values, velocity=values, effort=values[:0])
-
-    messages = [Message("/j", i, state(i)) for i in range(15)] + ramp("/a", range(15))
-    original = write([joints, Topic("/a")], messages, layout).data
-    dice = random.Random(repr(layout))
-    path = tmp_path / "x.mcap"
-    readings = 0
-    for _ in range(60):
-        path.write_bytes(mutate(original, dice))
-        begin = time.process_time()
-        try:
-            bag = Bag(path)
-            times = [raw.log_time_ns for raw in bag.raw_messages()]
-            assert times == sorted(times)
-            assert sum(info.count for info in bag.topics.values()) <= len(times)
-            list(bag.messages([topic for topic, info in bag.topics.items() if info.readable]))
-            bag.facts()
-            readings += 1
-            sentences = bag.warnings
-        except BagError as error:
-            sentences = [str(error)]
-        assert all("\n" not in sentence and str(path) in sentence for sentence in sentences)
-        assert time.process_time() - begin < 5
-    assert readings > 15
 
 
 # --- types --------------------------------------------------------------------------------------------------
@@ -615,18 +549,6 @@ def test_messages_that_do_not_fit_their_definition_are_left_out_and_counted(tmp_
         assert [m.data for _, _, m in bag.messages(["/a"])] == [0, 1, 2, 3, 4, 9]
         (warning,) = bag.warnings
         assert warning.startswith(f"{tmp_path / 'x.mcap'}: /a: 5 messages left out that cannot be decoded (")
-
-
-def test_fields_serve_as_types_for_field_paths(tmp_path: Path) -> None:
-    bag = with_good([Topic("/o", "nav_msgs/msg/Odometry"), Topic("/j", "sensor_msgs/msg/JointState")], [], tmp_path)
-    FieldPath("yaw(pose.pose.orientation)").check("/o", "nav_msgs/msg/Odometry", bag.fields)
-    FieldPath("position[fan]").check("/j", "sensor_msgs/msg/JointState", bag.type_fields("/j"))
-    with pytest.raises(SignalError, match="poze"):
-        FieldPath("poze.pose").check("/o", "nav_msgs/msg/Odometry", bag.fields)
-    with pytest.raises(SignalError, match="x/msg/Nix: not defined"):
-        bag.fields("x/msg/Nix")
-    assert bag.fields("nav_msgs/msg/Odometry")["child_frame_id"] == FieldType("string", "string")
-    assert bag.fields("geometry_msgs/msg/PoseWithCovariance")["covariance"] == FieldType("number", "float64", 36)
 
 
 def test_messages_that_rosbag2_compressed_one_by_one(tmp_path: Path) -> None:
@@ -846,37 +768,24 @@ def test_folders_and_files_in_the_order_given(tmp_path: Path) -> None:
 
 
 def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
-    odd_names = ["fan", "3", " spaced ", "a[b]"]
-    joints = cdr(
-        "sensor_msgs/msg/JointState",
-        header=header(SECOND),
-        name=odd_names,
-        position=np.arange(4.0),
-        velocity=np.arange(3.0),
-        effort=np.zeros(0),
+    odd_names, joint_state, more = ["fan", "3", " spaced ", "a[b]"], "sensor_msgs/msg/JointState", np.arange(3.0)
+    joints = cdr(joint_state, header=header(5), name=odd_names, position=np.arange(4.0), velocity=more, effort=more[:0])
+    none = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    array, single = (cdr("std_msgs/msg/Float64MultiArray", layout=none, data=np.arange(n)) for n in (100.0, 1.0))
+    pose = JAZZY.types["geometry_msgs/msg/Pose"](
+        message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0),
+        message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8),
     )
-    multi = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-    array = cdr("std_msgs/msg/Float64MultiArray", layout=multi, data=np.arange(100.0))
-    single = cdr("std_msgs/msg/Float64MultiArray", layout=multi, data=np.arange(1.0))
-    quaternion = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
-    point = message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
-    pose = message("geometry_msgs/msg/Pose", position=point, orientation=quaternion)
-    poses = cdr("geometry_msgs/msg/PoseArray", header=header(0), poses=[pose, pose])
-    topics = [
-        Topic("/joints", "sensor_msgs/msg/JointState"),
-        Topic("/array", "std_msgs/msg/Float64MultiArray"),
-        Topic("/single", "std_msgs/msg/Float64MultiArray"),
-        Topic("/poses", "geometry_msgs/msg/PoseArray"),
-        Topic("/text", "std_msgs/msg/String"),
-    ]
-    messages = [
-        Message("/joints", 1, joints),
-        Message("/array", 1, array),
-        Message("/single", 1, single),
-        Message("/poses", 1, poses),
-        Message("/text", 1, cdr("std_msgs/msg/String", data="3")),
-    ]
-    bag = read(write(topics, messages), tmp_path)
+    poses = cdr("geometry_msgs/msg/PoseArray", header=header(0), poses=[pose] * 2)
+    kinds = {
+        "/joints": (joint_state, joints),
+        "/array": ("std_msgs/msg/Float64MultiArray", array),
+        "/single": ("std_msgs/msg/Float64MultiArray", single),
+        "/poses": ("geometry_msgs/msg/PoseArray", poses),
+        "/text": ("std_msgs/msg/String", cdr("std_msgs/msg/String", data="3")),
+    }
+    topics = [Topic(name, kind) for name, (kind, _) in kinds.items()]
+    bag = read(write(topics, [Message(name, 1, data) for name, (_, data) in kinds.items()]), tmp_path)
     found = {item.info.topic: item for item in bag.facts()}
     assert found["/joints"].fields == (
         *("position[fan]", 'position["3"]', 'position[" spaced "]', 'position["a[b]"]'),
@@ -951,15 +860,3 @@ def test_real_recordings_read_as_the_mcap_library_reads_them(name: str) -> None:
         else:
             assert info.reason
     assert bag.warnings == []
-
-
-@needs_data
-@pytest.mark.parametrize("name", ["crazyflie/yx4bag_0.mcap", "cougars_auv/SO_bag_0.mcap"])
-def test_real_recordings_decode_as_rosbags_decodes_them(name: str) -> None:
-    with AnyReader([DATA / name]) as reader:
-        kept = [c for c in reader.connections if c.topic != "/rosout"]
-        expected = sorted(
-            ((t, c.topic, repr(reader.deserialize(data, c.msgtype))) for c, t, data in reader.messages(kept)),
-        )
-    bag = Bag(DATA / name)
-    assert sorted((t, topic, repr(m)) for topic, t, m in bag.messages({c.topic for c in kept})) == expected

@@ -21,15 +21,14 @@ from bag_writer import Message as Message_
 from bag_writer import Topic, write
 from engine_bag import SIGNALS, engine_bag
 from perturbed import Arriving as Message
-from perturbed import held_up, run
+from perturbed import held_up, run, session_of
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp
-from uncertain_lti.monitor.session import Rule, Session, topic_types
+from uncertain_lti.monitor.session import Rule
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.sampling.reading import read_as_fitted
 
 STEP = 0.025  # s, of the engine's recordings
@@ -43,16 +42,6 @@ def engine(tmp_path_factory: pytest.TempPathFactory) -> tuple[UncertainLTI, Bag]
     (folder / "signals.yaml").write_text(SIGNALS)
     path = engine_bag(folder / "run.mcap", 600)
     return fit(read_transients([path], folder / "signals.yaml")), Bag(path)
-
-
-def session_of(model: UncertainLTI, bag: Bag, **options: Any) -> Session:
-    definitions = {raw.topic: raw.channel.definition for raw in bag.raw_messages(model.signals.topics)}
-    decoders = {definition.type_name: definition.decode for definition in definitions.values()}
-
-    def make_reader(type_name: str, paths: Any) -> MessageReader:
-        return MessageReader(type_name, paths, bag.fields, decoders[type_name])
-
-    return Session(model, Rule(), topic_types(model, "the model", bag.fields), bag.fields, make_reader, 0.0, **options)
 
 
 def sent(bag: Bag) -> list[Message]:
@@ -80,23 +69,20 @@ def in_parts(messages: list[Message]) -> list[Message]:
     return sorted([*come, *rest], key=lambda m: m[0])
 
 
-def two_at_once(messages: list[Message], apart: float = 0.0) -> list[Message]:
-    """The first two states come so many s apart, then their controls at once: none is far behind the clock topic."""
+def two_at_once(messages: list[Message]) -> list[Message]:
+    """The first two states come 0.4 steps apart, then their controls at once: none is far behind the clock topic."""
     came = messages[3][0]
     early = sorted(messages[:4], key=lambda m: m[1] != STATE_TOPIC)
-    return [(came + 1e-5 * k + apart * (k > 0), *message) for k, (_, *message) in enumerate(early)] + messages[4:]
+    return [(came + 1e-5 * k + 0.4 * STEP * (k > 0), *message) for k, (_, *message) in enumerate(early)] + messages[4:]
 
 
 DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
     "on time": lambda m: m,
-    "controls come 0.6 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6),
     "controls come 3 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 3.0),
     "both come in bursts": lambda m: held_up(held_up(m, STATE_TOPIC, 0.0, 2.0), CONTROL_TOPIC, 0.0, 2.1),
     "states come 0.6 s after the controls": lambda m: held_up(m, STATE_TOPIC, 0.0, 0.6),
-    "two samples come at once": two_at_once,
-    "two samples come at once, their states less so": lambda m: two_at_once(m, 0.4 * STEP),
+    "two samples come at once, their states less so": two_at_once,
     "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
-    "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
     "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),
     "stopped, then in parts": in_parts,
     "stopped, and controls 3 s later": lambda m: held_up(stopped(m, 5.01, 16, STATE_TOPIC), CONTROL_TOPIC, 5.01, 12.0),
@@ -106,7 +92,7 @@ DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
 @pytest.mark.parametrize("delay", DELAYS.values(), ids=DELAYS.keys())
 def test_every_verdict_is_that_of_the_offline_check(engine: tuple[UncertainLTI, Bag], delay: Any) -> None:
     model, bag = engine
-    session = session_of(model, bag)
+    session = session_of(model, Rule())
     live = run(session, delay(sent(bag)))
     check = EnvelopeMonitor(model).check(read_as_fitted(bag, model.signals))
     assert session.late == 0 and session.sampler.counters["missing"] == 0
@@ -130,59 +116,55 @@ def paused(messages: list[Message]) -> list[Message]:
     return [m for m in messages if not 5.01 <= m[0] < 5.31]
 
 
-WITH_LAG: dict[str, Callable[[list[Message]], list[Message]]] = {
-    "on time": lambda m: m,
-    "a pause": paused,
-    "into the stream": lambda m: [message for message in m if message[0] > 1.234],
-    "controls come 0.6 s later": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6),
-    "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
-    "stopped, then in chunks": lambda m: stopped(m, 5.01, 16, STATE_TOPIC),
-    "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),
+LAGGING: dict[str, tuple[float, Callable[[list[Message]], list[Message]]]] = {
+    "on time": (2.4, lambda m: m),
+    "a pause": (2.4, paused),
+    "into the stream": (4.01, lambda m: [message for message in m if message[0] > 1.234]),
+    "controls come 0.6 s later": (2.4, lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6)),
+    "less than a step, stopped, then topic by topic": (0.4, lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC)),
+    "stopped, then in chunks": (4.01, lambda m: stopped(m, 5.01, 16, STATE_TOPIC)),
+    "stopped, then in chunks, controls first": (2.4, lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC)),
 }
 
 
-@pytest.mark.parametrize("steps", [0.4, 2.4, 4.01])
-@pytest.mark.parametrize("delay", WITH_LAG.values(), ids=WITH_LAG.keys())
+@pytest.mark.parametrize("name", LAGGING)
 def test_stamps_that_always_lag_give_what_they_give_where_nothing_waits(
-    engine: tuple[UncertainLTI, Bag], delay: Any, steps: float
+    engine: tuple[UncertainLTI, Bag], name: str
 ) -> None:
     """A copied stamp, or the clock of another machine: no sample gets a control that would not have come before it."""
-    model, bag = engine
+    (model, bag), (steps, delay) = engine, LAGGING[name]
     came = lagging(sent(bag), steps * STEP)
-    name = next(name for name, each in WITH_LAG.items() if each is delay)
     whole = delay(came) if name in ("a pause", "into the stream") else came
-    expected = run(session_of(model, bag, catch_up=0.0), whole)
-    session = session_of(model, bag)
+    expected = run(session_of(model, Rule(), catch_up=0.0), whole)
+    session = session_of(model, Rule())
     live = run(session, delay(came))
     assert len(live) == len(expected) > 400
     for verdict, other in zip(live, expected, strict=True):
         assert verdict.t_ns == other.t_ns and verdict.alarm == other.alarm
         assert verdict.numbers("lower") == other.numbers("lower")
-    lags = {CONTROL_TOPIC: pytest.approx(steps * STEP, abs=0.1 * STEP)} if steps > 1 else {}
-    assert name != "on time" or session.lags == lags
+    assert name != "on time" or session.lags == {CONTROL_TOPIC: pytest.approx(steps * STEP, abs=0.1 * STEP)}
 
 
 def test_without_it_the_verdicts_are_lost(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
-    delay = DELAYS["controls come 0.6 s after the states"]
-    session = session_of(model, bag, catch_up=0.0)
-    assert len(run(session, delay(sent(bag)))) == 600
+    session = session_of(model, Rule(), catch_up=0.0)
+    assert len(run(session, held_up(sent(bag), CONTROL_TOPIC, 0.0, 0.6))) == 600
     assert session.late == 23 and session.sampler.counters["missing"] == 23
 
 
 def test_what_was_put_in_order_is_counted_and_told(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
-    on_time, session = session_of(model, bag), session_of(model, bag)
+    on_time, session = session_of(model, Rule()), session_of(model, Rule())
     run(on_time, sent(bag))
     assert on_time.reordered == 0 and on_time.caught_up == ""
-    run(session, DELAYS["controls come 0.6 s after the states"](sent(bag)))
+    run(session, held_up(sent(bag), CONTROL_TOPIC, 0.0, 0.6))
     assert session.counts(0.0)["put in order"] == str(session.reordered) != "0"
     assert "up to 0.599 s late" in session.caught_up and f"{session.reordered} messages" in session.caught_up
 
 
 def test_without_a_stall_nothing_waits(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
-    session = session_of(model, bag)
+    session = session_of(model, Rule())
     messages = sent(bag)
     run(session, messages[:100], until=messages[100][0])
     for at, topic, log_time, data, sent_ns in messages[100:]:
@@ -197,7 +179,7 @@ def test_a_control_that_is_late_at_its_usual_pace_stays_late(engine: tuple[Uncer
         (at + 1.5 * STEP, t, log + late, d, was + late) if t == CONTROL_TOPIC else (at, t, log, d, was)
         for at, t, log, d, was in sent(bag)
     ]
-    session = session_of(model, bag)
+    session = session_of(model, Rule())
     run(session, sorted(shifted, key=lambda m: m[0]))
     assert session.late > 500 and session.reordered == 0
 
@@ -205,7 +187,7 @@ def test_a_control_that_is_late_at_its_usual_pace_stays_late(engine: tuple[Uncer
 def test_a_topic_that_does_not_come_back_holds_up_nothing_for_long(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
     messages = [m for m in stopped(sent(bag), 5.01, 16, STATE_TOPIC) if m[1] == STATE_TOPIC or m[0] < 5.0]
-    session = session_of(model, bag)
+    session = session_of(model, Rule())
     taken = [(0.0, 0.0)]
     for at, topic, log_time, data, sent_ns in messages:
         for message in session.accept(topic, log_time, data, at, sent_ns, (log_time - sent_ns) * 1e-9):
@@ -218,7 +200,7 @@ def test_a_topic_that_does_not_come_back_holds_up_nothing_for_long(engine: tuple
 def test_controls_that_are_sent_no_more_hold_up_nothing(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
     messages = [m for m in sent(bag) if m[1] == STATE_TOPIC or m[0] < 0.1]
-    session = session_of(model, bag)
+    session = session_of(model, Rule())
     waits = [at for at, *message, sent_ns in messages if not session.accept(*message, at, sent_ns)]
     assert len(messages) == 604 and max(waits) < 0.1 + STALL + 2 * STEP
 
@@ -227,7 +209,7 @@ def test_a_recording_that_was_paused_goes_on_soon(engine: tuple[UncertainLTI, Ba
     """Its stamps lag as those of messages that were held back; but they go on to."""
     model, bag = engine
     resumed = [(at + 3.0 if at > 5.01 else at, *message) for at, *message in sent(bag)]
-    session = session_of(model, bag)
+    session = session_of(model, Rule())
     run(session, [m for m in resumed if m[0] < 5.01], until=5.01)
     waits = [at for at, *message, sent_ns in resumed if at > 5.01 and not session.accept(*message, at, sent_ns)]
     assert len(waits) > 10 and max(waits) < 8.01 + STALL + 2 * STEP
@@ -258,8 +240,7 @@ def test_memory_is_bounded() -> None:
     for k in range(MOST + 1):
         assert not catch_up.over
         put(catch_up, "x", k, 1e-6 * k, 0.0)
-    assert len(catch_up.ready(0.0)) == MOST + 1
-    assert catch_up.over
+    assert len(catch_up.ready(0.0)) == MOST + 1 and catch_up.over
 
 
 def test_a_topic_that_is_sent_once_is_not_waited_for_again() -> None:
@@ -286,7 +267,7 @@ def test_arrivals_never_go_back() -> None:
     assert arrivals == sorted(set(arrivals))
 
 
-@pytest.mark.parametrize("ahead", [-3600.0, -0.3, 0.3, 3600.0])
+@pytest.mark.parametrize("ahead", [-3600.0, 0.3])
 def test_another_clock_of_a_publisher_changes_no_order(ahead: float) -> None:
     catch_up, order = waiting(), []
     for k in range(60):

@@ -11,7 +11,6 @@
 
 import io
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -94,15 +93,6 @@ def test_commands_say_what_the_library_says(folder, capsys):
             assert said["lower"] == verdicts.lower[k].tolist() and said["flags"] == verdicts.flags[k].tolist()
 
 
-def test_topics(folder, capsys):
-    assert main(["topics", str(folder / "run.mcap")]) == 0
-    printed = capsys.readouterr().out
-    assert "/engine/state" in printed and "position[fan_speed]" in printed and "usable" in printed
-    assert main(["topics", str(folder / "run.mcap"), "--json"]) == 0
-    topics = {t["topic"]: t for t in json.loads(capsys.readouterr().out)["topics"]}
-    assert topics[STATE_TOPIC]["count"] == 300 and topics[STATE_TOPIC]["rate"] == pytest.approx(40.0)
-
-
 # --- bad input ---
 
 
@@ -118,44 +108,29 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
     empty.write_bytes(b"")
     lfs.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     text.write_text("not a bag")
+    fit = ["fit", run, "--signals", signals, "--output", out]
     cases = [
         (["check", out, run], "no such model file"),
-        (["fit", str(folder / "nope.mcap"), "--signals", signals, "--output", out], "nope.mcap"),
-        (["fit", str(empty), "--signals", signals, "--output", out], "empty"),
-        (["fit", str(lfs), "--signals", signals, "--output", out], "git lfs pull"),
+        (["fit", str(folder / "nope.mcap"), *fit[2:]], "nope.mcap"),
+        (["fit", str(empty), *fit[2:]], "empty"),
+        (["fit", str(lfs), *fit[2:]], "git lfs pull"),
         (["topics", str(text)], "text.mcap"),
         (["fit", run, "--signals", str(folder / "nope.yaml"), "--output", out], "nope.yaml"),
         (["fit", run, "--signals", signals, "--output", str(folder / "no" / "m.json")], "make it first"),
         (fit_with(SIGNALS.replace("/engine/state", "/engine/stat")), "topics there: /engine/control, /engine/state"),
         (fit_with("states: [1, 2"), "is not YAML"),
-        (
-            fit_with("clock: /engine/state\n" + SIGNALS.replace("topic: /engine/state", "topic: /engine/stte")),
-            "no topic /engine/stte (is /engine/state meant?)",
-        ),
-        (
-            ["check", str(folder / "signals.yaml"), run],
-            "this is a signals file, and a model file is wanted here; write a",
-        ),
+        (fit_with(SIGNALS.replace("/engine/state", "/engine/stte", 1)), "/engine/stte (is /engine/state meant?)"),
+        (["check", signals, run], "this is a signals file, and a model file is wanted here; write a"),
         (["check", str(text), run], "is not JSON"),
         (["check", str(folder), run], "this is a folder, and a model file is wanted here; name the file in it"),
         (["check", "leibov206", run], "(is leibov2006 meant?)"),
-        (
-            ["topics", signals],
-            "this is a signals file, and a recording is wanted here; are the arguments swapped?",
-        ),
-        (
-            ["fit", run, "--signals", str(folder), "--output", out],
-            "this is a folder, and a signals file is wanted here",
-        ),
+        (["topics", signals], "this is a signals file, and a recording is wanted here; are the arguments swapped?"),
+        (["check", run, out], "this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
         (fit_with(SIGNALS.replace("position[fan_speed]", "positon[0]")), "(is position meant?)"),
         (fit_with(SIGNALS.replace("position[fan_speed]", "position[fan_sped]")), "(is fan_speed meant?)"),
         (fit_with(SIGNALS.replace("position[fan_speed]", "rol(position[0])")), "no function 'rol' (is roll meant?)"),
         (fit_with(SIGNALS.replace("states:", "sates:")), "unknown key 'sates' (is states meant?)"),
-        (["fit", run, "--signals", signals, "--output", out, "--workers", "-1"], "--workers is -1; give 1 or more"),
-        (["fit", run, "--signals", signals, "--output", out, "--workers", "0"], "--workers is 0; give 1 or more"),
-        (["check", run, out], "this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
-        (["fit", run, "--signals", run, "--output", out], "this is an MCAP recording, and a signals file is wanted"),
-        (["check", out, run, "--margin", "-1"], "no such model file"),
+        ([*fit, "--workers", "0"], "--workers is 0; give 1 or more"),
     ]
     for arguments, words in cases:
         assert words in refused(capsys, arguments), arguments
@@ -186,18 +161,15 @@ def test_nothing_but_an_older_file_of_its_kind_is_written_over(folder, capsys):
         assert main(arguments) == 0, arguments
 
 
-def test_help_and_usage():
-    """As a process: every command has --help; wrong usage is status 2."""
-    command = [sys.executable, "-m", "uncertain_lti.cli.main"]
-    environment = {**os.environ, "COLUMNS": "100"}
-    whole = subprocess.run([*command, "--help"], capture_output=True, text=True, env=environment, timeout=1200)
-    assert whole.returncode == 0
-    assert all(name in whole.stdout for name in ("topics", "fit", "check", "info", "play", "record", "demo"))
-    for name in ("fit", "play"):
-        one = subprocess.run([*command, name, "--help"], capture_output=True, text=True, env=environment, timeout=1200)
-        assert one.returncode == 0 and "usage" in one.stdout, one.stderr
-    for wrong in ([], ["fit"], ["nonsense"], ["check", "a", "b", "--margin", "x"]):
-        assert subprocess.run([*command, *wrong], capture_output=True, timeout=1200).returncode == 2
+def test_help_and_usage(capsys):
+    """Every command has --help; wrong usage is status 2."""
+    for words, status in (
+        *(([*name, "--help"], 0) for name in ([], ["fit"], ["play"])),
+        *((wrong, 2) for wrong in (["fit"], ["nonsense"], ["check", "a", "b", "--margin", "x"])),
+    ):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        assert stopped.value.code == status and "usage" in "".join(capsys.readouterr())
 
 
 def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, capsys):
@@ -285,14 +257,11 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
     ("words", "said"),
     [
         (["fit", "a.mcap", "--signals", "s.yaml", "--outptu", "m"], "there is no --outptu (is --output meant?)"),
-        (["fit", "a.mcap", "--signls", "s.yaml", "--output", "m"], "--signls s.yaml (is --signals meant?)"),
         (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
         (["check", "m", "a.mcap", "--discard", "1"], "--discard 1 (an option of fit)"),
         (["chek", "m", "b"], "(is check meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--additive", "noies"], "(is noise meant?)"),
-        (["fit", "b", "--signals", "s", "--output", "m", "--discrad", "3"], "(is --discard meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--discard", "abc"], "neither a whole number nor a share"),
-        (["fti", "m"], "(is fit meant?)"),
     ],
 )
 def test_a_near_miss_names_one_option(words, said, capsys):
@@ -332,18 +301,11 @@ def test_an_alarm_is_red_where_colours_are_wanted(monkeypatch):
         assert lines[0] == "bag: 3 verdicts" and ("\x1b[1;31mALARM" in lines[1]) == coloured
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh"])
-def test_completion(shell, tmp_path, capsys):
+def test_completion(tmp_path, capsys):
     pytest.importorskip("shtab", reason="shtab, of the extra completion, is not installed")
-    assert main(["completion", shell]) == 0
-    script = capsys.readouterr().out
-    assert "--criterion" in script and "validate" in script
-    if shutil.which(shell):
-        (tmp_path / "script").write_text(script)
-        assert subprocess.run([shell, "-n", tmp_path / "script"], check=False).returncode == 0
-    if shell == "bash":
-        ask = "COMP_WORDS=(uncertain-lti fit --crit); COMP_CWORD=2; _shtab_uncertain_lti; echo ${COMPREPLY[@]}"
-        done = subprocess.run(
-            ["bash", "-c", f"source {tmp_path}/script; {ask}"], capture_output=True, text=True, check=False
-        )
-        assert done.stdout.split() == ["--criterion"]
+    assert main(["completion", "zsh"]) == 0 and "validate" in capsys.readouterr().out
+    assert main(["completion", "bash"]) == 0
+    (tmp_path / "script").write_text(capsys.readouterr().out)
+    ask = "COMP_WORDS=(uncertain-lti fit --crit); COMP_CWORD=2; _shtab_uncertain_lti; echo ${COMPREPLY[@]}"
+    done = subprocess.run(["bash", "-c", f"source {tmp_path}/script; {ask}"], capture_output=True, text=True)
+    assert done.stdout.split() == ["--criterion"]

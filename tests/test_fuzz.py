@@ -51,9 +51,7 @@ READ = {
     "no closing zero": framed(b"base"),
     "not even the length of one": framed(b""),
     "zeros": framed(b"base\0\0\0\0"),
-    "more room": framed(b"base\0", more=8),
     "filled up": framed(b"base\0", more=11),
-    "a name that ends early": framed(b"base\0", name=b"a\0b\0"),
     "a name without a closing zero": framed(b"base\0", name=b"a"),
     "another name that ends early": framed(b"base\0", name=b"a\0\xff\0"),
     "big-endian": framed(b"base\0", start=BIG),
@@ -144,13 +142,11 @@ def test_a_cut_message_is_refused_live_and_of_recordings() -> None:
                 assert read_alike(kind, path, data[:size], before) is None, size
 
 
-@pytest.mark.parametrize(
-    "kind, path", [("std_msgs/msg/Byte", "data"), ("diagnostic_msgs/msg/DiagnosticStatus", "level")]
-)
-def test_a_byte_is_a_number_live_as_of_recordings(kind: str, path: str) -> None:
+def test_a_byte_is_a_number_live_as_of_recordings() -> None:
     pytest.importorskip("rclpy", reason="rclpy is not installed")
-    data = made(kind, b"\7")
-    assert read_alike(kind, path, data, []) == read_alike(kind, path, data, [data] * 2) == 7.0
+    for kind, path in (("std_msgs/msg/Byte", "data"), ("diagnostic_msgs/msg/DiagnosticStatus", "level")):
+        data = made(kind, b"\7")
+        assert read_alike(kind, path, data, []) == read_alike(kind, path, data, [data] * 2) == 7.0
 
 
 @pytest.mark.parametrize("path", ["present", "voltage"])
@@ -173,8 +169,8 @@ def test_whatever_goes_wrong_is_noticed(tmp_path: Path) -> None:
     """The harness itself, on cases that do what no case may do."""
     program = tmp_path / "wrong.py"
     program.write_text("""
-import os, time, fuzz
-fuzz.LIMIT_CPU_S, fuzz.LIMIT_S = 0.5, 6.0
+import os, fuzz
+fuzz.LIMIT_CPU_S = 0.5
 def wrong(rng, folder):
     kind = next(kinds)
     if kind == "raise":
@@ -184,8 +180,6 @@ def wrong(rng, folder):
     if kind == "compute":
         while True:
             pass
-    if kind == "hang":
-        time.sleep(600)
     if kind == "ask for much":
         bytearray(fuzz.LIMIT_MEMORY + 1)
     return "read"
@@ -194,17 +188,14 @@ fuzz.KINDS["wrong"] = wrong
 if __name__ == "__main__":
     import sys
     seed = int(sys.argv[sys.argv.index("--seed") + 1])
-    kinds = iter(["fine", *["raise", "ask for much", "fine", "compute", "hang", "die", "fine"][seed:]])
+    kinds = iter(["fine", *["raise", "ask for much", "fine", "compute", "die", "fine"][seed:]])
     raise SystemExit(fuzz.main())
 """)
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", path)
-        outcome = fuzz.run("wrong", first=0, count=7, program=str(program))
+        outcome = fuzz.run("wrong", first=0, count=6, program=str(program))
     assert outcome.counts == {"read": 2}
-    for failure, (seed, why) in zip(
-        outcome.failures,
-        [(0, "KeyError"), (1, "MemoryError"), (3, "ended with -27"), (4, "Timeout"), (5, "ended with 3")],
-        strict=True,
-    ):
+    expected = [(0, "KeyError"), (1, "MemoryError"), (3, "ended with -27"), (4, "ended with 3")]
+    for failure, (seed, why) in zip(outcome.failures, expected, strict=True):
         assert f"--seed {seed}:" in failure and why in failure

@@ -64,9 +64,8 @@ def utilisation(model: UncertainLTI, transients: list[Transient]) -> Any:
     return np.concatenate([EnvelopeMonitor(model).check(t).horizon_utilisation[:, 1:] for t in transients])
 
 
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize(("criterion", "schedule"), [("qp", {"x1": 2}), ("lp", {}), ("lp", {"x1": 2})])
 @pytest.mark.parametrize("widths", ["growing", "constant"])
-@pytest.mark.parametrize("schedule", [{}, {"x1": 2}])
 def test_every_window_is_inside_by_the_arithmetic_of_the_verdict(criterion: Any, widths: Any, schedule: Any) -> None:
     transients = runs()
     model = fit(transients, criterion, additive="noise", schedule=schedule, horizons=STEPS, widths=widths)
@@ -205,13 +204,10 @@ def test_weights_are_those_of_the_arrival() -> None:
 
 
 def test_a_horizon_that_is_asked_for_by_its_number_is_there_or_refused() -> None:
+    options = {"additive": "noise", "alarm": "containment", "horizons": [4, 39]}
     for widths in ("growing", "auto"):
         with pytest.raises(FitError, match="no horizon of 39 steps: 3 windows"):
-            uncertain_lti.fit(
-                runs(length=40), "qp", additive="noise", alarm="containment", horizons=[4, 39], widths=widths
-            )
-    with pytest.raises(FitError, match="no horizon of 39 steps: 3 windows"):
-        fit(runs(length=40), additive="noise", horizons=[4, 39])
+            uncertain_lti.fit(runs(length=40), "qp", widths=widths, **options)
 
 
 def test_horizons_without_windows_or_numbers_are_dropped_by_name() -> None:
@@ -251,25 +247,17 @@ def test_check_and_figure_say_which_horizon_was_left(tmp_path: Path) -> None:
     figure = horizon_figure(model, verdicts)
     maps = [axis for axis in figure.axes if axis.get_title("left")]
     assert [axis.get_title("left") for axis in maps] == list(model.state_names)
-    assert [text.get_text() for text in maps[0].get_yticklabels()] == [
-        "1 (0.02 s)",
-        "2 (0.04 s)",
-        "5 (0.1 s)",
-        "11 (0.22 s)",
-    ]
-    save(figure, tmp_path / "f.png", 50)
+    labels = [text.get_text() for text in maps[0].get_yticklabels()]
+    assert labels == ["1 (0.02 s)", "2 (0.04 s)", "5 (0.1 s)", "11 (0.22 s)"]
     save(horizon_figure(model, verdicts, ["x2"], (0.5, 1.0)), tmp_path / "f.png", 50)
     with pytest.raises(ModelError, match="no state 'other'"):
         horizon_figure(model, verdicts, ["other"])
 
 
-@pytest.mark.parametrize("bad", [[1], [2.5], [True], [0, 4]])
-def test_what_is_no_number_of_steps_is_refused(bad: Any) -> None:
-    with pytest.raises(FitError, match="whole numbers of steps"):
-        fit(runs(count=1), horizons=bad)
-
-
-def test_the_problem_as_written_has_one_step() -> None:
+def test_what_is_no_number_of_steps_is_refused() -> None:
+    for bad in ([1], [2.5], [True]):
+        with pytest.raises(FitError, match="whole numbers of steps"):
+            fit(runs(count=1), horizons=bad)
     with pytest.raises(FitError, match="cvxpy states one step"):
         fit(runs(count=1), horizons=[3], method="cvxpy")
 

@@ -22,13 +22,10 @@ from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import edges
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.horizon import MOST_STEPS, Horizon, Run
-from uncertain_lti.model.operating_point import normalised
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, REQUIRED, SHAPES
-from uncertain_lti.monitor.verdict import Foreseen
 from uncertain_lti.monitor.verdict import place as place_of
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Sampler, Step
@@ -81,8 +78,7 @@ def test_a_model_of_one_step_has_none_and_stays_in_its_format() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"steps": 1}, "whole number, 2 to"),
-        ({"steps": True}, "whole number"),
+        ({"steps": True}, "whole number, 2 to"),
         ({"steps": MOST_STEPS + 1}, "whole number"),
         ({"steps": 9}, "two have as many steps"),
         ({"widths": "wide"}, "growing or constant"),
@@ -90,7 +86,6 @@ def test_a_model_of_one_step_has_none_and_stays_in_its_format() -> None:
         ({"blocks": []}, r"horizons\[0\].blocks"),
         ({"odd": 1}, "odd"),
         ({"blocks": [dict.fromkeys(REQUIRED, [[1.0]])]}, r"horizons\[0\].blocks\[0\].A"),
-        ({"blocks": [{}]}, r"horizons\[0\].blocks\[0\].A' is missing"),
     ],
 )
 def test_what_is_no_horizon_is_refused_by_name(change: dict[str, Any], words: str) -> None:
@@ -122,7 +117,6 @@ def test_a_negative_half_width_and_another_number_of_states_are_refused() -> Non
             {"blocks": [{"A": [[1.0, 0.0], [0.0, 1.0]], "B": [[1.0], [1.0]]}]},
             r"'run.blocks\[0\].c' is missing; fit the model",
         ),
-        ({"blocks": [{"A": [[1.0]], "B": [[1.0], [1.0]], "c": [0.0, 0.0]}]}, r"run.blocks\[0\].A"),
         ({"blocks": [{"A": [[1.0, 0.0], [0.0, 1e400]], "B": [[1.0], [1.0]], "c": [0.0, 0.0]}]}, "not finite"),
     ],
 )
@@ -185,7 +179,7 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
     return model, transient, pushed
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(streams())
 def test_a_stream_has_the_utilisations_of_its_transient(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
     """Through gaps, resets, dropped messages, missing values, steps out of range and changes of mode."""
@@ -205,7 +199,7 @@ def live(model: UncertainLTI, steps: list[Step]) -> Any:
     return np.array(kept).reshape(len(kept), len(model.horizons) + 1, model.n)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(streams())
 def test_windows_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
     """Which windows count, and the run and its envelope, one number after another."""
@@ -281,40 +275,6 @@ def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
         assert packed[place_of("lower", model.n)] == found.lower.tobytes()
         assert packed[place_of("upper", model.n)] == found.upper.tobytes()
     assert EnvelopeMonitor(model.replace(horizons=())).foresee(0, [*x[0], *u[0]], dt) is None
-
-
-@settings(max_examples=30, deadline=None)
-@given(streams())
-def test_what_is_foreseen_is_the_envelope_if_nothing_changes(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
-    """By the bits of the arrays; and what is judged does not depend on what was foreseen."""
-    model, transient, steps = case
-    whole = EnvelopeMonitor(model).check(transient).horizon_utilisation
-    ahead = [expected_ahead(model, step) for step in steps[:20]]
-    found = foreseen(model, steps, whole)
-    assert [None if one is None else (one.lower.tobytes(), one.upper.tobytes()) for one in found] == ahead
-
-
-def foreseen(model: UncertainLTI, steps: list[Step], whole: Any) -> list[Foreseen | None]:
-    monitor, found, rows = EnvelopeMonitor(model, margin=1.5), list[Foreseen | None](), []
-    for k, step in enumerate(steps):
-        verdict = monitor.judge(step)
-        if not step.status.dropped:
-            rows.append(verdict.horizon_utilisation)
-        if k < 20:
-            found.append(monitor.foresee(step.t_ns, [*step.after, *step.before[model.n :]], 0.01))
-    assert np.array(rows).tobytes() == whole.tobytes()
-    return found
-
-
-def expected_ahead(model: UncertainLTI, step: Step) -> tuple[bytes, bytes] | None:
-    point, count = model.operating_point, model.steps[-1]
-    z = normalised(np.array([*step.after, *step.before[model.n :]]), point.steady, point.scale)
-    z = np.repeat(z[:, None], count, axis=1)
-    if not np.isfinite(z).all() or (model.main_block(z) < 0).any():
-        return None
-    *_, (_, centre, half) = model.envelopes(np.arange(count), z, np.full(count, 0.01))
-    lower, upper = (point.recorded_x(bound) for bound in edges(centre[:, 0], half[:, 0], 1.5))
-    return (lower.tobytes(), upper.tobytes()) if np.isfinite([lower, upper]).all() else None
 
 
 @pytest.mark.parametrize("schedule", [None, SPEED])

@@ -13,7 +13,6 @@ import struct
 import subprocess
 import sys
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -21,12 +20,10 @@ from bag_writer import (
     Layout,
     Message,
     Topic,
-    cdr,
     channel_record,
     chunk_index,
     chunk_record,
     float64,
-    header,
     message_record,
     ramp,
     raw_file,
@@ -37,19 +34,16 @@ from bag_writer import (
 )
 from by_message import read_stream_by_message
 from mcap.reader import NonSeekingReader, make_reader
-from mcap.writer import Writer
 from test_annotate import held
 
-from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
+from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings import bag as bag_module
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.mcap_scan import outline
 from uncertain_lti.recordings.message_types import define
-from uncertain_lti.reports.annotate import annotate
-from uncertain_lti.sampling.reading import read_as_fitted_with_decisions, read_stream
+from uncertain_lti.sampling.reading import read_stream
 
 TOPIC = Topic("/a")
 DEFINED = schema_record(1, TOPIC) + channel_record(1, TOPIC, 1)
@@ -87,36 +81,31 @@ sys.exit(main(sys.argv[1:]))
     )
 
 
-@pytest.mark.parametrize("what", ["zeros", "private records", "messages without content"])
-def test_a_small_file_takes_little_memory_and_time(tmp_path, model, what):
+@pytest.mark.parametrize("rest", [bytes(9), message_record(1, STEP, b"")])
+def test_a_small_file_takes_little_memory_and_time(tmp_path, model, rest):
     """20 KB that decompress to 250 MiB of the smallest records; before, walking them took 4 GiB and minutes."""
-    rest = {
-        "zeros": bytes(9),
-        "private records": record(0x80),
-        "messages without content": message_record(1, STEP, b""),
-    }[what]
     path = tmp_path / "small.mcap"
     path.write_bytes(raw_file(chunk_record(DEFINED + said(20) + rest * ((250 << 20) // len(rest))), summary=b""))
     assert path.stat().st_size < 50_000
     done = limited(["check", model, path])
     assert done.returncode in (0, 2), done.stderr[-2000:]
     assert "Traceback" not in done.stderr and "not enough memory" not in done.stderr
-    if what == "zeros":  # what follows a record that is none is left out, what stands before it counts
+    if not any(rest):  # what follows a record that is none is left out, what stands before it counts
         assert "20 samples, 19 verdicts" in done.stdout and "left out" in done.stderr
     else:
         assert "more records than bytes" in done.stderr
 
 
 def test_small_records_outside_chunks_are_walked_at_once(tmp_path):
-    """A million in 0.1 s of processor time; before, each was read alone, in 3 s. Chunks in between count."""
+    """Half a million in 0.05 s of processor time; before, each was read alone, in 1.5 s. Chunks in between count."""
     path = tmp_path / "bare.mcap"
     chunk = chunk_record(said(1, begin=20))
-    bare = message_record(1, STEP, b"") * 1_000_000
+    bare = message_record(1, STEP, b"") * 500_000
     path.write_bytes(raw_file(DEFINED, said(20), chunk, bare, chunk, said(20, begin=30), summary=b""))
     began = time.process_time()
     bag = Bag(path)
-    assert time.process_time() - began < 1.5
-    assert bag.topics["/a"].count == 1_000_042 and not any("left out" in warning for warning in bag.warnings)
+    assert time.process_time() - began < 0.75
+    assert bag.topics["/a"].count == 500_042 and not any("left out" in warning for warning in bag.warnings)
 
 
 @pytest.mark.parametrize("number", [2**40, 2**63, 2**70])
@@ -128,10 +117,10 @@ def test_a_fixed_array_longer_than_any_message_is_a_message_that_is_cut(number):
 
 
 def test_many_chunks_do_not_decompress_to_more_than_a_multiple_of_the_file(tmp_path, model):
-    """300 chunks of 250 MiB each in one file of 2.4 MB: 75 GiB, were they all decompressed."""
+    """100 chunks of 250 MiB each in one file of 0.8 MB: 25 GiB, were they all decompressed."""
     bomb = chunk_record(record(0x80, bytes(250 << 20)))
     path = tmp_path / "bombs.mcap"
-    path.write_bytes(raw_file(chunk_record(DEFINED + said(20)), *[bomb] * 300, summary=b""))
+    path.write_bytes(raw_file(chunk_record(DEFINED + said(20)), *[bomb] * 100, summary=b""))
     done = limited(["check", model, path])
     assert done.returncode == 0 and "20 samples, 19 verdicts" in done.stdout, done.stderr[-2000:]
     assert "when decompressed" in done.stderr and len(done.stderr) < 5000
@@ -142,12 +131,10 @@ def test_a_chunk_that_reaches_over_its_neighbour_costs_the_copy_nothing(tmp_path
     start = len(raw_file())
     longer = first[:1] + struct.pack("<Q", len(first) - 9 + 40) + first[9:]
     index = chunk_index(start, first) + chunk_index(start + len(first), second)
-    path, copy = tmp_path / "over.mcap", tmp_path / "copy.mcap"
-    path.write_bytes(raw_file(longer, second, summary=index))
+    path = save(tmp_path / "over.mcap", raw_file(longer, second, summary=index))
     read = [(m.log_time_ns, m.data) for m in Bag(path).raw_messages()]
     assert len(read) == 20
-    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
-    assert [(m.log_time_ns, m.data) for m in Bag(copy).raw_messages(["/a"])] == read
+    assert [(m.log_time_ns, m.data) for m in Bag(copied(path, model)).raw_messages(["/a"])] == read
 
 
 @pytest.mark.parametrize("opcode", [2, 15])
@@ -188,15 +175,10 @@ def save(path, data):
 
 def test_a_summary_without_schemas_reads_alike_everywhere(tmp_path, model):
     """Channels are repeated in the summary and schemas are not: `topics` read such a file, `fit` refused it."""
-    path = tmp_path / "bare.mcap"
-    with open(path, "wb") as stream:
-        writer = Writer(stream, repeat_schemas=False)
-        writer.start()
-        schema = writer.register_schema(TOPIC.type, "ros2msg", TOPIC.schema_text().encode())
-        channel = writer.register_channel("/a", "cdr", schema)
-        for m in ramp("/a", range(0, 20 * STEP, STEP)):
-            writer.add_message(channel, m.log_time, m.data, m.log_time)
-        writer.finish()
+    chunk = chunk_record(DEFINED + said(20))
+    index = chunk_index(len(raw_file()), chunk, channels=[1])
+    summary = channel_record(1, TOPIC, 1) + statistics_record({1: 20}, 1) + index
+    path = save(tmp_path / "bare.mcap", raw_file(chunk, summary=summary))
     assert Bag(path).topics["/a"].readable
     signals = UncertainLTI.load(model).signals
     stream = read_stream(Bag(path, indexed=True), signals)
@@ -235,13 +217,11 @@ def chain(fields, length):
 
 SCHEMAS = {
     "fixed arrays of texts": b"".join(b"string[4096] a%d\n" % i for i in range(8)),
-    "fixed arrays in types": chain("T{} a\nstring[1000] s", 9),
     "a tree": chain("T{0} a\nT{0} b", 30),
     "deep": chain("T{} a", 900),
     "blank lines": b"\n" * 1_000_000 + b"float64 x\n",
     "comments": b"# nothing\n" * 100_000 + b"float64 x\n",
     "many fields": b"".join(b"float64 x%d\n" % i for i in range(60_000)),
-    "no end": b"float64[" * 100_000,
     "a long default": b"float64[] x [" + b"1," * 400_000 + b"1]\n",
     "a long name": b"float64 " + b"x" * 1_000_000,
 }  # fmt: skip
@@ -265,7 +245,7 @@ def test_a_file_of_nothing_but_schemas_ends(tmp_path, monkeypatch):
     monkeypatch.setattr(bag_module, "_MOST_LINES", 5000)
     topics = [
         Topic(f"/t{k}", "p/msg/T", schema="".join(f"float64 x{i}\n" for i in range(1000)) + f"float64 y{k}\n")
-        for k in range(2000)
+        for k in range(500)
     ]
     records = b"".join(schema_record(k + 1, t) + channel_record(k + 1, t, k + 1) for k, t in enumerate(topics))
     path = save(
@@ -274,7 +254,7 @@ def test_a_file_of_nothing_but_schemas_ends(tmp_path, monkeypatch):
     began = time.process_time()
     bag = Bag(path)
     assert time.process_time() - began < 3.0
-    assert not bag.topics["/t0"].reason and "too long together" in bag.topics["/t999"].reason
+    assert not bag.topics["/t0"].reason and "too long together" in bag.topics["/t499"].reason
 
 
 def test_a_nested_message_without_fields_is_one_byte():
@@ -311,6 +291,13 @@ def test_messages_cut_before_their_end_are_left_out(tmp_path, what):
         assert read(Bag(path), signals).values[0].tolist() == [[1.5], [1.5]]
 
 
+def copied(path, model):
+    """The annotated copy that `check --write` makes of a file."""
+    copy = path.with_name("copy.mcap")
+    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
+    return copy
+
+
 def test_attachments_and_metadata_in_copies(tmp_path, model):
     """Bytes behind what the format knows are no damage; a metadata record with a broken map is."""
     body = struct.pack("<QQ", 1, 2) + struct.pack("<I", 1) + b"n" + struct.pack("<I", 1) + b"t" + struct.pack("<Q", 3)
@@ -318,9 +305,8 @@ def test_attachments_and_metadata_in_copies(tmp_path, model):
     broken = record(12, struct.pack("<I", 1) + b"m" + struct.pack("<I", 4000) + b"key")
     whole = record(12, struct.pack("<I", 1) + b"w" + struct.pack("<III", 10, 1, 0)[:4] + struct.pack("<I", 1) + b"k"
                    + struct.pack("<I", 1) + b"v" + b"padding")  # fmt: skip
-    path, copy = tmp_path / "a.mcap", tmp_path / "copy.mcap"
-    path.write_bytes(raw_file(good, broken, whole, chunk_record(DEFINED + said(20)), summary=b""))
-    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
+    path = save(tmp_path / "a.mcap", raw_file(good, broken, whole, chunk_record(DEFINED + said(20)), summary=b""))
+    copy = copied(path, model)
     found = held(copy, without=["/envelope_monitor/"])
     assert [(a.name, a.data) for a in found.attachments] == [("n", b"abc")]
     assert [(m.name, m.metadata) for m in found.metadata] == [("w", {"k": "v"})]
@@ -332,12 +318,10 @@ def test_attachments_and_metadata_in_copies(tmp_path, model):
 def test_copies_of_padded_definitions_can_be_walked(tmp_path, model):
     """The format allows bytes behind a definition; inside chunks the mcap library does not pass over them."""
     padded = schema_record(1, TOPIC, b"padding") + channel_record(1, TOPIC, 1, b"padding")
-    path, copy = tmp_path / "padded.mcap", tmp_path / "copy.mcap"
-    path.write_bytes(raw_file(chunk_record(padded + said(20)), summary=b""))
+    path = save(tmp_path / "padded.mcap", raw_file(chunk_record(padded + said(20)), summary=b""))
     read = [m.data for m in Bag(path).raw_messages()]
     assert len(read) == 20 and by_the_library(path) != read
-    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
-    assert by_the_library(copy) == read
+    assert by_the_library(copied(path, model)) == read
 
 
 def by_the_library(path):
@@ -364,12 +348,8 @@ def test_log_times_past_64_bits_are_refused_where_they_enter(tmp_path, model, su
                 list(read(["/late"]))
         assert len(list(bag.raw_messages(["/a"]))) == 20
     assert {f.info.topic: f.rate for f in Bag(path).facts()} == {"/a": 1.0, "/late": None}
-    copy = tmp_path / "copy.mcap"
     assert main(["topics", str(path)]) == 0
-    assert main(["check", str(model), str(path), "--write", str(copy)]) == 0
-    assert {(c[0], m[2]) for c, *m in ((m[0], *m) for m in held(copy, without=["/envelope"]).messages)} >= {
-        ("/late", 2**63)
-    }
+    assert ("/late", 2**63) in {(m[0][0], m[2]) for m in held(copied(path, model)).messages}
 
 
 def test_messages_out_of_order_are_held_up_to_a_limit(tmp_path, monkeypatch):
@@ -404,24 +384,3 @@ def test_a_damaged_definition_in_the_summary_alone_hurts_nothing(tmp_path, model
         assert Bag(path, indexed=True).indexed
         for indexed in (True, False):
             assert read_stream(Bag(path, indexed=indexed), signals).values[0][:, 0].tolist() == list(range(20))
-
-
-def test_a_copy_without_any_sample(tmp_path):
-    """Something is decided on every clock message, and none of them is a sample."""
-    kind = "sensor_msgs/msg/JointState"
-    empty = np.empty(0)
-    data = cdr(kind, header=header(0), name=["a"], position=np.array([1.0]), velocity=empty, effort=empty)
-    stamped = cdr(kind, header=header(10**9), name=["a"], position=np.array([1.0]), velocity=empty, effort=empty)
-    state = {"name": "x", "topic": "/x", "field": "position[0]", "type": kind}
-    signals = SignalMap.from_dict(
-        {"states": [state], "clock": "/x", "max_gap": 5.0, "topics": {"/x": {"time": "header"}}}
-    )
-    model = UncertainLTI([[0.0]], np.zeros((1, 0)), [[1.0]], np.zeros((1, 0)), v=[2.0], signals=signals)
-    bodies = [data, stamped, data]
-    path = write([Topic("/x", kind)], [Message("/x", k, b) for k, b in enumerate(bodies)]).save(tmp_path / "x.mcap")
-    (bag,) = group_recordings([path])
-    transient, decisions = read_as_fitted_with_decisions(bag, signals)
-    every = replace(decisions, dropped=np.ones_like(decisions.dropped))
-    none = Transient(np.empty(0, np.int64), np.empty((0, 1)), np.empty((0, 0)), signals=signals)
-    annotate(bag.parts, EnvelopeMonitor(model).check(none), every, tmp_path / "copy.mcap", model)
-    assert [m.data for m in Bag(tmp_path / "copy.mcap").raw_messages(["/x"])] == bodies

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
-from uncertain_lti.identification import fit, fleet, formulation, passes, programmes, solvers, working_set
+from uncertain_lti.identification import fit, fleet, formulation, passes, programmes, working_set
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.problem import Problem
@@ -70,7 +70,7 @@ def widths(model, transient):
     return upper - lower
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(
     seed=st.integers(0, 2**32 - 1),
     n=st.integers(1, 4),
@@ -124,17 +124,17 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
-def test_large_problem_reaches_the_same_optimum(criterion, monkeypatch):
-    """Beyond the size of the first subsample, where full passes have to correct it."""
+@pytest.mark.parametrize("held", [working_set._HELD_BYTES, 1])
+def test_large_problem_reaches_the_same_optimum(criterion, held, monkeypatch):
+    """Beyond the first subsample, where full passes have to correct it; rows proven together, or in groups."""
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
+    monkeypatch.setattr(working_set, "_HELD_BYTES", held)
     transient = drawn(small_plant(8), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")
     problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
     _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL if criterion == "qp" else cp.HIGHS)
     assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
-    s = transient.transitions()
-    lower, upper = model.bounds(s.x, s.u, s.dt)
-    assert ((lower <= s.x_next) & (s.x_next <= upper)).all()
+    assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
@@ -196,14 +196,6 @@ def test_centre_of_the_quadratic_programme_is_the_closest_one():
     best.solve(cp.CLARABEL, **CLARABEL)
     ours = np.sum((increment - 0.1 * z @ np.concatenate([model.A[0], model.B[0]])) ** 2)
     assert ours == pytest.approx(best.value, rel=1e-4)
-
-
-def test_fitted_twice_is_the_same_to_the_bit():
-    transient = drawn(leibov2006(), 500, 3)
-    for criterion in ("qp", "lp"):
-        one, two = fit(transient, criterion), fit(transient, criterion)
-        for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
-            assert np.array_equal(getattr(one, name), getattr(two, name))
 
 
 def test_recordings_are_not_joined():
@@ -328,9 +320,9 @@ def test_wrong_options_are_refused():
         (dict(weights=np.tile([[1.0, 2.0], [2.0, 1.0]], (50, 1, 1))), "not positive definite"),
         (dict(weights=np.tile([[1.0, 0.5], [0.0, 1.0]], (50, 1, 1))), "not symmetric"),
         (dict(weights=[np.ones((49, 2))]), r"must be \(50, 2\)"),
-        (dict(weights="heavy"), "not arrays of real numbers"),
         (dict(weights=np.array([1.0, 1j])), "not arrays of real numbers"),
         (dict(operating_point=OperatingPoint.identity(3, 1)), "3 states"),
+        *((dict(additive="noise", discard=budget), "discard is") for budget in (-1, 1.5, np.nan, True)),
     ]
     for options, words in cases:
         with pytest.raises(FitError, match=words):
@@ -354,29 +346,15 @@ def test_what_is_too_small_for_the_arithmetic_is_named(size, criterion):
 
 
 def test_infinite_and_complex_numbers_are_refused():
-    whole = drawn(small_plant(2), 50, 2)
     for wrong in ({"fixed": {"A": np.full((2, 2), np.inf)}}, {"upper": {"A": np.full((2, 2), -np.inf)}}):
         with pytest.raises(FitError, match="A is to be infinite; give finite numbers, NaN for a free element"):
             Structure(2, 1, **wrong)
     with pytest.raises(FitError, match="A is not an array of real numbers"):
         Structure(2, 1, fixed={"A": np.full((2, 2), 1j)})
     with pytest.raises(TransientError, match="x is not numeric; give real numbers"):
-        Transient(whole.t_ns, whole.x + 1j, whole.u)
-    with pytest.raises(TransientError, match="X must be a vector of real numbers"):
-        OperatingPoint(np.zeros(2), np.zeros(1), np.ones(2) + 1j, np.ones(1))
+        Transient(np.arange(3.0), np.full((3, 2), 1j), np.zeros((3, 1)))
     with pytest.raises(ModelError, match="field 'A' is not an array of numbers"):
         UncertainLTI(np.eye(2) * 1j, np.eye(2, 1), np.eye(2), np.eye(2, 1))
-
-
-def test_versions_are_those_of_what_solved():
-    transient = drawn(small_plant(1), 60, 1)
-    for options, packages in (
-        ({"criterion": "qp"}, {"daqp"}),
-        ({"criterion": "qp", "method": "cvxpy"}, {"cvxpy", "osqp"}),
-        ({"criterion": "lp", "method": "cvxpy"}, {"cvxpy", "highspy"}),
-    ):
-        found = fit(transient, additive="noise", **options).fit_summary["versions"]
-        assert set(found) == {"uncertain-lti", "python", "numpy", *packages}
 
 
 def test_nothing_usable_is_said():
@@ -493,42 +471,21 @@ def by_bounds(model, problem):
 def test_a_fit_judges_every_transition_as_the_bounds_do(sample):
     """To the bit: on the bounds it is inside, an ulp beyond outside."""
     outside = 0
-    for seed in range(60):
+    for seed in range(30):
         model, problem = sample(seed)
         total, expected = passes.judge(problem, model), by_bounds(model, problem)
         assert total.outside.tolist() == expected[0].tolist()
         assert total.largest.tobytes() == expected[1].tobytes()
         assert total.weighted == pytest.approx(expected[2], rel=1e-15)
         outside += int(total.outside.sum())
-    assert outside > 500
+    assert outside > 250
 
 
 def test_a_fit_does_not_depend_on_the_number_of_threads(monkeypatch):
-    transient = drawn(leibov2006(), 100_001, 3, noise=1e-3)
+    transient = drawn(leibov2006(), 40_001, 3, noise=1e-3)
     several = fit(transient, "qp", additive="noise", describe_data=False)
     monkeypatch.setattr(fleet, "core_count", lambda: 1)
     assert fit(transient, "qp", additive="noise", describe_data=False).to_dict() == several.to_dict()
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_the_dual_bound_is_below_every_feasible_value_and_meets_the_optimum(seed):
-    rng = np.random.default_rng(seed)
-    M, G = rng.standard_normal((6, 6)), rng.standard_normal((40, 6))
-    H, f, h = M @ M.T + 1e-3 * np.eye(6), rng.standard_normal(6), G @ rng.uniform(0, 1, 6) - rng.uniform(0, 1, 40)
-    lower, upper = np.full(6, -5.0), np.full(6, 5.0)
-    programme = solvers.Programme(H, f, G, h, lower, upper)
-    answer = solvers.solve_qp(programme)
-
-    def value(xi):
-        return 0.5 * xi @ H @ xi + f @ xi
-
-    best = value(answer.xi)
-    assert solvers.dual_bound(programme, answer.xi) == pytest.approx(best, rel=1e-9, abs=1e-9)
-    for _ in range(20):  # a bound wherever it is taken
-        anywhere = answer.xi + 0.1 * rng.standard_normal(6)
-        assert solvers.dual_bound(programme, anywhere) <= best + 1e-9
-    again = solvers.solve_qp(programme, answer.active)
-    np.testing.assert_allclose(again.xi, answer.xi, atol=1e-10)
 
 
 def test_transients_weigh_as_the_user_says():
@@ -557,30 +514,12 @@ def with_structure(transient, additive="none", criterion="qp", **given):
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
-def test_structure_is_kept_and_costs(criterion):
-    transient = drawn(small_plant(71, 3, 2), 300, 71, noise=1e-3, rest=0)
-    free = fit(transient, criterion, additive="noise")
-    nan = np.nan
-    A = [[nan, 0.0, nan], [0.0, nan, nan], [nan, nan, nan]]
-    dA = [[nan, 0.0, nan], [nan, nan, 0.0], [nan, nan, nan]]
-    lower = {"B": np.zeros((3, 2)), "dB": [[0.1, nan], [nan, nan], [nan, nan]]}
-    model = with_structure(
-        transient, "noise", criterion, fixed={"A": A, "dA": dA}, lower=lower, upper={"v": [nan, 0.5, nan]}
-    )
-    assert count_outside(model, [transient]) == 0
-    assert model.A[0, 1] == 0 and model.A[1, 0] == 0 and (model.B >= 0).all() and model.v[1] <= 0.5 * (1 + 1e-9)
-    assert model.dA[0, 1] < 1e-12 and model.dA[1, 2] < 1e-12  # rounding apart
-    assert model.dB[0, 0] >= 0.1
-    ratio = np.asarray(model.fit_summary["objective"]) / np.asarray(free.fit_summary["objective"])
-    assert (ratio >= 1 - 1e-8).all()
-
-
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_structure_reaches_the_optimum_of_the_bounded_problem(criterion):
     transient = drawn(small_plant(72), 150, 72, noise=1e-3)
     A = np.array([[np.nan, 0.3], [0.0, np.nan]])
     dA = np.array([[np.nan, 0.2], [np.nan, np.nan]])
     model = with_structure(transient, "noise", criterion, fixed={"A": A, "dA": dA}, upper={"B": [[1.0], [-0.5]]})
+    assert count_outside(model, [transient]) == 0 and model.A[~np.isnan(A)].tolist() == [0.3, 0.0]
     s = transient.transitions()
     z = np.hstack([s.x, s.u])
     for i in range(2):
@@ -656,7 +595,6 @@ def test_structure_rules_of_a_signals_file():
     for rules, words in (
         ({"state": "p"}, "a list of rules"),
         ([{"state": "p"}], "keys state, from"),
-        ([{"state": "q", "from": "v", "nominal": 1}], "there is no 'q'; there are p, v"),
         ([{"state": "p", "from": "g", "nominal": 1}], "there is no 'g'; there are p, v, f"),
         ([{"state": "p", "from": "v", "nominal": "one"}], "write a number"),
         ([{"state": "p", "from": "noise", "nominal": 1}], "noise has no nominal"),
@@ -681,8 +619,7 @@ def test_structure_goes_to_the_model_file_and_back(tmp_path):
 # --- discards ---
 
 
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
-@pytest.mark.parametrize("budget", [3, 0.012])
+@pytest.mark.parametrize(("criterion", "budget"), [("qp", 3), ("lp", 0.012)])
 def test_discards_find_the_outliers(criterion, budget):
     clean = drawn(small_plant(81), 260, 81, noise=1e-3)
     x = clean.x.copy()
@@ -705,8 +642,7 @@ def test_discards_find_the_outliers(criterion, budget):
     assert count_outside(model, [kept]) <= 6
 
 
-@pytest.mark.parametrize("seed", [82, 84])
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
+@pytest.mark.parametrize(("criterion", "seed"), [("qp", 82), ("lp", 84)])
 def test_discards_are_the_best_single_ones(criterion, seed):
     """Against trying every transition: the first discard lowers the objective most; for (11) δ of the rows in all."""
     transient = drawn(small_plant(seed), 60, seed, noise=5e-3)
@@ -729,15 +665,8 @@ def test_discards_leave_as_many_transitions_as_unknowns():
         fit(drawn(small_plant(1), 8, 1), additive="noise", discard=2)
 
 
-def test_discards_out_of_range_are_refused():
-    transient = drawn(small_plant(1), 50, 1)
-    for budget in (-1, 1.5, np.nan, True):
-        with pytest.raises(FitError, match="discard is"):
-            fit(transient, additive="noise", discard=budget)
-
-
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_controls_that_move_together_cost_no_optimality(criterion, seed):
     """Columns that cannot be told apart, and scales far apart: the answer is still proved, and is cvxpy's."""
     rng = np.random.default_rng(seed)
@@ -761,45 +690,3 @@ def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch
     np.testing.assert_allclose(model.fit_summary["objective"], expected.fit_summary["objective"], rtol=1e-7)
     np.testing.assert_allclose(model.fit_summary["mean_width"], expected.fit_summary["mean_width"], rtol=1e-3)
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
-
-
-def test_rows_proven_in_groups_have_the_optimum_of_rows_proven_together(monkeypatch):
-    rng = np.random.default_rng(5)
-    N, x = 30_000, np.zeros((30_001, 3))
-    u = rng.normal(size=(N + 1, 1))
-    for k in range(N):
-        x[k + 1] = 0.95 * x[k] + 0.02 * x[k, ::-1] + 0.1 * u[k] + 0.01 * rng.uniform(-1, 1, 3)
-    transient = Transient(np.arange(N + 1) * 0.01, x, u)
-    together = [fit([transient], criterion=c, additive="noise", describe_data=False) for c in ("qp", "lp")]
-    monkeypatch.setattr(working_set, "_HELD_BYTES", 1)
-    for criterion, model in zip(("qp", "lp"), together, strict=True):
-        said = []
-        alone = fit([transient], criterion, additive="noise", describe_data=False, progress=said.append)
-        counted = [text.partition(",")[0] for text in said if text.startswith("row ")]
-        assert counted == ["row 2 of 3", "row 3 of 3"]
-        assert alone.fit_summary["objective"] == pytest.approx(model.fit_summary["objective"], rel=1e-9)
-        assert alone.fit_summary["optimality_gap"] < 1e-6
-        assert alone.fit_summary["solver"]["passes"] > model.fit_summary["solver"]["passes"]
-
-
-def test_near_rows_alone_lead_to_the_minimiser_of_all():
-    rng = np.random.default_rng(6)
-    root, G = rng.normal(size=(6, 6)), rng.normal(size=(400, 6))
-    H, f = root @ root.T + np.eye(6), rng.normal(size=6)
-    h, lower, upper = G @ rng.normal(size=6) - rng.uniform(0, 1, 400), np.full(6, -np.inf), np.full(6, np.inf)
-    programme = solvers.Programme(H, f, G, h, lower, upper)
-    whole = solvers.solve_qp(programme)
-    for xi in (np.zeros(6), whole.xi, 100 * rng.normal(size=6)):
-        near = solvers.solve_near(programme, xi)
-        np.testing.assert_allclose(near.xi, whole.xi, rtol=0, atol=1e-9)
-        again = solvers.solve_near(programme, near.xi, near.active)
-        np.testing.assert_allclose(again.xi, whole.xi, rtol=0, atol=1e-9)
-
-
-def test_a_long_fit_says_how_far_its_rows_are(monkeypatch):
-    rng = np.random.default_rng(7)
-    monkeypatch.setattr(working_set, "_SILENCE", 0.0)
-    x = rng.normal(size=(200, 3))
-    said = []
-    fit([Transient(np.arange(200) * 0.01, x, rng.normal(size=(200, 1)))], additive="noise", progress=said.append)
-    assert any(text.startswith("row 3 of 3, about ") and text.endswith(" s left") for text in said)

@@ -24,7 +24,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import leibov2006, transient
-from uncertain_lti.reports.model_text import detectable_blocks, detectable_data, detectable_words
+from uncertain_lti.reports.model_text import detectable_blocks, detectable_data
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.validation import detectable as module
 from uncertain_lti.validation.detectable import FEWEST, detectable, typical_within
@@ -33,12 +33,6 @@ from uncertain_lti.validation.intervals import quantile_share_interval, share_in
 from uncertain_lti.validation.left_out import validate
 
 ONSET = 40
-
-
-@pytest.fixture(scope="module")
-def run():
-    """A run of the nominal engine, which its own nominal model describes to the bit."""
-    return simulated()
 
 
 def simulated(act=lambda u: u, row=None):
@@ -53,6 +47,12 @@ def simulated(act=lambda u: u, row=None):
     return Transient(
         0.025 * np.arange(120), x, u, state_names=model.state_names, control_names=model.control_names, max_gap=0.1
     )
+
+
+@pytest.fixture(scope="module")
+def run():
+    """A run of the nominal engine, which its own nominal model describes to the bit."""
+    return simulated()
 
 
 def inject(run, kind, signal, size, at, model=None):
@@ -130,34 +130,23 @@ def test_responses_are_exact_for_a_linear_plant(run, kind):
     assert np.array_equal(faulty.x[: ONSET + 1], run.x[: ONSET + 1]) and np.array_equal(faulty.u, run.u)
 
 
-def coil_error(volts, knots, kind, size, act):
+def coil_error(volts, knots, size, act):
     """Error of the approximation over ten steps after the onset, relative to what the true fault changes."""
     healthy = coil_runs(range(4), samples=201, volts=volts)
     model = fit(healthy, additive="noise", schedule={"I_L": knots} if knots > 1 else None)
     wrong, moved = [], []
     for before, truth in zip(healthy, coil_runs(range(4), samples=201, volts=volts, act=act), strict=True):
-        faulty = inject(before, kind, "V_IN", size, 100 * 500e-9, model)
+        faulty = inject(before, "offset", "V_IN", size, 100 * 500e-9, model)
         wrong.append(faulty.x[100:110] - truth.x[100:110])
         moved.append(truth.x[100:110] - before.x[100:110])
     return np.sqrt(np.mean(np.square(wrong), axis=(0, 1)) / np.mean(np.square(moved), axis=(0, 1)))
 
 
-@pytest.mark.parametrize(("kind", "size"), [("offset", 0.5), ("loss", 0.1), ("stuck", 20 * 500e-9)])
-def test_the_response_is_near_the_truth_where_the_model_is(kind, size):
-    """A circuit whose source is off, gives less or hangs, with small currents: the plant is linear, and noise-free."""
-    k = np.arange(201)[:, None]
-    act = {
-        "offset": lambda u: u + size * (k >= 100),
-        "loss": lambda u: u * (1 - size * (k >= 100)),
-        "stuck": lambda u: np.where((k >= 100) & (k < 120), u[99], u),
-    }[kind]
-    assert (coil_error(5.0, 1, kind, size, act) < 0.01).all()
-
-
 def test_the_response_is_as_far_off_as_the_model():
-    """The coil saturates: one linear model misses the response, and a schedule on the current takes half of that."""
+    """Small currents leave the plant linear; else one model misses the response, and a schedule takes half of that."""
     k = np.arange(201)[:, None]
-    errors = [coil_error(40.0, knots, "offset", 5.0, lambda u: u + 5.0 * (k >= 100)) for knots in (1, 5)]
+    assert (coil_error(5.0, 1, 0.5, lambda u: u + 0.5 * (k >= 100)) < 0.01).all()
+    errors = [coil_error(40.0, knots, 5.0, lambda u: u + 5.0 * (k >= 100)) for knots in (1, 5)]
     assert (errors[0] > 0.7).all() and (errors[1] < 0.7).all() and (errors[1] < 0.7 * errors[0]).all()
 
 
@@ -268,7 +257,6 @@ def test_sizes_have_the_order_that_they_must_have(validation, found):
 
 
 def test_what_cannot_be_known_is_refused_in_words(validation):
-    assert "no" not in detectable(validation.model, validation.parts, 1e-3, kinds=("bias",)).refused
     too_long = detectable(validation.model, validation.parts, 100.0)
     assert "lasts 100 s without a gap" in too_long.refused and not too_long.faults
     with pytest.raises(FitError, match="positive number of seconds"):
@@ -293,12 +281,12 @@ def test_the_interval_of_a_share_counts_clusters():
     assert quantile_share_interval(np.zeros(60), hits, 0.9)[1] == (0.0, 1.0)
     held = 0
     rng = np.random.default_rng(1)
-    for _ in range(300):
+    for _ in range(200):
         of_recording = rng.beta(9.0, 1.0, 12)
         cases = rng.random((12, 5)) < of_recording[:, None]
         _, (low, high) = quantile_share_interval(np.repeat(np.arange(12), 5), cases.ravel(), 0.9)
         held += low <= 0.9 <= high
-    assert held >= 0.87 * 300
+    assert held >= 0.87 * 200
 
 
 # --- where it is said ---
@@ -311,7 +299,8 @@ def test_validate_info_and_report_say_which_faults_are_seen(tmp_path, capsys):
     words = ["--signals", str(tmp_path / "signals.yaml"), "--additive", "noise", "--output", name]
     assert main(["fit", str(tmp_path / "run.mcap"), *words]) == 0
     page = tmp_path / "page.html"
-    assert main(["report", name, str(tmp_path / "run.mcap"), "--output", str(page), "-q"]) == 0
+    report = ["report", name, str(tmp_path / "run.mcap"), "--output", str(page), "-q"]
+    assert main(report) == 0
     text = page.read_text()
     assert "of others: run uncertain-lti validate MODEL --output MODEL" in text
     assert f"<li>{UncertainLTI.load(name).fit_summary['alarm']['promises'][1]}</li>" in text
@@ -324,15 +313,8 @@ def test_validate_info_and_report_say_which_faults_are_seen(tmp_path, capsys):
     assert fan["size"] > 0 and f"{fan['size']:.3g}" in said
     assert main(["info", name]) == 0
     assert f"fan: off by {fan['size']:.3g}" in capsys.readouterr().out
-    page.unlink()
-    assert main(["report", name, str(tmp_path / "run.mcap"), "--output", str(page), "-q"]) == 0
+    assert main(report) == 0
     assert "Which faults would it see?" in page.read_text() and f"off by {fan['size']:.3g}" in page.read_text()
     assert main(["validate", name, "--within", "0"]) == 2
     assert "positive number of seconds" in capsys.readouterr().err
-    assert detectable_words(detectable_data({"detectable": data}))[0].startswith("fan: off by")
-
-
-def test_a_section_that_another_program_wrote_is_no_section():
-    assert detectable_data({}) is None
-    assert detectable_data({"detectable": {"faults": [{"kind": "bias"}]}}) is None
-    assert detectable_data({"detectable": [1]}) is None
+    assert detectable_data({}) is None and detectable_data({"detectable": {"faults": [{"kind": "bias"}]}}) is None
