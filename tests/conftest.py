@@ -42,8 +42,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What another numpy can change: arithmetic, files, the kernel, and the node, as ROS on Ubuntu has numpy 1.26.
 _NUMPY = """
-    bag cdr_arrays interchange kernel live mcap_batches model monitor operating_point reading sampler
-    signals transient
+    cdr_arrays kernel live mcap_batches model monitor operating_point reading sampler signals transient
 """.split()
 
 
@@ -112,3 +111,20 @@ def recordings() -> Path:
 @pytest.fixture(scope="session")
 def signals_folder() -> Path:
     return ROOT / "config" / "signals"
+
+
+@pytest.fixture(scope="session")
+def engine_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """signals.yaml, run.mcap, its m.model.json, and bad.mcap, of which the fan jumps for three samples."""
+    import numpy as np
+    from engine_bag import SIGNALS, engine_bag
+
+    from uncertain_lti.cli.main import main
+
+    folder = tmp_path_factory.mktemp("engine")
+    (folder / "signals.yaml").write_text(SIGNALS)
+    engine_bag(folder / "run.mcap")
+    engine_bag(folder / "bad.mcap", change=lambda k, x: x + (5.0 if 100 <= k < 103 else 0.0) * np.eye(5)[0])
+    words = ["--signals", str(folder / "signals.yaml"), "--additive", "noise", "--alarm", "containment", "-q"]
+    assert main(["fit", str(folder / "run.mcap"), *words, "--output", str(folder / "m.model.json")]) == 0
+    return folder

@@ -20,7 +20,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writer import COMPRESSIONS, Message, Topic, metadata_yaml, ramp, write, write_folder
-from engine_bag import SIGNALS, engine_bag
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as Recorded
@@ -28,10 +27,9 @@ from mcap.stream_reader import StreamReader
 from mcap.writer import Writer
 from rosbags.highlevel import AnyReader
 
-from uncertain_lti import EnvelopeMonitor, read_transients
+from uncertain_lti import EnvelopeMonitor, UncertainLTI
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
-from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.outputs import NODE, RECORDED
@@ -166,16 +164,10 @@ def test_a_shipped_recording(tmp_path):
 # --- layouts of files -----------------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def engine(tmp_path_factory):
-    """A model of two states, a recording with a jump, and its folder."""
-    folder = tmp_path_factory.mktemp("engine")
-    (folder / "signals.yaml").write_text(SIGNALS)
-    engine_bag(folder / "run.mcap")
-    model = fit(read_transients(folder / "run.mcap", folder / "signals.yaml"), additive="noise")
-    model.save(folder / "m.model.json")
-    engine_bag(folder / "bad.mcap", change=lambda k, x: x + (5.0 if 100 <= k < 103 else 0.0) * np.eye(5)[0])
-    return folder, model
+@pytest.fixture
+def engine(engine_folder):
+    """A folder with a recording that has a jump, and its model of two states."""
+    return engine_folder, UncertainLTI.load(engine_folder / "m.model.json")
 
 
 def rewritten(source, target, *, extra=True, first=1, part=slice(None), **options):

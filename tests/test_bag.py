@@ -153,13 +153,6 @@ def test_parts_read_as_one_in_the_order_of_metadata_yaml(
     assert [part.name for part in bag.parts] == names
 
 
-def test_messages_keep_publish_time_type_and_schema(tmp_path: Path) -> None:
-    bag = read(write([Topic("/a")], [Message("/a", 5, float64(1.5), 3)]), tmp_path)
-    (raw,) = bag.raw_messages()
-    assert (raw.log_time_ns, raw.publish_time_ns, raw.type, raw.encoding) == (5, 3, "std_msgs/msg/Float64", "cdr")
-    assert raw.channel.schema is not None and raw.channel.schema.data == b"float64 data\n"
-
-
 def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
     payload = random.Random(0).randbytes(1000)
     text = Topic("/a", "std_msgs/msg/UInt8MultiArray")
@@ -179,16 +172,6 @@ def test_a_bag_is_read_lazily(tmp_path: Path) -> None:
         tracemalloc.stop()
     assert times == sorted(late_by_one)
     assert size > 4_000_000 and peak < 3_000_000
-
-
-def test_attachments_metadata_and_private_records_are_passed_over(tmp_path: Path) -> None:
-    file = write(TWO, ramp("/a", range(10)))
-    first = places(file.data)[1].begin
-    attachment = struct.pack("<QQII", 1, 2, 0, 0) + struct.pack("<Q", 5_000_000) + bytes(5_000_000) + bytes(4)
-    extra = struct.pack("<BQ", Opcode.ATTACHMENT, len(attachment)) + attachment + struct.pack("<BQ", 0x90, 3) + b"abc"
-    path = tmp_path / "x.mcap"
-    path.write_bytes(file.data[:first] + extra + file.data[first:])
-    assert read_all(Bag(path)) == in_order(file.messages)
 
 
 # --- cut files ----------------------------------------------------------------------------------------------
@@ -641,11 +624,9 @@ def test_the_advice_for_a_file_compressed_as_a_whole(name: str, tmp_path: Path) 
     assert subprocess.run(command, cwd=tmp_path, capture_output=True, check=False).returncode == 0
     assert read_all(Bag(tmp_path / command[-1])) == in_order(file.messages)
     if name != "x.mcap":
-        with pytest.raises(BagError, match="zstd -d"):
-            Bag(tmp_path / "in")
-        (tmp_path / "in" / "metadata.yaml").write_text(metadata_yaml([name]))
-        with pytest.raises(BagError, match="zstd -d"):
-            Bag(tmp_path / "in")
+        assert "zstd -d" in error_of(path.parent)
+        (path.parent / "metadata.yaml").write_text(metadata_yaml([name]))
+        assert "zstd -d" in error_of(path.parent)
 
 
 # --- folders and groups -------------------------------------------------------------------------------------

@@ -111,40 +111,6 @@ def lagging(messages: list[Message], lag: float) -> list[Message]:
     return sorted(shifted, key=lambda m: m[0])
 
 
-def paused(messages: list[Message]) -> list[Message]:
-    """Who publishes waits for 0.3 s, with stamps that wait, too: nothing is held up."""
-    return [m for m in messages if not 5.01 <= m[0] < 5.31]
-
-
-LAGGING: dict[str, tuple[float, Callable[[list[Message]], list[Message]]]] = {
-    "on time": (2.4, lambda m: m),
-    "a pause": (2.4, paused),
-    "into the stream": (4.01, lambda m: [message for message in m if message[0] > 1.234]),
-    "controls come 0.6 s later": (2.4, lambda m: held_up(m, CONTROL_TOPIC, 0.0, 0.6)),
-    "less than a step, stopped, then topic by topic": (0.4, lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC)),
-    "stopped, then in chunks": (4.01, lambda m: stopped(m, 5.01, 16, STATE_TOPIC)),
-    "stopped, then in chunks, controls first": (2.4, lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC)),
-}
-
-
-@pytest.mark.parametrize("name", LAGGING)
-def test_stamps_that_always_lag_give_what_they_give_where_nothing_waits(
-    engine: tuple[UncertainLTI, Bag], name: str
-) -> None:
-    """A copied stamp, or the clock of another machine: no sample gets a control that would not have come before it."""
-    (model, bag), (steps, delay) = engine, LAGGING[name]
-    came = lagging(sent(bag), steps * STEP)
-    whole = delay(came) if name in ("a pause", "into the stream") else came
-    expected = run(session_of(model, Rule(), catch_up=0.0), whole)
-    session = session_of(model, Rule())
-    live = run(session, delay(came))
-    assert len(live) == len(expected) > 400
-    for verdict, other in zip(live, expected, strict=True):
-        assert verdict.t_ns == other.t_ns and verdict.alarm == other.alarm
-        assert verdict.numbers("lower") == other.numbers("lower")
-    assert name != "on time" or session.lags == {CONTROL_TOPIC: pytest.approx(steps * STEP, abs=0.1 * STEP)}
-
-
 def test_without_it_the_verdicts_are_lost(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
     session = session_of(model, Rule(), catch_up=0.0)

@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import zstandard
 from bag_writer import (
     COMPRESSIONS,
     Layout,
@@ -35,6 +34,7 @@ from bag_writer import (
     write_folder,
 )
 from by_message import read_stream_by_message
+from fuzz import damaged
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -205,26 +205,6 @@ class Maker:
         return struct.unpack(code, self.dice.randbytes(struct.calcsize(code)))[0]
 
 
-def damaged(data: bytes, dice: random.Random) -> bytes:
-    """A message as a bad disk or recorder leaves it; often one that can be decoded."""
-    kind = dice.randrange(8)
-    at = dice.randrange(len(data))
-    if kind == 0:
-        return data[:at]
-    if kind == 1:
-        return data + dice.randbytes(dice.randrange(1, 6))
-    if kind == 2:
-        return zstandard.compress(data)
-    if kind == 3:
-        return bytes([data[0], data[1] ^ 1]) + data[2:]
-    if kind == 4:
-        return data[:2] + dice.randbytes(2) + data[4:]
-    changed = bytearray(data)
-    for _ in range(dice.choice([1, 1, 3])):
-        changed[dice.randrange(len(data))] = dice.choice([0, 1, 0x41, 0x80, 0xFF])
-    return bytes(changed)
-
-
 def paths(top: Type, definition: Definition, dice: random.Random) -> list[str]:
     """Some paths of a type that signals may have."""
     found: list[str] = []
@@ -317,7 +297,7 @@ def test_the_same_as_message_by_message(
         which = dice.randrange(len(tops))
         data = makers[which].one(dice.random() < 0.5 if little is None else little)
         if dice.random() < odd:
-            data = damaged(data, dice)
+            data = damaged(dice, data)
         written.append(Message(f"/t{which}", k * stretch + dice.randrange(10), data))
     edges = sorted({0, len(written), *(dice.randrange(len(written) + 1) for _ in range(parts - 1))})
     names = [f"p_{i}.mcap" for i in range(len(edges) - 1)]

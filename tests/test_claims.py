@@ -9,7 +9,6 @@
 
 """docs/claims.md names commands that exist: files, tests and options. What they show is theirs to test."""
 
-import ast
 import itertools
 import re
 import shlex
@@ -20,25 +19,15 @@ import pytest
 from uncertain_lti.cli.main import build_parser
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGE = ROOT / "docs" / "claims.md"
 
 
 def rows() -> list[list[str]]:
     """Cells of every row of the tables."""
-    lines = [
-        line for line in PAGE.read_text().splitlines() if line.startswith("| ") and not line.startswith("| claim ")
-    ]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+    lines = (ROOT / "docs" / "claims.md").read_text().splitlines()
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if re.match(r"\| (?!claim )", line)]
 
 
 COMMANDS = sorted({cell for row in rows() for cell in re.findall(r"`([^`]+)`", row[1])})
-
-
-def known_words(path: Path) -> set[str]:
-    """Texts in a script, and its functions, after which some name their parts."""
-    nodes = list(ast.walk(ast.parse(path.read_text())))
-    texts = {node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)}
-    return texts | {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
 
 
 def wanting(command: str) -> list[str]:
@@ -51,19 +40,18 @@ def wanting(command: str) -> list[str]:
             return [f"arguments of {command}"]
         return []
     if program == "pytest":
-        missing = []
-        for word in words[: words.index("-k") if "-k" in words else None]:
-            file, _, test = word.partition("::")
-            if not (ROOT / file).is_file():
-                missing.append(file)
-            elif test and f"def {test}(" not in (ROOT / file).read_text():
-                missing.append(word)
-        return missing
-    if program != "python" or not (ROOT / words[0]).is_file():
-        return [f"{program} {words[0]}"]
-    known = known_words(ROOT / words[0])
-    values = {after for word, after in itertools.pairwise(words) if word.startswith("--")}
-    return [word for word in words[1:] if word not in known | values]
+        named = [word.partition("::") for word in words[: words.index("-k") if "-k" in words else None]]
+        return [file for file, _, test in named if not there(file, rf"def {test}\(" if test else "")]
+    script, *given = words
+    if program != "python" or not there(script, ""):
+        return [script]
+    values = {after for word, after in itertools.pairwise(given) if word.startswith("--")}
+    return [word for word in given if word not in values and not there(script, rf"\"{word}\"|def {word}\(")]
+
+
+def there(file: str, pattern: str) -> bool:
+    """Whether there is a file, and this in it: a test, or what a script takes."""
+    return (ROOT / file).is_file() and re.search(pattern, (ROOT / file).read_text()) is not None
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -88,15 +76,6 @@ def test_every_claim_has_a_command_and_every_benchmark_a_claim():
     for row in rows():
         assert "`" in row[1] or row[1] == "the same" or set(row[0]) == {"-"}, row
     named = " ".join(COMMANDS)
-    shared = {
-        "coil.py",
-        "measure.py",
-        "peers.py",
-        "regime_peers.py",
-        "recorded.py",
-        "detectors.py",
-        "shared_recordings.py",
-    }  # parts of the others
-    assert all(
-        f"benchmarks/{path.name}" in named for path in (ROOT / "benchmarks").glob("*.py") if path.name not in shared
-    )
+    parts_of_others = {"coil", "measure", "recorded", "detectors", "shared_recordings"}
+    own = {path.stem for path in (ROOT / "benchmarks").glob("*.py")} - parts_of_others
+    assert all(f"benchmarks/{stem}.py" in named for stem in own)

@@ -12,99 +12,78 @@
 import json
 
 import numpy as np
+import perturbed
 import pytest
-from bag_writer import JAZZY, Message, Topic, cdr, header, write
+from bag_writer import Message, Topic, float64, write
 from engine_bag import joint_state
+from perturbed import GEAR as MODE
 
 from uncertain_lti import EnvelopeMonitor, read_transients
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor.alarm import Arming, Condition
-from uncertain_lti.monitor.session import Rule, Session, topic_types
-from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
-from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.message_reader import MessageReader
+from uncertain_lti.monitor.session import Rule
+from uncertain_lti.plants.leibov import CONTROL_TOPIC as CONTROL
+from uncertain_lti.plants.leibov import STATE_TOPIC as STATE
+from uncertain_lti.plants.leibov import transient
 from uncertain_lti.sampling.clock import Status
 
-SIGNALS = """
+SIGNALS = f"""
 states:
-  - {name: fan, topic: /engine/state, field: "position[fan_speed]"}
-  - {name: core, topic: /engine/state, field: "position[compressor_speed]"}
-  - {name: hot, topic: /engine/hot, field: temperature}
+  - {{name: fan, topic: {STATE}, field: "position[fan_speed]"}}
+  - {{name: core, topic: {STATE}, field: "position[compressor_speed]"}}
+  - {{name: hot, topic: /engine/hot, field: "position[temperature]"}}
 controls:
-  - {name: fuel, topic: /engine/control, field: "position[main_fuel_flow]"}
-  - {name: area, topic: /engine/control, field: "position[nozzle_throat_area]"}
+  - {{name: fuel, topic: {CONTROL}, field: "position[main_fuel_flow]"}}
+  - {{name: area, topic: {CONTROL}, field: "position[nozzle_throat_area]"}}
 """
-FAN, HOT = "fan_speed", "turbine_exit_total_temperature"
+JOINT_STATE = "sensor_msgs/msg/JointState"
+TOPICS = [Topic(MODE, "std_msgs/msg/Float64"), *(Topic(name, JOINT_STATE) for name in ("/engine/hot", STATE, CONTROL))]
 
 
-def record(path, modes, seed=1, steps=300, fault_at=None):
-    """A run of the published engine, with modes {sample: value} that come just before that sample's state."""
-    plant = transient(steps, seed, start_ns=10**18, fault_at=fault_at)
-    messages = []
+def messages_of(plant, modes=(), names=None):
+    """A run of the engine, with modes {sample: values} that come just before that sample's state."""
+    messages, hot = [], plant.state_names.index("turbine_exit_total_temperature")
     for k, t in enumerate(plant.t_ns.tolist()):
-        for value in modes.get(k, ()):
-            messages.append(Message("/mode", t - 1, cdr("std_msgs/msg/UInt8", data=value), t - 1))
-        x = dict(zip(plant.state_names, plant.x[k], strict=True))
-        hot = cdr("sensor_msgs/msg/Temperature", header=header(t), temperature=x[HOT], variance=0.0)
-        messages.append(Message("/engine/hot", t, hot, t))
-        messages.append(Message(STATE_TOPIC, t, joint_state(plant.state_names, plant.x[k], t), t))
-        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
-    kinds = {STATE_TOPIC: "sensor_msgs/msg/JointState", CONTROL_TOPIC: "sensor_msgs/msg/JointState"}
-    kinds |= {"/engine/hot": "sensor_msgs/msg/Temperature", "/mode": "std_msgs/msg/UInt8"}
-    return write([Topic(name, kind) for name, kind in kinds.items()], messages).save(path)
+        messages += [Message(MODE, t - 1, float64(value), t - 1) for value in dict(modes).get(k, ())]
+        messages.append(Message("/engine/hot", t, joint_state(["temperature"], plant.x[k, [hot]], t), t))
+        state = joint_state(plant.state_names, plant.x[k], t) if names is None else names(k, t)
+        messages += [Message(STATE, t, state, t)]
+        messages.append(Message(CONTROL, t, joint_state(plant.control_names, plant.u[k], t), t))
+    return messages
 
 
 @pytest.fixture(scope="module")
 def machine(tmp_path_factory):
-    """A model, its file, and a recording with a fault and changing modes; states on two topics."""
+    """A model, its folder, and the messages of a recording with a fault and changing modes; states on two topics."""
     folder = tmp_path_factory.mktemp("deployed")
     (folder / "signals.yaml").write_text(SIGNALS)
-    record(folder / "healthy.mcap", {0: [3]})
+    write(TOPICS, messages_of(transient(300, 1, start_ns=10**18))).save(folder / "healthy.mcap")
     modes = {20: [3], 100: [1], 130: [3], 190: [1, 3], 220: [1], 221: [3]}
-    record(folder / "run.mcap", modes, seed=2, fault_at=60)
+    messages = messages_of(transient(300, 2, start_ns=10**18, fault_at=60), modes)
+    write(TOPICS, messages).save(folder / "run.mcap")
     model = fit(read_transients(folder / "healthy.mcap", folder / "signals.yaml"), alarm_rule=AlarmRule(2, 5))
     model.save(folder / "m.model.json")
-    return model, folder
+    return model, folder, messages
 
 
-def live(model, bag, rule):
-    """Instants at which the session has an alarm, and all instants that it judged."""
-    fields = {t: bag.type_fields(t) for t in bag.topics}
-    of_type = {info.type: fields[t] for t, info in bag.topics.items()}
-
-    def type_fields(name):
-        return next(f for f in [of_type.get(name), *of_type.values()] if f is not None)(name)
-
-    def reader(name, paths):
-        return MessageReader(name, paths, type_fields, lambda data: JAZZY.deserialize_cdr(data, name))
-
-    session = Session(model, rule, topic_types(model, "the model", type_fields), type_fields, reader, 0.0)
-    if rule.enable and not session.enable_type:
-        session.found_enable_type(bag.topics[session.enable_topic].type)
-    found = []
-    for message in bag.raw_messages():
-        verdicts, _ = session.take(message.channel.topic, message.log_time_ns, message.data, 0.0)
-        found += [(v.t_ns, v.alarm or session.latched) for v in verdicts if not v.status.dropped]
-    return found
+def live(model, messages, rule):
+    """Instants that the session judges, and whether it has an alarm."""
+    return [(row["t_ns"], row["alarm"]) for row in perturbed.live(perturbed.session_of(model, rule), messages)]
 
 
 @pytest.mark.parametrize(
     "options",
     [
-        {},
         {"masked": "fan, hot"},
-        {"enable": "/mode data == 3"},
-        {"enable": "/mode data == 3", "grace": 0.4},
-        {"grace": 2.0},
-        {"latch": True},
-        {"enable": "/engine/state position[fan_speed] > 0.01", "latch": True},
+        {"enable": f"{MODE} data == 3", "grace": 0.4},
+        {"enable": f"{STATE} position[fan_speed] > 0.01", "latch": True},
     ],
 )
 def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, options, capsys):
-    model, folder = machine
-    expected = live(model, Bag(folder / "run.mcap"), Rule(**options))
+    model, folder, messages = machine
+    expected = live(model, messages, Rule(**options))
     words = [w for k, v in options.items() for w in ([f"--{k}"] if v is True else [f"--{k}", str(v)])]
     status = main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), "--json", *words])
     data = json.loads(capsys.readouterr().out)
@@ -120,7 +99,7 @@ def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, optio
 
 @pytest.mark.parametrize("whole_model", [True, False])
 def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whole_model, tmp_path, capsys):
-    model, folder = machine
+    model, folder, _ = machine
     other = model.replace(alarm=[AlarmRule(3, 4, 1.5), StatisticRule("energy", 0.5, 0.3)])
     other.save(tmp_path / "other.model.json")
     if whole_model:
@@ -144,7 +123,7 @@ def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whol
 
 
 def test_from_and_to_judge_that_time_alone(machine, capsys):
-    model, folder = machine
+    model, folder, _ = machine
     name = [str(folder / "m.model.json"), str(folder / "run.mcap")]
     (run,) = read_transients(folder / "run.mcap", model.signals)
     whole = EnvelopeMonitor(model).check(run)
@@ -173,7 +152,7 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
         (["--masked", "nobody"], "masked state 'nobody' is not in the model"),
         (["--enable", "mode is 3"], "write TOPIC FIELD OPERATOR NUMBER"),
         (["--enable", "/nowhere data == 3"], "there is no topic /nowhere"),
-        (["--enable", "/engine/state position[fan_sped] > 1"], "there is no 'fan_sped' in the message's names"),
+        (["--enable", f"{STATE} position[fan_sped] > 1"], "there is no 'fan_sped' in the message's names"),
         (["--grace", "nan"], "grace is nan"),
         (["--from", "5", "--to", "4"], "leaves nothing to judge"),
         (["--from", "1e6"], "no sample lies between"),
@@ -184,7 +163,7 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
     ],
 )
 def test_what_cannot_be_deployed_is_refused(machine, options, words, capsys, tmp_path, monkeypatch):
-    _, folder = machine
+    _, folder, _ = machine
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty.json").write_text("[]")
     (tmp_path / "odd.json").write_text('{"rules": [{"kind": "median", "window_s": 1.0, "threshold": 1.0}]}')
@@ -209,28 +188,21 @@ def test_a_looped_recording_starts_the_grace_over():
 
 def test_of_a_name_that_is_there_twice_the_first_counts_live_and_offline(machine, tmp_path, capsys):
     """With names that move from one message to the next, and a condition on another topic."""
-    model, folder = machine
-    rng = np.random.default_rng(1)
-    plant = transient(200, 2, start_ns=10**18)
-    n, messages = len(plant.state_names), []
-    for k, t in enumerate(plant.t_ns.tolist()):
+    model, folder, _ = machine
+    rng, plant, first = np.random.default_rng(1), transient(200, 2, start_ns=10**18), []
+    n = len(plant.state_names)
+
+    def moving(k, t):
         order = rng.permutation([*range(n), *rng.integers(0, n, 2)])
-        names = [plant.state_names[i] for i in order]
         x = plant.x[k][order] + 1e-4 * np.arange(n + 2)  # of places, not of names
-        hot = cdr("sensor_msgs/msg/Temperature", header=header(t), temperature=plant.x[k][-1], variance=0.0)
-        messages.append(Message("/engine/hot", t, hot, t))
-        messages.append(Message(STATE_TOPIC, t, joint_state(names, x, t), t))
-        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
-    kinds = dict.fromkeys((STATE_TOPIC, CONTROL_TOPIC), "sensor_msgs/msg/JointState")
-    kinds["/engine/hot"] = "sensor_msgs/msg/Temperature"
-    path = write([Topic(name, kind) for name, kind in kinds.items()], messages).save(tmp_path / "twice.mcap")
-    condition = f"{CONTROL_TOPIC} position[0] > -99"
+        first.append(x[order.tolist().index(plant.state_names.index("fan_speed"))])
+        return joint_state([plant.state_names[i] for i in order], x, t)
+
+    messages = messages_of(plant, {0: [3]}, moving)
+    path = write(TOPICS, messages).save(tmp_path / "twice.mcap")
+    condition = f"{MODE} data > 1"
     assert main(["check", str(folder / "m.model.json"), str(path), "--json", "--enable", condition]) in (0, 1, 3)
     found = json.loads(capsys.readouterr().out)["recordings"][0]["verdict_per_sample"]
-    assert [(v["t_ns"], v["alarm"]) for v in found] == live(model, Bag(path), Rule(enable=condition))
+    assert [(v["t_ns"], v["alarm"]) for v in found] == live(model, messages, Rule(enable=condition))
     read = read_transients([path], folder / "signals.yaml")[0]
-    first = []
-    for message in Bag(path).raw_messages([STATE_TOPIC]):
-        value = JAZZY.deserialize_cdr(message.data, kinds[STATE_TOPIC])
-        first.append(dict(zip(reversed(value.name), reversed(value.position), strict=True))[FAN])
     assert read.x[:, 0].tolist() == first[: len(read)]

@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,8 +26,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from rclpy.serialization import deserialize_message
-from ros_processes import World, open_world
-from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, Plant, by_hand, joint_state, saved, vector
+from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, joint_state, vector
 
 from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
@@ -320,30 +318,3 @@ def test_problems_and_the_enable_condition_are_told_when_they_change() -> None:
     rig.problems = ["/x: a publisher cannot be heard"]
     rig.send(5)
     assert rig.lines == rig.problems
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with open_world(tmp_path) as world:
-        yield world
-
-
-def test_the_log_of_the_node_tells_the_story(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm_rule=AlarmRule(2, 5))
-    process = world.monitor(saved(model, tmp_path))
-    process.says(f"active: listening to {STATE}, {CONTROL}")
-    process.says(f"no verdict yet: nothing received on {STATE}, {CONTROL}")
-    plant = Plant(world, model).subscribed()
-    plant.send(50)
-    process.says("judging a, b; alarm when at least 2 of 5 verdicts violated")
-    plant.send(3, off=2.0)
-    process.says("above its bounds")
-    plant.send(10)
-    process.says("the alarm is over after")
-    process.says(f"no message on {STATE}")
-    plant.send(50)
-    process.says("judging again, after ")
-    assert world.change("deactivate")
-    process.says("no longer active")
-    warnings = [line for line in process.output.splitlines() if line.startswith("[WARN]")]
-    assert len(warnings) == 1 and "]: alarm, at least 2 of 5 verdicts violated: a = " in warnings[0]

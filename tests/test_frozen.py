@@ -27,7 +27,6 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.repeats import Repeats, repeats_in, together
-from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.monitor.frozen import needs, repeat_words
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
@@ -317,12 +316,6 @@ def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     assert "warning: position repeats exactly for 6.99 s (at most 0.99 s in the fit) from 2.0000 s" in check_text(data)
 
 
-def test_a_state_that_stops_in_a_moving_machine_is_no_parked_one(model: UncertainLTI) -> None:
-    """Held where the model's own equation comes to rest, it is told by what the model leaves unexplained."""
-    frozen = held(run(21), 1, 300, 500)
-    assert EnvelopeMonitor(model).check(frozen).frozen[300:400, 1].any()
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_offline_and_live_give_the_same(model: UncertainLTI, seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -337,22 +330,6 @@ def test_offline_and_live_give_the_same(model: UncertainLTI, seed: int) -> None:
     t[int(rng.integers(100, 700)) :] += 50 * MS  # a gap
     t[int(rng.integers(100, 700)) :] += 22 * MS  # a step that the model was not fitted to
     same_as_live(model, changed(transient, t=t, x=x, u=u), margin=[1.0, 2.5][seed % 2])
-
-
-def test_offline_and_live_give_the_same_with_a_schedule() -> None:
-    rng = np.random.default_rng(3)
-    schedule = Schedule((Axis("x1", knots=(-9.0, 0.0, 9.0)),))
-    A = np.stack([-np.diag([1.0, 2.0]), -np.diag([3.0, 1.0]), -np.diag([2.0, 4.0])]) + rng.normal(size=(3, 2, 2))
-    model = UncertainLTI(
-        A, rng.normal(size=(3, 2, 1)), np.zeros((3, 2, 2)), np.zeros((3, 2, 1)), v=np.full((3, 2), 0.02),
-        schedule=schedule, repeats=Repeats([0.05, 0.0]),
-    )  # fmt: skip
-    x = np.cumsum(rng.normal(size=(400, 2)) * 0.05, axis=0)
-    for begin in (50, 150, 300):
-        x[begin : begin + 40, begin % 4 // 2] = x[begin, begin % 4 // 2]
-    transient = Transient(DT * np.arange(400), x, np.sin(0.1 * np.arange(400))[:, None])
-    assert EnvelopeMonitor(model).check(transient).frozen.any()
-    same_as_live(model, transient)
 
 
 def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:

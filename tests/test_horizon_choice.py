@@ -95,36 +95,17 @@ def test_what_holds_on_left_out_data_stays_with_a_table_that_says_why() -> None:
     assert any(message.startswith("horizons of ") for message in model.fit_summary["messages"])
 
 
-def test_left_out_parts_have_the_utilisations_of_the_model_fitted_without_them() -> None:
-    model = fit(RUNS, additive="noise", horizons={"steps": [4, 9]}, widths="constant")
-    assert "horizon_choice" not in model.fit_summary and [h.widths for h in model.horizons] == ["constant"] * 2
-    left = validate(RUNS, full=model, additive="noise")
-    for part, run in zip(left.parts, RUNS, strict=True):
-        assert part.longer.shape == (part.judged, 2, 2)
-        assert (~np.isnan(part.longer[:, 0, 0])).sum() == len(run) - 4
-        assert (part.longer_width > 0).all()
-
-
 def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without() -> None:
     model = fit(RUNS, additive="noise", horizons={"steps": [4, 9]}, widths="constant")
     assert model.sampling.dt_median is not None
     rules = tuple(rules_for(model, 100, model.sampling.dt_median))
     assert {rule.horizon for rule in rules} == {1, 9} and len(rules) == 8
+    assert "horizon_choice" not in model.fit_summary and [h.widths for h in model.horizons] == ["constant"] * 2
     for part, run in zip(validate(RUNS, full=model, additive="noise").parts, RUNS, strict=True):
         verdicts = EnvelopeMonitor(part.model.replace(alarm=rules)).check(run)
         expected = np.abs(verdicts.statistics[verdicts.judged])
         values = [s if r.kind == "mean" else s**2 for r, s in zip(rules, sizes_of(rules, part), strict=True)]
         np.testing.assert_allclose(np.concatenate(values, axis=1), np.nan_to_num(expected), rtol=1e-12)
-
-
-def test_a_choice_says_which_horizons_are_useless(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("uncertain_lti.identification.horizon_fit.WIDER", 0.0)
-    model = fit(RUNS[:2], additive="noise", horizons={"longest": 0.1}, widths="constant")
-    assert model.steps == ()
-    (said,) = [text for text in model.fit_summary["messages"] if "worth having" in text]
-    assert (
-        said.startswith("no horizons: none has an envelope") and said.count("steps: its envelope is wider than if") == 2
-    )
 
 
 def test_horizons_that_lose_are_refused() -> None:

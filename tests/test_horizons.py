@@ -126,14 +126,6 @@ def test_what_cannot_be_run_is_refused_by_name(run: Any, words: str) -> None:
         UncertainLTI.from_dict(data)
 
 
-def test_format_1_has_no_horizons() -> None:
-    data = json.loads(json.dumps(with_horizons(np.random.default_rng(3), (2,)).to_dict())) | {
-        "format": "uncertain-lti/1"
-    }
-    with pytest.raises(ModelError, match="unknown field 'horizons'"):
-        UncertainLTI.from_dict(data)
-
-
 # --- the same bits live and offline -------------------------------------------------------------------------------
 
 TICK = 10_000_000  # ns

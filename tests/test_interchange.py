@@ -195,6 +195,7 @@ def run(n=2, steps=200, seed=0):
     return Transient(np.arange(steps) * 0.1, x, u, state_names=[f"<x{i}>" for i in range(n)], name="a & b")
 
 
+@pytest.mark.numpy
 def test_results_print_on_one_line_and_as_a_table():
     runs = [run(seed=s) for s in (0, 1)]
     model = fit(runs, additive="noise")
