@@ -266,13 +266,16 @@ def test_in_a_burst_controls_that_were_late_themselves_stay_late() -> None:
     assert [k for _, k, _ in catch_up.finish(1.0)] == order and catch_up.reordered == 0
 
 
-def test_a_lag_of_more_than_a_step_is_said_when_a_recording_is_read(
+def test_a_lag_of_more_than_a_step_is_said_live_and_when_a_recording_is_read(
     engine: tuple[UncertainLTI, Bag], tmp_path: Any
 ) -> None:
     model, bag = engine
     kinds = {topic: bag.topics[topic].type for topic in (STATE_TOPIC, CONTROL_TOPIC)}
     for steps, said in ((0.9, 0), (2.4, 1)):
-        came = [Message_(topic, log, data) for _, topic, log, data, _ in lagging(sent(bag), steps * STEP)]
+        live, session = lagging(sent(bag), steps * STEP), session_of(model, Rule())
+        run(session, live)
+        assert session.lags == ({CONTROL_TOPIC: pytest.approx(steps * STEP, abs=0.1 * STEP)} if said else {})
+        came = [Message_(topic, log, data) for _, topic, log, data, _ in live]
         path = write([Topic(name, kind) for name, kind in kinds.items()], came).save(tmp_path / f"{said}.mcap")
         notes = read_as_fitted(Bag(path), model.signals).notes
         assert len([note for note in notes if f"stamps on {CONTROL_TOPIC} lag" in note and "2.4 steps" in note]) == said

@@ -83,7 +83,7 @@ def said(found):
     return {key for key, words in WORDS.items() if any(words in message for message in found)}
 
 
-@pytest.mark.parametrize(("seed", "noise"), enumerate([0.0, 1e-4, 1e-3, 1e-2]))
+@pytest.mark.parametrize(("seed", "noise"), [*enumerate([0.0, 1e-4, 1e-3, 1e-2])])
 def test_healthy_recordings_cause_no_alarm(seed, noise):
     assert said(messages(run(seed, noise=noise))) == set()
 

@@ -179,6 +179,11 @@ def test_a_million_have_the_bits_of_one() -> None:
             assert one.tobytes() == all_of_them[:k].tobytes()
 
 
+def test_on_the_edge_of_a_horizon_the_comparison_decides_and_a_run_beyond_all_numbers_is_outside() -> None:
+    quotient, inside = np.array([1.0, -1.5, np.nan, np.nan]), np.array([False, True, False, True])
+    np.testing.assert_array_equal(arithmetic.settled(quotient, inside), [np.nextafter(1.0, 2.0), -1.0, np.inf, np.nan])
+
+
 def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
     one, two = np.ones((2, 4)), np.ones(2)
     point = np.zeros(3), np.ones(3), np.zeros(3), np.ones(3)
