@@ -36,8 +36,8 @@ def joint_state(names, values, stamp_ns):
     )
 
 
-def engine_bag(path, steps=300, seed=1, change=lambda k, x: x, **run):
-    """A run of the published engine as a bag, state before control at every instant."""
+def engine_bag(path, steps=300, seed=1, change=lambda k, x: x, more=(), **run):
+    """A run of the published engine as a bag, state before control at every instant, and topics with no message."""
     plant = transient(steps, seed, start_ns=10**18, **run)
     messages = []
     for k, t in enumerate(plant.t_ns.tolist()):
@@ -45,4 +45,4 @@ def engine_bag(path, steps=300, seed=1, change=lambda k, x: x, **run):
         messages.append(Message(STATE_TOPIC, t, joint_state(plant.state_names, x, t), t))
         messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
     topics = [Topic(STATE_TOPIC, "sensor_msgs/msg/JointState"), Topic(CONTROL_TOPIC, "sensor_msgs/msg/JointState")]
-    return write(topics, messages).save(path)
+    return write([*topics, *more], messages).save(path)

@@ -128,6 +128,36 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
     assert not Path(out).exists()
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["fit", "absent.mcap", "--signals", "absent.yaml", "--output", "/sys/x.model.json"],
+        ["init", "absent.mcap", "--output", "/sys/x.yaml"],
+        ["start", "absent.mcap", "--output", "/sys/x"],
+        ["check", "leibov2006", "run.mcap", "--write", "/sys/x.mcap"],
+        ["report", "leibov2006", "run.mcap", "--output", "/sys/x.html"],
+    ],
+    ids=lambda arguments: arguments[0],
+)
+def test_a_place_that_cannot_be_written_is_refused_before_the_work(folder, arguments, monkeypatch, capsys):
+    """Root may not make a file in /sys either; what is read first is not there, or would print."""
+    monkeypatch.chdir(folder)
+    assert "/sys/x" in (said := refused(capsys, arguments)) and "cannot be written" in said
+
+
+def test_a_condition_that_cannot_hold_is_no_quiet(folder, tmp_path, capsys):
+    """An alarm that is never armed says nothing of the machine."""
+    model, run = str(folder / "m.model.json"), folder / "run.mcap"
+    for words in (["--enable", f"{STATE_TOPIC} position[fan_speed] > 1e9"], ["--grace", "1000"]):
+        assert main(["check", model, str(run), *words]) == 3
+        assert "UNKNOWN: the alarm was armed at no verdict" in capsys.readouterr().out
+    assert main(["check", model, str(run), "--enable", f"{STATE_TOPIC} position[fan_speed] < 1e9"]) == 0
+    silent = engine_bag(tmp_path / "silent.mcap", more=[Topic("/engine/mode")])
+    assert "/engine/mode has no message" in refused(
+        capsys, ["check", model, str(silent), "--enable", "/engine/mode data == 3"]
+    )
+
+
 def test_nothing_but_an_older_file_of_its_kind_is_written_over(folder, capsys):
     """Not a recording, not a signals file, not a note: whatever the option was meant to be."""
     run, signals, model = folder / "run.mcap", folder / "signals.yaml", folder / "m.model.json"

@@ -120,7 +120,18 @@ def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: 
         raise BagError(f"{path}: is a folder; name a file in it, for example {path / example}")
     if not may_replace(path, holds=holds):
         raise BagError(f"{path}: is there already and is no {kind}; choose another name, or move it away")
+    try_to_write(path)
     return path
+
+
+def try_to_write(path: Path) -> None:
+    """Refuse before the work what `written` would refuse after it: a folder in which nothing can be made."""
+    if path.exists() and not path.is_file():
+        return
+    try:
+        tempfile.TemporaryFile(dir=os.path.dirname(os.path.realpath(path))).close()
+    except OSError as error:
+        raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:

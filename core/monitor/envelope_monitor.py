@@ -493,7 +493,7 @@ class EnvelopeMonitor:
         return Verdicts(
             transient, numbers, seen[UTILISATION], judged, left, outside, alarm, unfitted_step, unlisted_mode,
             unknown_regime, frozen, withheld, repeating, statistics, each, self.alarms, longer.transpose(1, 0, 2),
-            longer_residual.transpose(1, 0, 2), why, asked,
+            longer_residual.transpose(1, 0, 2), why, asked, None if armed is None else armed.counts,
         )  # fmt: skip
 
     def _look_all(

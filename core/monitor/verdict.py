@@ -355,6 +355,8 @@ class Verdicts:
         Of each sample and number of a state that is frozen there, in words why it is.
     asked : array (N+1,) of bool, optional
         Whether a verdict was asked for; default all.
+    armed : array (N+1,) of bool, optional
+        Whether the alarm could be raised; default always.
     """
 
     transient: Transient
@@ -377,6 +379,7 @@ class Verdicts:
     longer_residual: Array
     why_frozen: dict[tuple[int, int], str] = field(default_factory=dict)
     asked: NDArray[np.bool_] | None = None
+    armed: NDArray[np.bool_] | None = None
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())

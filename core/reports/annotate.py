@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.files import sha256, whole_file
+from uncertain_lti.base.files import sha256, try_to_write, whole_file
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, VerdictRecords, names_of, text_message
@@ -82,6 +82,7 @@ def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[P
             raise BagError(f"{path}: {several}; name a folder for them, or check them one by one")
         if not path.parent.is_dir():
             raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
+        try_to_write(path)
         chosen = [path]
     elif path.exists() and not path.is_dir():
         raise BagError(f"{path}: is neither a folder nor called *.mcap; choose another name")

@@ -306,6 +306,11 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     if judged < JUDGED * steps:
         why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
         return f"only {judged} of {steps} steps could be judged{why}"
+    if verdicts.armed is not None and not (verdicts.armed & verdicts.judged).any():
+        return (
+            "the alarm was armed at no verdict: --enable did not hold, or --grace was not over; give others, or check "
+            "a recording in which the machine is in use"
+        )
     if (outside := data["outside_domain_share"]) > UNVOUCHED:
         ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
         why = f" ({'; '.join(data['unknown'])})" if data["unknown"] else ""

@@ -94,13 +94,13 @@ def refuse_absent(
 ) -> None:
     """What no message has: a topic, or what the first lacks and gave no number in any other, a mistake in the map."""
     for name, columns, read in zip(signals.topics, paths, values, strict=True):
-        if not len(read):
-            raise BagError(f"{bag.path}: {name} has no message; record it, or choose another topic or recording")
         for path, column in zip(columns, read.T, strict=True):
             _refuse_absent(bag, name, path, column)
 
 
 def _refuse_absent(bag: Recording, topic: str, path: FieldPath, column: NDArray[np.float64]) -> None:
+    if not len(column):
+        raise BagError(f"{bag.path}: {topic} has no message; record it, or choose another topic or recording")
     looked_up = any(kind != "attribute" for kind, _ in path.steps)
     if not looked_up or not np.isnan(column[:1]).any() or not np.isnan(column).all():
         return
