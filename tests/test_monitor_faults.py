@@ -763,7 +763,8 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     Plant(world, model).subscribed().send(3)
     until(lambda: world.status()["received"][STATE] == 3, "the samples")
     accepted = world.set(enable=f"{STATE} position[c] > 0", enable_type="")
-    assert accepted == (True, f"parameter enable: {STATE} comes without a number in position[c]")
+    there = "there is no 'c' in the message's names; names there: a, b"
+    assert accepted == (True, f"parameter enable: {STATE} comes without a number in position[c]: {there}")
     assert world.set(enable=f"{STATE} position[b] > -9") == (True, "")
 
 

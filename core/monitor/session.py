@@ -140,7 +140,7 @@ class Session(Stream):
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
-    def why_no_condition(self, data: bytes) -> str:
+    def why_no_condition(self, data: bytes, decoded: Callable[[], Any]) -> str:
         """Why a message of the enable condition's topic says nothing on it, in words; empty if it does."""
         condition = self.arming.condition
         assert condition is not None
@@ -148,7 +148,10 @@ class Session(Stream):
             (value,) = self._condition_reader(condition, self.enable_type).read(data)[1]
         except UnreadableError as error:
             return f"{condition.topic}: a message {error}"
-        return "" if value == value else f"{condition.topic} comes without a number in {condition.field.text}"
+        if value == value:
+            return ""
+        absent = condition.field.absent(decoded())
+        return f"{condition.topic} comes without a number in {condition.field.text}" + f": {absent}" * bool(absent)
 
     def likeness(self) -> Likeness | None:
         """What the alarm that is on, or was on last, looks like."""
