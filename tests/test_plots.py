@@ -10,6 +10,7 @@
 """Figures: what they must not hide, and that they can be drawn at both extremes of size."""
 
 import math
+import os
 
 import numpy as np
 import pytest
@@ -158,6 +159,16 @@ def test_a_panel_says_what_it_shows():
     assert axes[0].get_xlabel() == "time [s]"
     looped = checked(model, 200, back=[100])
     assert "2 passes" in envelope_figure(model, looped).axes[-1].get_xlabel()
+
+
+def test_an_image_on_a_full_disk_is_one_sentence_that_names_it(tmp_path, monkeypatch):
+    def full(descriptor):
+        raise OSError(28, "No space left on device")
+
+    figure = matrices_figure(by_hand(2, 1, LONG))
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ModelError, match="f.svg: cannot be written: No space left on device; choose another place"):
+        save(figure, tmp_path / "f.svg")
 
 
 @pytest.mark.parametrize("n, width", [(2, 0.0), (2, 1.0), (50, 1.0)])

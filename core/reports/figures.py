@@ -28,7 +28,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, refuse_other
-from uncertain_lti.base.files import whole_file
+from uncertain_lti.base.files import written
 from uncertain_lti.base.text import printable, shortened
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
@@ -263,9 +263,7 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
     Raises
     ------
     ModelError
-        No image is written with such an ending.
-    OSError
-        The file cannot be written.
+        No image is written with such an ending, or the file cannot be written.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # names may be in any script
@@ -275,7 +273,7 @@ def save(figure: Any, path: str | os.PathLike[str] | IO[bytes], dpi: int = 110) 
         kind = os.path.splitext(path)[1][1:] or "png"
         if kind not in figure.canvas.get_supported_filetypes():
             raise ModelError(f"{path}: no image is written as '{kind}'; end the name in .png, .svg or .pdf")
-        with whole_file(path) as stream:
+        with written(path, ModelError) as stream:
             figure.savefig(stream, dpi=dpi, format=kind)
 
 
