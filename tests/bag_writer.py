@@ -15,12 +15,13 @@ import io
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import lz4.frame
+import numpy as np
 import zstandard
 from mcap.writer import CompressionType, IndexType, Writer
 from rosbags.typesys import Stores, get_typestore
@@ -243,3 +244,18 @@ def raw_file(*records: bytes, summary: bytes | None = None) -> bytes:
         return data
     data += record(15, bytes(4))
     return data + summary + record(2, struct.pack("<QQI", len(data) if summary else 0, 0, 0)) + MAGIC
+
+
+def joint_state(t_ns: int, values: Sequence[float], names: Sequence[str] = ("a", "b")) -> bytes:
+    """A JointState with a stamp, and values as positions."""
+    empty = np.empty(0)
+    return cdr(
+        "sensor_msgs/msg/JointState", header=header(t_ns), name=list(names),
+        position=np.array(values, dtype=np.float64), velocity=empty, effort=empty,
+    )  # fmt: skip
+
+
+def vector(t_ns: int, x: float, y: float, z: float = 0.0) -> bytes:
+    """A Vector3Stamped."""
+    inner = message("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+    return cdr("geometry_msgs/msg/Vector3Stamped", header=header(t_ns), vector=inner)

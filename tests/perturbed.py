@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from bag_writer import JAZZY, Layout, Message, Topic, cdr, float64, header, message, write
+from bag_writer import JAZZY, Layout, Message, Topic, float64, joint_state, vector, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
 from uncertain_lti.cli.judge import check_recording
@@ -148,18 +148,6 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
 
 
 # --- streams ------------------------------------------------------------------------------------------------
-
-
-def joint_state(t_ns: int, values: Any, names: Sequence[str] = ("a", "b")) -> bytes:
-    empty = np.empty(0)
-    return cdr(
-        JOINT_STATE, header=header(t_ns), name=list(names), position=np.array(values, dtype=np.float64),
-        velocity=empty, effort=empty,
-    )  # fmt: skip
-
-
-def vector(t_ns: int, x: float, y: float, z: float) -> bytes:
-    return cdr(VECTOR, header=header(t_ns), vector=message("geometry_msgs/msg/Vector3", x=x, y=y, z=z))
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
+import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
@@ -116,6 +117,12 @@ class Topic:
         except AssertionError:
             raise AssertionError(f"{name}: {len(self.messages)} of {number} messages") from None
         return self.messages[:number]
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Iterator[World]:
+    with open_world(tmp_path) as world:
+        yield world
 
 
 @contextmanager

@@ -23,7 +23,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.signature import Signature, closeness
-from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Likeness, Part, Pattern
+from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Pattern
 from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text, signature_text
@@ -100,12 +100,6 @@ def test_faults_that_look_alike_are_both_named_and_neither_is_chosen(taught: Unc
     assert found["label"] is None and "looks like two or one, too alike to tell (nearest two" in found["text"]
     assert "no known fault" not in found["text"]
     assert "signatures of faults: one, two" in model_text(UncertainLTI.from_dict(twins.to_dict()))
-
-
-def test_states_that_began_an_alarm_of_no_known_pattern_are_named() -> None:
-    pattern = Likeness("", (("worn", 0.3),), (), ("a", "b"), LEAST)
-    assert pattern.words == "looks like no known fault (nearest worn 0.30); began at a, b"
-    assert "began" not in Likeness("", (), (Part("sensor", "a", 0.9),), ("a",), LEAST).words
 
 
 def test_no_alarm_has_no_name(taught: UncertainLTI) -> None:
@@ -229,11 +223,6 @@ def test_signatures_without_a_common_horizon_are_not_alike() -> None:
     ones = np.ones((1, 2, 2)) / 2
     assert closeness(Signature("a", [1], ones), Signature("b", [5], ones)) == 0.0
     assert closeness(Signature("a", [1], ones), Signature("b", [1], 3 * ones)) == pytest.approx(1.0)
-
-
-def test_a_recording_without_an_alarm_has_no_signature(model: UncertainLTI) -> None:
-    with pytest.raises(ModelError, match="no alarm was raised"):
-        learn_signatures(model, [("x", EnvelopeMonitor(model, 5, 5).check(run(1)))])
 
 
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,16 +11,18 @@
 
 from __future__ import annotations
 
+import json
+import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import Layout, Message, Topic, cdr, float64, header, write
+from bag_writer import Layout, Message, Topic, float64, joint_state, vector, write
 from rosbags.highlevel import AnyReader
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
@@ -43,24 +45,19 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.duration import Duration
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import Diagnostics, World, open_world, until
+from ros_processes import Diagnostics, World, until
+from ros_processes import world as world
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
 
-JUDGED = [output for output in outputs.JUDGED if output.of == "states"]  # the models here have no horizons
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 STATE, CONTROL = "/plant/state", "/plant/control"
 JOINT_STATE, VECTOR = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Vector3Stamped"
 STEP_NS = 10_000_000
 EPOCH_NS = 1_700_000_000_000_000_000
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with open_world(tmp_path) as world:
-        yield world
 
 
 # --- a model and recordings made by hand --------------------------------------------------------------------
@@ -106,20 +103,6 @@ def saved(model: UncertainLTI, folder: Path, name: str = "hand") -> Path:
     path = folder / f"{name}.model.json"
     model.save(path)
     return path
-
-
-def joint_state(t_ns: int, values: Any, names: tuple[str, ...] = ("a", "b")) -> bytes:
-    empty = np.empty(0)
-    return cdr(
-        JOINT_STATE, header=header(t_ns), name=list(names), position=np.array(values, dtype=np.float64),
-        velocity=empty, effort=empty,
-    )  # fmt: skip
-
-
-def vector(t_ns: int, x: float, y: float) -> bytes:
-    from bag_writer import message
-
-    return cdr(VECTOR, header=header(t_ns), vector=message("geometry_msgs/msg/Vector3", x=x, y=y, z=0.0))
 
 
 def run_of(model: UncertainLTI, steps: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -207,7 +190,7 @@ def bits(values: Any) -> bytes:
     return np.asarray(values, dtype=np.float64).tobytes()
 
 
-OF_STATES = [output for output in JUDGED if output.of == "states"]
+OF_STATES = [output for output in outputs.JUDGED if output.of == "states"]
 """Those of the models here, which have no horizons."""
 
 
@@ -250,12 +233,12 @@ class Outputs:
 def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Path) -> None:
     model = by_hand(alarm_rule=AlarmRule(2, 5))
     path = saved(model, tmp_path)
-    bag = header_bag(model, tmp_path / "run.mcap", 1500)
+    bag = header_bag(model, tmp_path / "run.mcap", 600)
     verdicts = offline(path, bag)
     assert {v.status for v in verdicts} >= {Status.OK, Status.MISSING, Status.GAP}
     world.monitor(path)
     outputs = Outputs.of(world)
-    world.command("play", bag, "--rate", 6.0).succeed()
+    world.command("play", bag, "--rate", 3.0).succeed()
     outputs.hold_against(verdicts, ("a", "b"))
     status = world.status()
     assert status["verdicts"] == sum(v.judged for v in verdicts)
@@ -315,7 +298,7 @@ def test_a_command_at_an_arrival_or_judged_gives_one_by_one_what_check_gives(tmp
 def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp_path: Path) -> None:
     model = by_hand("log")
     path = saved(model, tmp_path)
-    bag = log_bag(model, tmp_path / "run.mcap", 400)
+    bag = log_bag(model, tmp_path / "run.mcap", 200)
     verdicts = offline(path, bag)
     assert {v.status for v in verdicts} >= {Status.OK, Status.GAP}
     world.monitor(path, use_sim_time=True)
@@ -363,13 +346,53 @@ class Plant:
             time.sleep(0.005)
 
 
+@dataclass
+class Bench:
+    """A monitor at work on a model by hand, what it says, and a plant that it hears."""
+
+    world: World
+    model: UncertainLTI
+    path: Path
+    process: Any
+    diagnostics: Diagnostics
+    flags: Any
+    plant: Plant
+
+    def flagged(self, number: int, since: int = 0) -> list[float]:
+        """The flag of the first state at so many samples, as soon as they are here, but for the first ones."""
+        return [message.position[0] for message in self.flags.count(number)[since:]]
+
+
+StartBench = Callable[..., Bench]
+
+
+@pytest.fixture
+def bench(world: World, tmp_path: Path) -> StartBench:
+    def start(model: UncertainLTI | None = None, **parameters: Any) -> Bench:
+        model = model or by_hand()
+        path = saved(model, tmp_path)
+        process = world.monitor(path, **({"diagnostics_period": 0.1} | parameters))
+        diagnostics = world.diagnostics()
+        flags = world.listen(JointState, "/envelope_monitor/flags").connected()
+        return Bench(world, model, path, process, diagnostics, flags, Plant(world, model).subscribed())
+
+    return start
+
+
+def trigger(world: World, name: str) -> tuple[bool, str]:
+    answer = world.call(Trigger, f"/envelope_monitor/{name}", Trigger.Request())
+    return answer.success, answer.message
+
+
+def wider(model: UncertainLTI) -> UncertainLTI:
+    return model.replace(dA=3 * model.dA, dB=3 * model.dB, v=3 * model.v)
+
+
 def test_every_verdict_and_every_heartbeat_is_published(world: World, tmp_path: Path) -> None:
     model = by_hand(alarm_rule=AlarmRule(2, 3))
     path = saved(model, tmp_path)
     world.monitor(path, heartbeat=4.0)  # sent every 2 s, which leaves as much for a busy machine
     late: list[Any] = []
-    from rclpy.event_handler import SubscriptionEventCallbacks
-
     promised = QoSProfile(depth=5000, deadline=Duration(seconds=4.0))
     events = SubscriptionEventCallbacks(deadline=late.append)
     violation = world.listen(Bool, "/envelope_monitor/violation", promised, event_callbacks=events).connected()
@@ -413,8 +436,10 @@ def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp
     assert state.level == bytes([OK])
     values = Diagnostics.values(state)
     assert float(values["lower"]) <= float(values["state"]) <= float(values["upper"])
-    values = Diagnostics.values(diagnostics.latest("envelope_monitor: monitor"))
-    assert int(values[f"received {STATE}"]) == 30 and int(values["verdicts"]) == 29
+    monitor = lambda: Diagnostics.values(diagnostics.latest("envelope_monitor: monitor"))  # noqa: E731
+    until(lambda: monitor()["verdicts"] == "29", "a report on all verdicts")
+    values = monitor()
+    assert values[f"received {STATE}"] == "30"
     assert float(values[f"age {CONTROL}"]) < 5 and values[f"publishers {STATE}"] == "1"
 
     plant.u = np.full(2, 0.7)
@@ -437,74 +462,83 @@ def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp
     assert (values["gaps"], values["dropped"], values["alarms"]) == ("1", "1", "1")
 
 
-def test_a_model_is_swapped_as_a_whole_or_not_at_all(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    first = saved(model, tmp_path, "first")
-    wide = UncertainLTI(
-        model.A, model.B, 3 * model.dA, 3 * model.dB, v=3 * model.v, signals=model.signals, sampling=model.sampling
-    )
-    second = saved(wide, tmp_path, "second")
-    broken = tmp_path / "broken.model.json"
-    broken.write_text(second.read_text().replace("uncertain-lti/1", "uncertain-lti/9"))
-    world.monitor(first)
-    outputs = Outputs.of(world)
-    plant = Plant(world, model).subscribed()
-    plant.send(1)
-    plant.send(3, off=2.0)
-    plant.send(1, off=2.0)
-    assert [m.position[0] for m in outputs.topics["flags"].count(5)[1:]] == [0, 1, 1, 1]
+def test_a_model_that_cannot_be_is_refused_by_name_and_the_one_at_work_goes_on(
+    bench: StartBench, tmp_path: Path
+) -> None:
+    """Set or read again; and the process ends in time, whatever it was given to read."""
+    on = bench()
+    on.plant.send(1)
+    on.plant.send(3, off=2.0)
+    os.mkfifo(tmp_path / "pipe")
+    text = on.path.read_text()
+    (tmp_path / "newer.json").write_text(text.replace("uncertain-lti/1", "uncertain-lti/9"))
+    timeless = json.loads(text)
+    del timeless["sampling"]["time"][CONTROL]
+    (tmp_path / "timeless.json").write_text(json.dumps(timeless))
+    nowhere = f"there is no such model file in {Path.cwd()}; give the whole path"
+    for wrong, why in (
+        (tmp_path / "newer.json", "uncertain-lti/9"),
+        (tmp_path / "timeless.json", f"sampling.time says nothing of {CONTROL}; write header or log"),
+        (tmp_path / "nowhere.json", "there is no such model file"),
+        ("hand.model.json", nowhere),
+        ("x" * 5000, nowhere),
+        (tmp_path / "pipe", "is no regular file"),
+        ("/dev/zero", "is no regular file"),
+    ):
+        accepted, reason = on.world.set(model=str(wrong))
+        assert not accepted and reason.startswith(str(wrong)[:100]) and why in reason and len(reason) < 6000
+        on.plant.send(1, off=2.0)
+    for broken in (text[: len(text) // 2], "[" * 100_000, ""):
+        on.path.write_text(broken)
+        success, reason = trigger(on.world, "reload")
+        assert not success and str(on.path) in reason, reason
+        on.plant.send(1, off=2.0)
+    assert on.flagged(14, since=1) == [0, *[1.0] * 12]
+    status = on.world.status()
+    assert (status["model"], status["state"]) == (str(on.path), "active")
+    on.process.signal(signal.SIGTERM)
+    assert on.process.wait(20.0) == 0
 
-    accepted, reason = world.set(model=str(broken))
-    assert not accepted and "uncertain-lti/9" in reason
-    accepted, reason = world.set(model=str(tmp_path / "nowhere.model.json"))
-    assert not accepted and "no such model file" in reason
-    assert world.status()["model"] == str(first)
-    plant.send(1, off=2.0)
-    assert outputs.topics["flags"].count(6)[5].position[0] == 1.0  # goes on undisturbed
 
-    accepted, reason = world.set(model=str(second))
-    assert accepted, reason
-    plant.send(4, off=2.0)
-    flags = outputs.topics["flags"].count(10)[6:]
-    assert np.isnan(flags[0].position).all()  # the new model has seen no sample before
-    assert [m.position[0] for m in flags[1:]] == [0, 0, 0]
-    assert world.status()["received"] == {STATE: 10, CONTROL: 10}  # the subscriptions were kept
-
-
-def test_a_swapped_model_may_have_other_topics(world: World, tmp_path: Path) -> None:
-    first, second = saved(by_hand(), tmp_path, "first"), saved(by_hand("log"), tmp_path, "second")
-    world.monitor(first)
-    assert world.status()["received"].keys() == {STATE, CONTROL}
-    accepted, reason = world.set(model=str(second))
-    assert accepted, reason
-    assert world.status()["received"].keys() == {"/power", "/voltage"}
-    power = world.publisher(Float64, "/power")
-    world.subscribed(power)
-    flags = world.listen(JointState, "/envelope_monitor/flags").connected()
+def test_a_model_is_swapped_as_a_whole(bench: StartBench, tmp_path: Path) -> None:
+    """By its name or its file; the first sample has no verdict, subscriptions are kept, and topics may be others."""
+    on = bench()
+    second = saved(wider(on.model), tmp_path, "second")
+    on.plant.send(1)
+    on.plant.send(2, off=2.0)
+    assert on.world.set(model=str(second)) == (True, "")
+    on.plant.send(3, off=2.0)
+    on.model.save(second)
+    success, said = trigger(on.world, "reload")
+    assert success and "2 states: a, b" in said
+    on.plant.send(3, off=2.0)
+    nan = np.nan
+    np.testing.assert_array_equal(on.flagged(9), [nan, 0, 1, nan, 0, 0, nan, 1, 1])
+    assert on.world.status()["received"] == {STATE: 9, CONTROL: 9}
+    assert on.world.set(model=str(saved(by_hand("log"), tmp_path, "third"))) == (True, "")
+    assert on.world.status()["received"].keys() == {"/power", "/voltage"}
+    power = on.world.publisher(Float64, "/power")
+    on.world.subscribed(power)
     power.publish(Float64(data=1.0))
-    assert list(flags.count(1)[0].name) == ["a"]
+    assert list(on.flags.count(10)[9].name) == ["a"]
 
 
-def test_the_alarm_rule_can_be_set_and_is_checked(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path))
-    outputs = Outputs.of(world)
-    plant = Plant(world, model).subscribed()
-    accepted, reason = world.set(violations=4, window=3)
+def test_the_alarm_rule_can_be_set_and_is_checked(bench: StartBench) -> None:
+    on = bench()
+    violation = on.world.listen(Bool, "/envelope_monitor/violation").connected()
+    accepted, reason = on.world.set(violations=4, window=3)
     assert not accepted and "violations is 4 of window 3" in reason
-    accepted, reason = world.set(margin=-1.0)
-    assert not accepted
-    accepted, reason = world.set(heartbeat=2.0)
+    assert not on.world.set(margin=-1.0)[0]
+    accepted, reason = on.world.set(heartbeat=2.0)
     assert not accepted and "read-only" in reason
-    assert world.set(violations=2, window=3, margin=2.0) == (True, "")
-    plant.send(1)
-    plant.send(4, off=1.5)
-    assert [m.position[0] for m in outputs.topics["flags"].count(5)[1:]] == [0, 0, 0, 0]  # within twice the width
-    assert world.set(margin=1.0) == (True, "")
-    plant.send(1, off=1.5)
-    plant.send(1, off=1.5)
-    assert [m.position[0] for m in outputs.topics["flags"].count(7)[5:]] == [1, 1]
-    until(lambda: outputs.topics["violation"].messages[-1].data, "the alarm")
+    assert on.world.set(violations=2, window=3, margin=2.0) == (True, "")
+    on.plant.send(1)
+    on.plant.send(4, off=1.5)
+    assert on.flagged(5, since=1) == [0, 0, 0, 0]  # within twice the width
+    assert on.world.set(margin=1.0) == (True, "")
+    on.plant.send(2, off=1.5)
+    assert on.flagged(7, since=5) == [1, 1]
+    until(lambda: violation.messages[-1].data, "the alarm")
 
 
 def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Path) -> None:
@@ -550,6 +584,7 @@ def test_a_rule_that_kept_the_node_from_starting_can_be_mended(world: World, tmp
     process.says("the node starts as soon as its parameters are set right")
     assert world.state() == "unconfigured"
     assert world.set(window=5) == (True, "") and world.state() == "active"
+    assert not world.manage("configure") and world.state() == "active", "a manager gives up on a node that started"
 
 
 def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_path: Path) -> None:
@@ -598,80 +633,62 @@ def test_a_signal_ends_the_node_with_status_0(world: World, tmp_path: Path, end:
     until(lambda: diagnostics.latest("envelope_monitor: monitor").message.startswith("finalized"), "its last words")
 
 
-def test_what_was_published_before_by_a_transient_local_publisher_is_heard(world: World, tmp_path: Path) -> None:
-    model = by_hand()
+def test_what_was_published_before_is_heard_and_quality_of_service_that_cannot_be_had_is_told(
+    world: World, tmp_path: Path
+) -> None:
     lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     control = world.publisher(Vector3Stamped, CONTROL, lasting)
     command = Vector3Stamped()
     command.vector.x = 0.25  # without a stamp: compared by time of receipt, and held
     control.publish(command)
-    world.monitor(saved(model, tmp_path))
-    until(lambda: world.status()["received"][CONTROL] == 1, "the command from before")
-
-
-def test_quality_of_service_that_cannot_be_had_is_told(world: World, tmp_path: Path) -> None:
     world.monitor(saved(by_hand(), tmp_path), **{"diagnostics_period": 0.1, "qos.reliability": "reliable"})
+    until(lambda: world.status()["received"][CONTROL] == 1, "the command from before")
     diagnostics = world.diagnostics()
     world.publisher(JointState, STATE, QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT))
     status = diagnostics.reaches(STALE, saying=f"{STATE}: a publisher cannot be heard")
     assert "best effort is offered, reliable asked" in status.message
-    accepted, reason = world.set(**{"qos.reliability": "match"})
-    assert not accepted
+    assert not world.set(**{"qos.reliability": "match"})[0]
 
 
-def test_bounds_are_predicted_only_while_somebody_listens(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    path = saved(model, tmp_path)
-    world.monitor(path)
-    flags = world.listen(JointState, "/envelope_monitor/flags").connected()
-    plant = Plant(world, model).subscribed()
-    plant.send(3)
-    flags.count(3)
-    lower = world.listen(JointState, "/envelope_monitor/predicted_lower").connected()
-    upper = world.listen(JointState, "/envelope_monitor/predicted_upper").connected()
-    judged = world.listen(JointState, "/envelope_monitor/lower").connected()
-    plant.send(10)
-    flags.count(13)
-    low, high = lower.count(10), upper.count(10)
-    for a, b in zip(low, high, strict=True):
-        assert stamp_of(a) == stamp_of(b) and (np.array(a.position) < np.array(b.position)).all()
-    # the step is the median step and the control was known, so the prediction is what is judged one sample later
-    later = {stamp_of(m): bits(m.position) for m in judged.count(10)}
-    for message in low[:-1]:
-        assert bits(message.position) == later[stamp_of(message)]
-    world.node.destroy_subscription(upper.subscription)
-    world.node.destroy_subscription(lower.subscription)
-    assert len(lower.messages) == 10
-
-
-def test_bounds_are_foreseen_over_the_longest_horizon_while_somebody_listens(world: World, tmp_path: Path) -> None:
+def test_bounds_are_predicted_for_a_step_and_the_longest_horizon_while_somebody_listens(
+    bench: StartBench,
+) -> None:
     arrays = {name: getattr(by_hand(), name) for name in ARRAYS}
-    model = by_hand(horizons=[Horizon(3, **arrays), Horizon(4, **arrays)])
-    world.monitor(saved(model, tmp_path))
-    lower = world.listen(JointState, "/envelope_monitor/horizon_predicted_lower").connected()
-    upper = world.listen(JointState, "/envelope_monitor/horizon_predicted_upper").connected()
-    state = world.listen(JointState, "/envelope_monitor/state").connected()
-    Plant(world, model).subscribed().send(6)
-    low, high, read = lower.count(6), upper.count(6), state.count(5)
-    dt = round(model.sampling.dt_median * 1e9)  # type: ignore[operator]
-    assert [stamp_of(m) for m in low] == [stamp_of(m) for m in high]
-    assert [stamp_of(m) - 4 * dt for m in low[1:]] == [stamp_of(m) for m in read]
-    for a, b in zip(low, high, strict=True):
-        assert (np.array(a.position) < np.array(b.position)).all() and tuple(a.name) == ("a", "b")
+    on = bench(by_hand(horizons=[Horizon(3, **arrays), Horizon(4, **arrays)]))
+    on.plant.send(3)
+    on.flags.count(3)
+    names = ("predicted_lower", "predicted_upper", "horizon_predicted_lower", "horizon_predicted_upper", "lower")
+    topics = [on.world.listen(JointState, f"/envelope_monitor/{name}").connected() for name in names]
+    on.plant.send(10)
+    low, high, far_low, far_high, judged = (topic.count(10) for topic in topics)
+    for lower, upper in ((low, high), (far_low, far_high)):
+        for a, b in zip(lower, upper, strict=True):
+            assert stamp_of(a) == stamp_of(b) and (np.array(a.position) < np.array(b.position)).all()
+            assert tuple(a.name) == ("a", "b")
+    # the step is the median step and the control was known, so the prediction is what is judged one sample later
+    later = {stamp_of(m): bits(m.position) for m in judged}
+    assert all(bits(m.position) == later[stamp_of(m)] for m in low[:-1])
+    assert [stamp_of(m) - 4 * STEP_NS for m in far_low] == [stamp_of(m) for m in judged]
 
 
-def test_topics_follow_remapping_and_namespaces(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    path = saved(model, tmp_path)
-    name = "/rig/watcher"
+def test_topics_and_diagnostics_follow_remapping_and_namespaces(world: World, tmp_path: Path) -> None:
+    """Statuses are `node: part`, as the aggregator's analyzers split them."""
+    model, name = by_hand(), "/rig/watcher"
     world.monitor(
-        path, "-r", "__ns:=/rig", "-r", "__node:=watcher", "-r", f"{STATE}:=/other/state", name=name,
-        diagnostics_period=0.1,
+        saved(model, tmp_path), "-r", "__ns:=/rig", "-r", "__node:=watcher", "-r", f"{STATE}:=/other/state", name=name,
+        diagnostics_period=0.1, hardware_id="rig 7",
     )  # fmt: skip
     diagnostics = world.diagnostics()
     flags = world.listen(JointState, f"{name}/flags").connected()
-    plant = Plant(world, model, state="/other/state").subscribed()
-    plant.send(5)
+    Plant(world, model, state="/other/state").subscribed().send(5)
     flags.count(5)
     assert world.status(name)["received"] == {"/other/state": 5, CONTROL: 5}
-    until(lambda: diagnostics.latest("rig/watcher: a"), "the namespace in the diagnostics")
+    until(lambda: len(diagnostics.topic.messages) > 12, "reports")
+    for array in diagnostics.topic.messages:
+        assert array.header.stamp.sec > 0
+        assert [s.name for s in array.status] == [f"rig/watcher: {part}" for part in ("monitor", "a", "b")]
+        for status in array.status:
+            keys = [v.key for v in status.values]
+            assert len(set(keys)) == len(keys) and status.message and status.hardware_id == "rig 7"
+    monitor = "rig/watcher: monitor"
+    until(lambda: Diagnostics.values(diagnostics.latest(monitor))["verdicts"] == "4", "a report on all verdicts")

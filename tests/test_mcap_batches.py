@@ -14,7 +14,6 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 
 import lz4.frame  # type: ignore[import-untyped]
@@ -91,10 +90,9 @@ def test_lz4_frames_without_their_end_mark(tmp_path: Path, monkeypatch: pytest.M
     assert outcome(path, by_message=False) == outcome(path, by_message=True) == whole
 
 
-@pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
-def test_the_same_without_isal(tmp_path: Path, compression: str) -> None:
+def test_the_same_without_isal(tmp_path: Path) -> None:
     """Whole and with a bit flipped, which a checksum tells."""
-    path = recording(tmp_path, compression, 5000)
+    path = recording(tmp_path, "zstd", 5000)
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     damaged = tmp_path / "damaged.mcap"
@@ -115,16 +113,6 @@ print([outcome(Path(path), False) for path in {[str(path), str(damaged)]!r}])
     assert here[0] != here[1] and done.stdout == f"{here}\n"
 
 
-def test_checksums_are_those_of_zlib() -> None:
-    isal = pytest.importorskip("isal.isal_zlib", reason="isal is not installed: checksums are by zlib")
-    dice = random.Random(0)
-    for size in [*range(300), *(dice.randrange(1 << 20) for _ in range(50))]:
-        data = bytearray(dice.randbytes(size + 16))
-        at, begin = dice.randrange(16), dice.choice([0, 1, 2**32 - 1, dice.getrandbits(32)])
-        for piece in (memoryview(data)[at : at + size], bytes(data[at : at + size])):
-            assert isal.crc32(piece, begin) == zlib.crc32(piece, begin)
-
-
 @pytest.mark.parametrize("chunk_size", [300, 5000])
 @pytest.mark.parametrize("compression", ["none", "lz4", "zstd"])
 def test_damaged_files(tmp_path: Path, compression: str, chunk_size: int) -> None:
@@ -132,7 +120,7 @@ def test_damaged_files(tmp_path: Path, compression: str, chunk_size: int) -> Non
     whole = recording(tmp_path, compression, chunk_size).read_bytes()
     dice = random.Random(chunk_size)
     path = tmp_path / "damaged.mcap"
-    for damage in range(60):
+    for damage in range(20):
         data = bytearray(whole)
         at = dice.randrange(len(data) - 8)
         if damage % 4 == 0:

@@ -16,13 +16,11 @@ import math
 import numpy as np
 import pytest
 
-from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, fit, validate
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, validate
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.proposal.tune import Remembered, memory_candidates, remember
-from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.recall import memory_of, recall, recalled, with_delays, with_memories
-from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.functions import Memory, parse_memory
 from uncertain_lti.signals.signal_map import Signal
@@ -97,19 +95,6 @@ def test_what_single_precision_makes_of_an_ignored_value_is_ignored() -> None:
     assert signal.admits(0.10001) and signal.admits(math.nan) and not signal.admits(-math.inf)
 
 
-def test_a_constant_step_is_the_period_and_a_gap_is_none() -> None:
-    """Stamps that jitter by half a period, a lost sample within max_gap, and one beyond it."""
-    signals = SignalMap((Signal("x", "/a", "data"),), clock="/a", max_gap=0.025, step=0.01, time={"/a": "header"})
-    stamps = [10, 15, 30, 34, 54, 90, 100]
-    sampler = Sampler(signals)
-    steps = [step for t in stamps for step in sampler.push("/a", t * 10**6, t * 10**6, [1.0])]
-    assert [s.status for s in steps] == [Status.FIRST, *[Status.OK] * 4, Status.GAP, Status.OK]
-    assert [s.dt for s in steps[1:]] == [0.01] * 4 + [pytest.approx(0.036), 0.01]
-    transient = Transient(np.array(stamps) * 10**6, np.ones((7, 1)), np.empty((7, 0)), signals=signals, max_gap=0.025)
-    assert transient.dt.tolist() == [s.dt for s in steps[1:]]
-    assert transient.replace(slice(0, 3)).dt.tolist() == [0.01, 0.01]
-
-
 def remembering(rows: dict[str, list[float]], signals: SignalMap, dt: float = 0.1) -> UncertainLTI:
     n = len(signals.states)
     zero = {"dA": np.zeros((n, n)), "dB": np.zeros((n, len(signals.controls)))}
@@ -134,21 +119,6 @@ def test_a_free_run_follows_its_own_memory_and_its_radius_is_that_of_the_recursi
     free = model.simulate((values[1:2] - 2.0) / 4.0, u, dt)
     np.testing.assert_allclose(free[:, 0] * 4.0 + 2.0, values[1:], rtol=1e-9)
     assert model.spectral_radius() == pytest.approx(math.sqrt(0.8))
-
-
-def test_a_lag_makes_one_measured_state_of_two_enough() -> None:
-    """An oscillator: its second state is what the first one was, so nothing is left unexplained."""
-    rng = np.random.default_rng(3)
-    t, drive = 0.05 * np.arange(1500), np.repeat(rng.normal(size=30), 50)
-    x = np.zeros((1500, 2))
-    for k in range(1499):
-        x[k + 1, 1] = x[k, 1] + 0.05 * (-9.0 * x[k, 0] - 0.6 * x[k, 1] + drive[k])
-        x[k + 1, 0] = x[k, 0] + 0.05 * x[k + 1, 1]
-    y = x[:, :1]
-    lagged = np.column_stack([drive, recall(y[:, 0], Memory("lag"), np.full(1500, 0.05), np.arange(1500) == 0)])
-    blind = fit(Transient(t, y, drive), additive="noise")
-    seeing = fit(Transient(t, y, lagged), additive="noise")
-    assert seeing.fit_summary["mean_width"] < 1e-9 * blind.fit_summary["mean_width"]
 
 
 def test_a_model_that_remembers_has_a_newer_format_and_an_older_one_may_not_say_so() -> None:

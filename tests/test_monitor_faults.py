@@ -12,15 +12,12 @@
 from __future__ import annotations
 
 import json
-import os
 import random
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -33,7 +30,6 @@ from conftest import ROOT
 from uncertain_lti import UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.monitor.deployed import Rule
 from uncertain_lti.monitor.intake import Sender
 from uncertain_lti.monitor.outputs import TRUE
 from uncertain_lti.monitor.verdict import Verdict
@@ -46,11 +42,11 @@ from processes import own_domain
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile
-from rclpy.serialization import serialize_message
-from ros_processes import Diagnostics, World, open_world, until
+from rclpy.serialization import deserialize_message, serialize_message
+from ros_processes import Diagnostics, World, until
+from ros_processes import world as world
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, UInt8
-from std_srvs.srv import Trigger
 from test_live import (
     CONTROL,
     EPOCH_NS,
@@ -64,28 +60,20 @@ from test_live import (
     WARN,
     Outputs,
     Plant,
+    StartBench,
     by_hand,
     joint_state,
     offline,
     run_of,
     saved,
     stamp_of,
+    trigger,
     vector,
-)  # fmt: skip
+)
+from test_live import bench as bench
 from test_node_stream import ros as ros
 
 NODE = "/envelope_monitor"
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with open_world(tmp_path) as world:
-        yield world
-
-
-def trigger(world: World, name: str) -> tuple[bool, str]:
-    answer = world.call(Trigger, f"{NODE}/{name}", Trigger.Request())
-    return answer.success, answer.message
 
 
 def stamped(message: Any, t_ns: int) -> Any:
@@ -112,32 +100,24 @@ def orderly_bag(model: UncertainLTI, path: Path, steps: int) -> Path:
     return write([Topic(STATE, JOINT_STATE), Topic(CONTROL, VECTOR)], messages).save(path)
 
 
-def test_stamps_from_the_future_are_counted_and_told(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
-    diagnostics = world.diagnostics()
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
-    plant.send(5)
-    assert world.status()["future"] == {}
-    plant.t_ns = time.time_ns() + 3600 * 10**9
-    plant.send(3)
-    until(lambda: ever(diagnostics, WARN, "lie over 1 s in the future"), "a warning")
-    assert world.status()["future"] == {STATE: 3, CONTROL: 3}
-    plant.t_ns = EPOCH_NS
-    plant.send(3)
-    got = [m.position[0] for m in flags.count(11)]
-    np.testing.assert_array_equal(np.isnan(got), [True, *[False] * 4, True, False, False, True, False, False])
+def test_stamps_from_the_future_are_counted_and_told(bench: StartBench) -> None:
+    on = bench()
+    on.plant.send(5)
+    assert on.world.status()["future"] == {}
+    on.plant.t_ns = time.time_ns() + 3600 * 10**9
+    on.plant.send(3)
+    until(lambda: ever(on.diagnostics, WARN, "lie over 1 s in the future"), "a warning")
+    assert on.world.status()["future"] == {STATE: 3, CONTROL: 3}
+    on.plant.t_ns = EPOCH_NS
+    on.plant.send(3)
+    wanted = [True, *[False] * 4, True, False, False, True, False, False]
+    np.testing.assert_array_equal(np.isnan(on.flagged(11)), wanted)
 
 
-def test_mutated_messages_do_no_harm(world: World, tmp_path: Path) -> None:
+def test_mutated_messages_do_no_harm(bench: StartBench) -> None:
     """Seeded damage to serialised messages, sent as they are; between them sound ones are judged as ever."""
-    model = by_hand()
-    # nothing waits for a control, which comes last here
-    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1, largest_message=0.25, catch_up=0.0)
-    diagnostics = world.diagnostics()
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
+    on = bench(largest_message=0.25, catch_up=0.0)  # nothing waits for a control, which comes last here
+    world, plant = on.world, on.plant
     rng = random.Random(11)
     sound = [
         serialize_message(stamped(JointState(name=["a", "b"], position=[0.3, 0.3]), EPOCH_NS)),
@@ -148,18 +128,17 @@ def test_mutated_messages_do_no_harm(world: World, tmp_path: Path) -> None:
         time.sleep(0.002)
     until(lambda: world.status()["received"].get(STATE) == 400, "all of them")
     assert sum(world.status()["unreadable"].values()) > 50
-    until(lambda: ever(diagnostics, STALE, f"{STATE}: a message is cut"), "a word on them")
+    until(lambda: ever(on.diagnostics, STALE, f"{STATE}: a message is cut"), "a word on them")
     plant.state.publish(JointState(name=["a", "b"], position=[0.0] * 100_000))
     until(lambda: world.status()["received"].get(STATE) == 401, "the huge one")
-    until(lambda: ever(diagnostics, STALE, "more than parameter largest_message allows"), "a word on it")
+    until(lambda: ever(on.diagnostics, STALE, "more than parameter largest_message allows"), "a word on it")
     plant.t_ns = EPOCH_NS + 10**12  # later than whatever stamp got through, or a step back: a new segment either way
-    heard = len(flags.messages)
+    heard = len(on.flags.messages)
     plant.send(6)
     plant.send(1, off=2.0)
     plant.send(1)
-    got = [m for m in flags.count(heard + 8)[heard:]]
-    assert [m.position[0] for m in got[-7:]] == [0, 0, 0, 0, 0, 0, 1]
-    assert process.running and world.status()["unexpected_errors"] == 0 and "Traceback" not in process.output
+    assert on.flagged(heard + 8)[-7:] == [0, 0, 0, 0, 0, 0, 1]
+    assert on.process.running and world.status()["unexpected_errors"] == 0 and "Traceback" not in on.process.output
 
 
 def mutated(rng: random.Random, data: bytes) -> bytes:
@@ -181,13 +160,10 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
     return bytes(body)
 
 
-def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=0.4, heartbeat=0.2)
-    diagnostics = world.diagnostics()
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    violation = world.listen(Bool, f"{NODE}/violation").connected()
-    plant = Plant(world, model).subscribed()
+def test_a_silent_state_and_a_silent_control_are_told_apart(bench: StartBench) -> None:
+    on = bench(state_timeout=0.4, heartbeat=0.2)
+    diagnostics, flags, plant = on.diagnostics, on.flags, on.plant
+    violation = on.world.listen(Bool, f"{NODE}/violation").connected()
     plant.send(10)
     flags.count(10)
 
@@ -211,7 +187,7 @@ def test_a_silent_state_and_a_silent_control_are_told_apart(world: World, tmp_pa
     for k in range(80):  # the state goes on, the control does not: held for max_hold, 0.5 s, and no longer
         plant.state.publish(stamped(JointState(name=["a", "b"], position=x), plant.t_ns + k * STEP_NS))
         time.sleep(0.01)
-    got = np.isnan([m.position[0] for m in flags.count(95)[15:]])
+    got = np.isnan(on.flagged(95, since=15))
     held = np.flatnonzero(got)[0]
     assert 49 <= held <= 52 and got[held:].all(), held
     until(lambda: ever(diagnostics, ERROR, "a signal is missing, stale or not finite"), "a report of it")
@@ -237,7 +213,7 @@ def test_missed_deadlines_are_told(world: World, tmp_path: Path) -> None:
 def test_a_monitor_that_is_killed_is_missed_and_resumes_without_a_wrong_verdict(world: World, tmp_path: Path) -> None:
     model = by_hand()
     path = saved(model, tmp_path)
-    bag = orderly_bag(model, tmp_path / "run.mcap", 9000)  # a minute and a half, of which a few seconds are played
+    bag = orderly_bag(model, tmp_path / "run.mcap", 3000)  # two minutes, of which some seconds are played
     expected: dict[int, Verdict] = {v.t_ns: v for v in offline(path, bag) if v.judged}
     missed: list[Any] = []
     promised = QoSProfile(depth=5000, deadline=Duration(seconds=0.4))
@@ -245,14 +221,14 @@ def test_a_monitor_that_is_killed_is_missed_and_resumes_without_a_wrong_verdict(
     events = SubscriptionEventCallbacks(deadline=missed.append)
     violation = world.listen(Bool, f"{NODE}/violation", promised, event_callbacks=events).connected()
     flags = world.listen(JointState, f"{NODE}/flags").connected()
-    player = world.command("play", bag)
-    flags.count(200)
+    player = world.command("play", bag, "--rate", "0.25")
+    flags.count(100)
     process.kill()
     before = len(missed)
     until(lambda: len(missed) > before, "the missed deadline")
     heard = len(flags.messages)
     world.run_node("envelope_monitor", {"model": str(path), "heartbeat": 0.4})
-    until(lambda: len(flags.messages) > heard + 50 or not player.running, "the second monitor")
+    until(lambda: len(flags.messages) > heard + 25 or not player.running, "the second monitor")
     assert player.running, "the recording ended too soon for this test"
     player.kill()
     status = world.status()
@@ -314,7 +290,7 @@ sys.exit(envelope_monitor.main())
 @pytest.mark.slow
 def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
     """`benchmarks/live_monitor.py --soak 600 --armed` in short, slowly enough for a machine that is busy."""
-    soak = ("--soak", "10", "--soak-rate", "150", "--armed")
+    soak = ("--soak", "5", "--soak-rate", "150", "--armed")
     command = [sys.executable, str(ROOT / "benchmarks" / "live_monitor.py"), *soak]
     with own_domain() as domain:
         command += ["--domain", str(domain)]
@@ -326,15 +302,12 @@ def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
 # --- the alarm ----------------------------------------------------------------------------------------------
 
 
-def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path), diagnostics_period=0.1, enable="/machine/mode data == 3", state_timeout=60.0)
-    diagnostics = world.diagnostics()
-    outputs = Outputs.of(world)
-    flags, violation = outputs.topics["flags"], outputs.topics["violation"]
-    plant = Plant(world, model).subscribed()
+def test_an_enable_condition_on_a_field_of_any_topic(bench: StartBench) -> None:
+    on = bench(enable="/machine/mode data == 3", state_timeout=60.0)
+    world, diagnostics, plant = on.world, on.diagnostics, on.plant
+    violation = world.listen(Bool, f"{NODE}/violation").connected()
     plant.send(5, off=2.0)
-    assert [m.position[0] for m in flags.count(5)[2:]] == [1, 1, 1]
+    assert on.flagged(5, since=2) == [1, 1, 1]
     diagnostics.reaches(WARN, saying="alarms are off: it is not known whether /machine/mode data == 3")
     assert world.status()["armed"] is None
     lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -342,7 +315,7 @@ def test_an_enable_condition_on_a_field_of_any_topic(world: World, tmp_path: Pat
     mode.publish(UInt8(data=1))
     until(lambda: world.status()["armed"] is False, "the mode")
     plant.send(5, off=2.0)
-    flags.count(10)
+    on.flags.count(10)
     diagnostics.reaches(WARN, name="envelope_monitor: a", saying="outside its bounds")
     assert not any(m.data for m in violation.messages)
     mode.publish(UInt8(data=3))
@@ -398,7 +371,7 @@ class Sends:
 
     def run(self, messages: int, step: float = 5e-4) -> int:
         """Verdicts on so many messages; each change of the alarm is published at once."""
-        for arrival, topic, data in stream_cases.stream(self.model, np.random.default_rng(6), messages, 0.1):
+        for arrival, topic, data in stream_cases.stream(self.model, np.random.default_rng(6), messages, 0.02):
             self.now += step
             self.node.arrive(arrival, topic, data)
             assert self.alarms[-1] == self.node.session.alarm
@@ -465,78 +438,47 @@ rclpy.spin(node)
 """
 
 
-def test_every_flag_arrives_beside_a_process_that_is_stopped(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    world.monitor(saved(model, tmp_path))
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
+def test_every_flag_arrives_beside_a_process_that_is_stopped(bench: StartBench) -> None:
+    on = bench(diagnostics_period=1.0)
+    world, flags, plant = on.world, on.flags, on.plant
     stalls = world.start("stalls", "-c", _LISTENS)
     stalls.says("listens")
     until(lambda: world.status()["listeners"]["lower"] == 1, "the reader")
-    plant = Plant(world, model).subscribed()
     plant.send(60)
     flags.count(60)
     stalls.signal(signal.SIGSTOP)
     plant.send(400)
-    flags.count(460, patience=30.0)
+    flags.count(460)
     stalls.kill()
     assert world.status()["held_back"] >= 0
 
 
-def test_reload_reads_the_file_again_or_says_why_not(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    path = saved(model, tmp_path)
-    world.monitor(path)
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
-    plant.send(1)
-    plant.send(2, off=2.0)
-    text = path.read_text()
-    for broken in (text[: len(text) // 2], "[" * 100_000, text.replace("uncertain-lti/1", "uncertain-lti/9"), ""):
-        path.write_text(broken)
-        success, reason = trigger(world, "reload")
-        assert not success and str(path) in reason, reason
-        plant.send(1, off=2.0)
-    assert [m.position[0] for m in flags.count(7)[1:]] == [0, *[1.0] * 5]
-    wide = UncertainLTI(
-        model.A, model.B, 3 * model.dA, 3 * model.dB, v=3 * model.v, signals=model.signals, sampling=model.sampling
-    )
-    wide.save(path)
-    success, said = trigger(world, "reload")
-    assert success and "2 states: a, b" in said
-    plant.send(3, off=2.0)
-    got = [m.position[0] for m in flags.count(10)[7:]]
-    assert np.isnan(got[0]) and got[1:] == [0, 0]
-
-
-def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(world: World, tmp_path: Path) -> None:
-    model = by_hand(max_hold=None, alarm_rule=AlarmRule(2, 3))
-    path = saved(model, tmp_path)
+def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(bench: StartBench) -> None:
     mode_type = {"enable": "/machine/mode data == 3", "enable_type": "std_msgs/msg/UInt8"}
-    process = world.monitor(path, latch=True, **mode_type)
-    outputs = Outputs.of(world)
-    flags, violation = outputs.topics["flags"], outputs.topics["violation"]
+    on = bench(by_hand(max_hold=None, alarm_rule=AlarmRule(2, 3)), latch=True, **mode_type)
+    world, plant = on.world, on.plant
+    violation = world.listen(Bool, f"{NODE}/violation").connected()
     mode = world.publisher(UInt8, "/machine/mode", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
     mode.publish(UInt8(data=3))
     until(lambda: world.status()["armed"], "the mode")
-    plant = Plant(world, model).subscribed()
     plant.send(30)
     plant.control.publish = lambda _: None  # type: ignore[method-assign]
     plant.send(3, off=2.0)
     plant.send(5)
-    flags.count(38)
+    on.flags.count(38)
     until(lambda: violation.messages[-1].data, "the alarm")
     assert trigger(world, "reload")[0]
     plant.send(5)
-    assert [m.position[0] for m in flags.count(43)[39:]] == [0, 0, 0, 0]
+    assert on.flagged(43, since=39) == [0, 0, 0, 0]
     assert world.set(margin=1.5) == (True, "") and world.status()["alarm"]
     assert world.set(enable="/machine/mode data >= 3") == (True, "") and world.status()["armed"] is True
     assert world.set(enable="/machine/mode data > 3") == (True, "") and world.status()["armed"] is False
     plant.send(5)
-    assert [m.position[0] for m in flags.count(48)[44:]] == [0, 0, 0, 0]
+    assert on.flagged(48, since=44) == [0, 0, 0, 0]
     assert violation.messages[-1].data and world.status()["latched"]
     assert trigger(world, "reset")[0] and not world.status()["alarm"]
-    process.says("the alarm is over after")
-    assert ", by ~/reset" in process.output
+    on.process.says("the alarm is over after")
+    assert ", by ~/reset" in on.process.output
 
 
 # --- snapshots ----------------------------------------------------------------------------------------------
@@ -544,7 +486,6 @@ def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(world:
 
 def test_snapshots_hold_what_came_and_what_was_said(world: World, tmp_path: Path) -> None:
     from mcap.reader import make_reader
-    from rosbags.highlevel import AnyReader
 
     folder = tmp_path / "snapshots"
     folder.mkdir()
@@ -579,17 +520,13 @@ def test_snapshots_hold_what_came_and_what_was_said(world: World, tmp_path: Path
         (notes,) = list(reader.iter_metadata())
         assert notes.metadata["model"] == str(path)
     assert [len(by_topic[t]) for t in (STATE, CONTROL, f"{NODE}/flags", f"{NODE}/lower")] == [40, 40, 40, 39]
-    with AnyReader([found]) as reader:
-        decoded: dict[str, list[Any]] = {}
-        for connection, _, data in reader.messages():
-            decoded.setdefault(connection.topic, []).append(reader.deserialize(data, connection.msgtype))
     for name in ("flags", "lower", "upper", "state", "utilisation"):
-        there = decoded[f"{NODE}/{name}"]
+        there = [deserialize_message(data, JointState) for data in by_topic[f"{NODE}/{name}"]]
         for a, b in zip(there, outputs.topics[name].count(len(there)), strict=True):
             np.testing.assert_array_equal(a.position, b.position)
             np.testing.assert_array_equal(a.velocity, b.velocity)
             assert stamp_of(a) == stamp_of(b) and list(a.name) == list(b.name)
-    assert [m.data for m in decoded[f"{NODE}/violation"]].count(True) == 3
+    assert by_topic[f"{NODE}/violation"].count(TRUE) == 3
     # what came in is there as it came, so the offline check can be repeated on it
     np.testing.assert_array_equal([v.flags for v in offline(path, found)], [m.position for m in flags])
 
@@ -599,61 +536,60 @@ def test_snapshots_hold_what_came_and_what_was_said(world: World, tmp_path: Path
     assert keep.read_bytes() == b"mine" and not found.exists() and len(list(tmp_path.glob("*.mcap"))) == 0
 
 
-def test_what_still_waits_at_the_end_is_judged(world: World, tmp_path: Path) -> None:
+def test_what_still_waits_at_the_end_is_judged(bench: StartBench) -> None:
     """A topic that was never heard has messages wait: here for ten seconds, had the monitor not been told to end."""
-    process = world.monitor(saved(by_hand(), tmp_path), catch_up=10.0)
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, by_hand()).subscribed()
-    plant.control.publish = lambda _: None  # type: ignore[method-assign]
-    plant.send(20)
-    until(lambda: world.status()["received"][STATE] == 20, "20 samples")
-    assert not flags.messages
-    process.signal(signal.SIGINT)
-    process.succeed()
-    assert len(flags.count(20)) == 20
+    on = bench(catch_up=10.0)
+    on.plant.control.publish = lambda _: None  # type: ignore[method-assign]
+    on.plant.send(20)
+    until(lambda: on.world.status()["received"][STATE] == 20, "20 samples")
+    assert not on.flags.messages
+    on.process.signal(signal.SIGINT)
+    on.process.succeed()
+    assert len(on.flags.count(20)) == 20
 
 
-def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(world: World, tmp_path: Path) -> None:
+def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(bench: StartBench, tmp_path: Path) -> None:
     folder = tmp_path / "snapshots"
-    model = by_hand(max_hold=None)
-    path = saved(model, tmp_path)
     options: dict[str, Any] = {"snapshot.on_alarm": True, "snapshot.after": 0.1, "snapshot.seconds": 1.0}
-    world.monitor(path, **{"snapshot.folder": str(folder)}, **options)
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
+    on = bench(by_hand(max_hold=None), **{"snapshot.folder": str(folder)}, **options)
+    plant = on.plant
     plant.send(20)
     plant.control.publish = lambda _: None  # type: ignore[method-assign]
     plant.send(300)
     for _ in range(8):
         plant.send(1, off=2.0)
         plant.send(3)
-    flags.count(320 + 8 * 4)
+    on.flags.count(320 + 8 * 4)
     (found,) = until(lambda: list(folder.glob("*.mcap")), "the file")
-    verdicts = offline(path, found)
+    verdicts = offline(on.path, found)
     assert len(verdicts) < 300 and sum(not v.judged for v in verdicts) == 1 and any(v.violated for v in verdicts)
-    assert world.status()["snapshot"] == str(found), "one file as long as the alarm keeps coming back"
+    assert on.world.status()["snapshot"] == str(found), "one file as long as the alarm keeps coming back"
     time.sleep(1.2)
     plant.send(3, off=2.0)
     until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without")
 
 
-def test_without_a_folder_there_are_no_snapshots(world: World, tmp_path: Path) -> None:
-    process = world.monitor(saved(by_hand(), tmp_path))
-    success, reason = trigger(world, "snapshot")
+def test_without_a_folder_there_are_no_snapshots(bench: StartBench, tmp_path: Path) -> None:
+    said = (
+        "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the node "
+        "with the other"
+    )
+    on = bench()
+    success, reason = trigger(on.world, "snapshot")
     assert not success and "snapshot.folder is empty" in reason
-    accepted, _ = world.set(**{"snapshot.folder": str(tmp_path)})
-    assert not accepted
-    process.kill()
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    options = {"model": str(saved(by_hand(), tmp_path)), "snapshot.folder": str(blocked)}
-    process = world.run_node("envelope_monitor", options, "-r", "__node:=second")
-    process.says("cannot be written to")
-    assert world.state("/second") == "unconfigured"
+    assert not on.world.set(**{"snapshot.folder": str(tmp_path)})[0]
+    assert on.world.set(**{"snapshot.on_alarm": True}) == (False, said)
+    (tmp_path / "file").write_text("")
+    for name, options, why in (
+        ("second", {"snapshot.folder": str(tmp_path / "file")}, "cannot be written to"),
+        ("third", {"snapshot.on_alarm": True}, f"not configured: {said}"),
+    ):
+        process = on.world.run_node("envelope_monitor", {"model": str(on.path), **options}, "-r", f"__node:={name}")
+        process.says(why)
+        assert on.world.state(f"/{name}") == "unconfigured"
 
 
 def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) -> None:
-    from uncertain_lti.base.errors import ModelError
     from uncertain_lti.monitor.snapshot import Album, Entry, Scene
     from uncertain_lti_ros.messages import definition
 
@@ -688,43 +624,6 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
     album.take(scene(30_000), patience=300.0)
     assert outside.read_bytes() == b"of someone else" and (folder / written[0].name).is_symlink()
     assert not list(tmp_path.rglob("*.part"))
-
-
-# --- model files that are none ------------------------------------------------------------------------------
-
-
-def test_a_pipe_or_a_device_is_refused_as_a_model_and_the_node_lives_on(world: World, tmp_path: Path) -> None:
-    path = saved(by_hand(), tmp_path)
-    process = world.monitor(path)
-    os.mkfifo(tmp_path / "pipe")
-    for wrong in (tmp_path / "pipe", "/dev/zero"):
-        accepted, reason = world.set(model=str(wrong))
-        assert not accepted and f"{wrong}: is no regular file" in reason
-    assert world.status()["model"] == str(path) and world.status()["state"] == "active"
-    process.signal(signal.SIGTERM)
-    assert process.wait(20.0) == 0
-
-
-def test_a_file_that_cannot_be_read_in_time_is_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    from uncertain_lti_ros import parameters
-
-    waiting = threading.Event()
-    monkeypatch.setattr(parameters.UncertainLTI, "load", lambda file: waiting.wait())
-    monkeypatch.setattr(parameters, "_PATIENCE", 0.05)
-    (tmp_path / "m.json").touch()
-    with pytest.raises(ModelError, match="cannot be read within 0.05 s"):
-        parameters.make_session(str(tmp_path / "m.json"), Rule(), None)  # type: ignore[arg-type]
-    waiting.set()
-
-
-def test_a_topic_without_its_time_is_refused_by_name(world: World, tmp_path: Path) -> None:
-    path = saved(by_hand(), tmp_path)
-    world.monitor(path)
-    content = json.loads(path.read_text())
-    del content["sampling"]["time"][CONTROL]
-    path.write_text(json.dumps(content))
-    assert trigger(world, "reload") == (False, f"{path}: sampling.time says nothing of {CONTROL}; write header or log")
-    assert world.status()["state"] == "active"
 
 
 _LEAVES = """
@@ -768,11 +667,9 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     assert world.set(enable=f"{STATE} position[b] > -9") == (True, "")
 
 
-def test_publishers_that_nothing_comes_from_are_told(world: World, tmp_path: Path) -> None:
-    world.monitor(saved(by_hand(), tmp_path), diagnostics_period=0.1)
-    diagnostics = world.diagnostics()
-    plant = Plant(world, by_hand()).subscribed()
-    diagnostics.reaches(STALE, saying=f"{STATE}: nothing received in 2 s, and there is 1 publisher")
-    before = diagnostics.count
-    plant.send(20)
-    diagnostics.reaches(OK, since=before)
+def test_publishers_that_nothing_comes_from_are_told(bench: StartBench) -> None:
+    on = bench()
+    on.diagnostics.reaches(STALE, saying=f"{STATE}: nothing received in 2 s, and there is 1 publisher")
+    before = on.diagnostics.count
+    on.plant.send(20)
+    on.diagnostics.reaches(OK, since=before)

@@ -15,7 +15,6 @@ import json
 import os
 import signal
 import time
-from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -32,7 +31,8 @@ from lifecycle_msgs.msg import TransitionEvent
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import Diagnostics, World, open_world, until
+from ros_processes import World, until
+from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
@@ -43,24 +43,20 @@ from test_live import (
     STEP_NS,
     Outputs,
     Plant,
+    StartBench,
     by_hand,
     header_bag,
     offline,
     saved,
     stamp_of,
 )
+from test_live import bench as bench
 
 from uncertain_lti_ros.parameters import PARAMETERS
 from uncertain_lti_ros.process import spare_the_middleware
 from uncertain_lti_ros.topics import MatchedSubscription
 
 NODE = "/envelope_monitor"
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with open_world(tmp_path) as world:
-        yield world
 
 
 # --- middleware ---------------------------------------------------------------------------------------------
@@ -95,8 +91,10 @@ def test_the_middleware_reads_the_profile(world: World, tmp_path: Path) -> None:
 # --- parameters ---------------------------------------------------------------------------------------------
 
 
-def test_every_parameter_tells_its_meaning_range_and_whether_it_can_be_set(world: World) -> None:
-    world.run_node("envelope_monitor", {"autostart": False})
+def test_every_parameter_tells_its_meaning_range_and_whether_it_can_be_set(world: World, tmp_path: Path) -> None:
+    """Of a node that is started from the parameter file."""
+    file = str(ROOT / "config" / "envelope_monitor.yaml")
+    world.run_node("envelope_monitor", {}, "--params-file", file, "-p", "autostart:=false")
     names = [p.name for p in PARAMETERS]
     described = world.call(
         DescribeParameters, f"{NODE}/describe_parameters", DescribeParameters.Request(names=names)
@@ -121,6 +119,8 @@ def test_every_parameter_tells_its_meaning_range_and_whether_it_can_be_set(world
         wrong = 3 if isinstance(parameter.default, str | bool) else "three"
         accepted, reason = world.set(**{parameter.name: wrong})
         assert not accepted and reason
+    assert world.set(model=str(saved(by_hand(), tmp_path))) == (True, "")
+    assert world.change("configure") and world.change("activate") and world.state() == "active"
 
 
 def test_the_parameter_file_gives_every_parameter_with_its_default() -> None:
@@ -132,17 +132,6 @@ def test_the_parameter_file_gives_every_parameter_with_its_default() -> None:
     assert flat == {p.name: p.default for p in PARAMETERS}
     assert {k: type(v) for k, v in flat.items()} == {p.name: type(p.default) for p in PARAMETERS}
     assert all(line.lstrip().startswith("#") or ":" in line for line in text.splitlines() if line.strip())
-
-
-def test_the_node_starts_from_the_parameter_file(world: World, tmp_path: Path) -> None:
-    path = saved(by_hand(), tmp_path)
-    file = str(ROOT / "config" / "envelope_monitor.yaml")
-    process = world.start(
-        "monitor", "-c", "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())",
-        "--ros-args", "--params-file", file, "-p", f"model:={json.dumps(str(path))}",
-    )  # fmt: skip
-    until(lambda: world.status().get("state") == "active" or not process.running, "an active monitor")
-    assert process.running, process.output
 
 
 # --- lifecycle ----------------------------------------------------------------------------------------------
@@ -200,11 +189,6 @@ def test_a_lifecycle_manager_of_nav2_brings_it_up_and_down(world: World, tmp_pat
     assert not world.manage("configure") and world.state() == "finalized"
 
 
-def test_a_manager_gives_up_on_a_node_that_started_itself(world: World, tmp_path: Path) -> None:
-    world.monitor(saved(by_hand(), tmp_path))
-    assert not world.manage("configure") and world.state() == "active"
-
-
 # --- executors ----------------------------------------------------------------------------------------------
 
 
@@ -253,18 +237,16 @@ def test_what_may_be_destroyed_has_no_handlers_in_the_executor(world: World) -> 
         node.destroy_node()
 
 
-def test_publishers_that_return_under_another_quality_of_service_are_followed(world: World, tmp_path: Path) -> None:
-    """Twelve times over, with messages flowing: subscriptions with event callbacks are made and destroyed."""
-    model = by_hand()
-    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model)
+def test_publishers_that_return_under_another_quality_of_service_are_followed(bench: StartBench) -> None:
+    """Eight times over, with messages flowing: subscriptions with event callbacks are made and destroyed."""
+    on = bench()
+    world, process, flags, plant = on.world, on.process, on.flags, on.plant
     offers = [
         QoSProfile(depth=10, reliability=reliability, durability=durability)
         for reliability in (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE)
         for durability in (DurabilityPolicy.VOLATILE, DurabilityPolicy.TRANSIENT_LOCAL)
     ]
-    for turn in range(12):
+    for turn in range(8):
         world.node.destroy_publisher(plant.state)
         plant.state = world.publisher(JointState, STATE, offers[turn % 4])
         before, end = len(flags.messages), time.monotonic() + 20
@@ -276,12 +258,9 @@ def test_publishers_that_return_under_another_quality_of_service_are_followed(wo
     assert all(not m.position[0] == 1.0 for m in flags.messages), "a gap in what was heard was judged"
 
 
-def test_a_publisher_of_another_type_beside_the_right_one_does_no_harm(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1, state_timeout=30.0)
-    diagnostics = world.diagnostics()
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
+def test_a_publisher_of_another_type_beside_the_right_one_does_no_harm(bench: StartBench) -> None:
+    on = bench(state_timeout=30.0)
+    world, plant = on.world, on.plant
     plant.send(5)
     stranger = world.start(
         "stranger", "-c",
@@ -296,14 +275,14 @@ while True:
     time.sleep(0.01)
 """,
     )  # fmt: skip
-    diagnostics.reaches(1, saying=f"{STATE}: a publisher sends geometry_msgs/msg/TwistStamped, and sensor_msgs")
+    on.diagnostics.reaches(1, saying=f"{STATE}: a publisher sends geometry_msgs/msg/TwistStamped, and sensor_msgs")
     plant.send(5)
-    assert [m.position[0] for m in flags.count(10)[1:]] == [0.0] * 9
-    assert world.status()["received"][STATE] == 10 and process.running
+    assert on.flagged(10, since=1) == [0.0] * 9
+    assert world.status()["received"][STATE] == 10 and on.process.running
     stranger.kill()
     until(lambda: not world.status()["problems"], "the stranger to be gone")
     plant.send(3)
-    assert flags.count(13)[12].position[0] == 0.0
+    assert on.flagged(13)[12] == 0.0
 
 
 # --- simulated time -----------------------------------------------------------------------------------------
@@ -341,38 +320,12 @@ def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_pat
     until(lambda: abs(world.status()["now_ns"] - time.time_ns()) < 10**10, "wall time")
 
 
-# --- diagnostics --------------------------------------------------------------------------------------------
-
-
-def test_statuses_group_by_node_and_hardware(world: World, tmp_path: Path) -> None:
-    """Names `node: part`, as the aggregator's analyzers split them; the keys stay the same from report to report."""
-    model = by_hand()
-    world.monitor(
-        saved(model, tmp_path), "-r", "__ns:=/rig", name=f"/rig{NODE}", diagnostics_period=0.1, hardware_id="rig 7"
-    )
-    diagnostics = world.diagnostics()
-    plant = Plant(world, model).subscribed()
-    plant.send(30)
-    until(lambda: len(diagnostics.topic.messages) > 12, "reports")
-    for array in diagnostics.topic.messages:
-        assert array.header.stamp.sec > 0
-        assert [s.name for s in array.status] == [f"rig{NODE}: {part}" for part in ("monitor", "a", "b")]
-        assert {s.hardware_id for s in array.status} == {"rig 7"}
-        for status in array.status:
-            keys = [v.key for v in status.values]
-            assert len(set(keys)) == len(keys) and status.message
-    monitor = f"rig{NODE}: monitor"
-    until(lambda: Diagnostics.values(diagnostics.latest(monitor))["verdicts"] == "29", "a report on all verdicts")
-
-
 # --- what is lost on the way --------------------------------------------------------------------------------
 
 
-def test_messages_that_full_queues_push_out_are_counted_and_never_bridged(world: World, tmp_path: Path) -> None:
-    model = by_hand()
-    process = world.monitor(saved(model, tmp_path), **{"qos.depth": 5})
-    flags = world.listen(JointState, f"{NODE}/flags").connected()
-    plant = Plant(world, model).subscribed()
+def test_messages_that_full_queues_push_out_are_counted_and_never_bridged(bench: StartBench) -> None:
+    on = bench(**{"qos.depth": 5})
+    process, flags, plant = on.process, on.flags, on.plant
     judged = lambda: bool(flags.messages) and stamp_of(flags.messages[-1]) == plant.t_ns - STEP_NS  # noqa: E731
     plant.send(20)
     until(judged, "a verdict before it stops")
@@ -383,12 +336,11 @@ def test_messages_that_full_queues_push_out_are_counted_and_never_bridged(world:
         process.signal(signal.SIGCONT)
     plant.send(5)
     until(judged, "the last verdict")
-    status = world.status()
+    status, max_gap = on.world.status(), on.model.signals.max_gap
     for topic in (STATE, CONTROL):
         assert status["lost"][topic] > 50 and status["received"][topic] + status["lost"][topic] == 125
-    assert model.signals is not None and model.signals.max_gap is not None
     steps = [(stamp_of(b) - stamp_of(a), b) for a, b in pairwise(flags.messages)]
-    across = [flag for step, flag in steps if step * 1e-9 > model.signals.max_gap]
+    across = [flag for step, flag in steps if step * 1e-9 > max_gap]
     assert len(across) == status["counters"]["gaps"] >= 1, "what was lost is a gap"
     assert all(np.isnan(flag.position).all() for flag in across)
 
@@ -397,26 +349,8 @@ def test_messages_that_full_queues_push_out_are_counted_and_never_bridged(world:
 
 
 def test_paths_that_a_user_gives_are_those_of_the_user(world: World, tmp_path: Path) -> None:
-    """`~` is the home folder, which no shell puts in behind `:=`; a relative path to nothing is told with where."""
+    """`~` is the home folder, which no shell puts in behind `:=`."""
     saved(by_hand(), tmp_path)
     world.env["HOME"] = str(tmp_path)
-    process = world.monitor("~/hand.model.json", **{"snapshot.folder": "~/snapshots"})
+    world.monitor("~/hand.model.json", **{"snapshot.folder": "~/snapshots"})
     assert (tmp_path / "snapshots").is_dir() and world.status()["model"] == "~/hand.model.json"
-    for wrong in ("hand.model.json", "x" * 5000):
-        accepted, reason = world.set(model=wrong)
-        assert not accepted and reason.startswith(wrong[:100]) and len(reason) < 6000
-        assert reason.endswith(f"there is no such model file in {Path.cwd()}; give the whole path")
-    assert process.running and world.state() == "active"
-
-
-def test_snapshots_on_alarm_without_a_folder_are_refused(world: World, tmp_path: Path) -> None:
-    path = saved(by_hand(), tmp_path)
-    said = (
-        "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the node "
-        "with the other"
-    )
-    process = world.run_node("envelope_monitor", {"model": str(path), "snapshot.on_alarm": True})
-    process.says(f"not configured: {said}")
-    process.kill()
-    world.monitor(path)
-    assert world.set(**{"snapshot.on_alarm": True}) == (False, said)

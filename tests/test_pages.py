@@ -28,7 +28,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.horizon import Horizon
 from uncertain_lti.reports import pages
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES, findings
-from uncertain_lti.reports.pages import environment, html_report, interactive_page, plotted_check, plotted_transient
+from uncertain_lti.reports.pages import html_report, interactive_page, plotted_check, plotted_transient
 from uncertain_lti.validation.left_out import validate
 
 ASSETS = Path(pages.__file__).parent / "assets"
@@ -230,27 +230,6 @@ def test_a_report_of_very_much_stays_one_page():
     text = html_report(model, verdicts, findings(model, "m", verdicts))
     needs_nothing_else(text)
     assert len(text) < 8_000_000 and [r["name"] for r in data_of(text)][0] == "run 7" and "run 39" in text
-
-
-def test_names_break_between_words():
-    name = environment().filters["name"]
-    assert name("turbine_exit_total_pressure") == "turbine_<wbr>exit_<wbr>total_<wbr>pressure"
-    assert name("/a//b") == "/<wbr>a//<wbr>b" and Page(name(HOSTILE)).tags == {"wbr"}
-
-
-def test_bad_places_are_one_sentence(engine, tmp_path, capsys):
-    model, bag = str(engine / "m.model.json"), str(engine / "bad.mcap")
-    before = Path(bag).read_bytes(), Path(model).read_bytes()
-    for output, why in (
-        (bag, "is about"),
-        (model, "is about"),
-        (str(tmp_path), "is a folder"),
-        (str(tmp_path / "no" / "x.html"), "make it first"),
-    ):
-        assert main(["report", model, bag, "--output", output]) == 2
-        said = capsys.readouterr()
-        assert why in said.err and said.err.count("\n") == 1 and not said.out
-    assert (Path(bag).read_bytes(), Path(model).read_bytes()) == before
 
 
 # --- panels ----------------------------------------------------------------------------------------------------------

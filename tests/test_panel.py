@@ -14,7 +14,6 @@ import math
 import numpy as np
 import pytest
 import scipy.stats
-from tanks import Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
@@ -195,7 +194,7 @@ def test_a_single_recording_is_left_out_in_blocks_and_little_is_said_to_be_littl
     assert "not_learnt" in few.fit_summary["alarm"] and few.alarm == (AlarmRule(),)
 
 
-@pytest.mark.parametrize("steps", [20, 30, 45, 60])
+@pytest.mark.parametrize("steps", [20, 45])
 def test_few_steps_give_a_panel_or_a_reason(steps):
     run = plant(2, steps=steps)
     alarm = fit(Transient(run.t, run.x[:, :1], run.u)).fit_summary["alarm"]
@@ -285,12 +284,6 @@ def test_large_problems_are_armed_by_what_was_fitted(runs, monkeypatch):
     assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in runs)
 
 
-def test_the_file_keeps_the_alarm_and_its_promises(model, tmp_path):
-    model.save(tmp_path / "m.json")
-    again = UncertainLTI.load(tmp_path / "m.json")
-    assert again.alarm == model.alarm and again.fit_summary["alarm"] == model.fit_summary["alarm"]
-
-
 def test_states_that_are_blind_are_named(runs):
     """Worth and promises follow from the sizes alone."""
     from uncertain_lti.identification import fit as plain
@@ -317,26 +310,6 @@ def test_recordings_far_from_one_another_give_a_panel_that_promises_no_rate():
     assert alarm["hours"] == 0 and alarm["limit_per_hour"] is None
     assert "one stretch says nothing of their rate" in " ".join(alarm["promises"])
     assert alarm["promises"][-1].endswith("the recordings cannot show that; record more")
-
-
-@pytest.mark.slow
-def test_fresh_plants_keep_to_the_stated_limit_within_what_was_recorded():
-    """Three tanks whose coefficients are drawn, ten recordings: alarms that begin within the domain, on fresh ones.
-
-    `python benchmarks/validity.py` draws more of them.
-    """
-    kept = []
-    for seed in range(3):
-        tanks, noise = Tanks(seed, spread=0.2), 1e-3 * (seed % 2)
-        model = fit(tanks.transients(10, seed, noise=noise))
-        monitor, count, hours = EnvelopeMonitor(model), 0, 0.0
-        for run in tanks.transients(40, 50_000 + seed, noise=noise):
-            verdicts = monitor.check(run)
-            fresh = ~np.logical_or.accumulate(verdicts.outside_domain)
-            count += int(np.count_nonzero(np.diff((verdicts.alarm & fresh).astype(int), prepend=0) > 0))
-            hours += float(fresh.sum()) * DT / 3600
-        kept.append(count / max(hours, 1e-9) <= model.fit_summary["alarm"]["limit_per_hour"])
-    assert sum(kept) >= 2
 
 
 def test_recordings_in_which_no_state_moves_give_a_model_that_says_so() -> None:

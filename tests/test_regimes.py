@@ -29,7 +29,6 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
-from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import check_regimes, unknown_in_words
 from uncertain_lti.reports.findings import CARE, UNKNOWN
 from uncertain_lti.sampling.clock import Status
@@ -113,13 +112,6 @@ def recording(path: Path, strange: bool = False) -> Path:
 @pytest.fixture(params=CASES)
 def case(request: pytest.FixtureRequest) -> str:
     return str(request.param)
-
-
-def checked(model: UncertainLTI, strange: bool = False) -> Verdicts:
-    x, u, gear = arrays(strange)
-    t = START + STEP * np.arange(COUNT)
-    s = gear[:, None] if model.q else None
-    return EnvelopeMonitor(model).check(Transient(t, x, u, s=s, signals=model.signals, max_gap=0.2))
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:

@@ -13,7 +13,6 @@ import io
 import json
 import sys
 from contextlib import redirect_stdout
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ import pytest
 pytest.importorskip("scipy", reason="scipy, which the experiment needs, is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, is not installed")
 
-from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, UncertainLTI
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.plants.leibov import leibov2006, transient
@@ -43,9 +42,8 @@ def objective(model, transients):
     return total
 
 
-@pytest.mark.parametrize("steps, seed", [(80, 1), (400, 2)])
-def test_the_direct_search_contains_every_sample_and_never_beats_the_exact_solver(steps, seed):
-    runs = [transient(steps, seed), transient(steps, seed + 10)]
+def test_the_direct_search_contains_every_sample_and_never_beats_the_exact_solver():
+    runs = [transient(80, 1), transient(80, 11)]
     exact, found = fit(runs), direct_search(runs)
     monitor = EnvelopeMonitor(found.model)
     assert not any(monitor.check(run).violated.any() for run in runs)
@@ -66,11 +64,7 @@ def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
     assert [axes.get_title("left").split()[0] for axes in figure.axes] == [s.name for s in model.signals.states]
     save(figure, tmp_path / "f.png")
     narrower = UncertainLTI(model.A, model.B, 0.5 * model.dA, 0.5 * model.dB, signals=model.signals)
-    assert EnvelopeMonitor(narrower).check(replace_name(run)).violated.any()
-
-
-def replace_name(run):
-    return Transient(run.t_ns, run.x, run.u, signals=replace(run.signals, source="copy"))
+    assert EnvelopeMonitor(narrower).check(run).violated.any()
 
 
 def test_the_published_model_is_known_to_the_commands_by_name(capsys):

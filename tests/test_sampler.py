@@ -618,20 +618,6 @@ def test_a_topic_that_is_heard_first_in_the_second_pass_joins_no_pass_to_another
     assert len(judged) > 1900 and all(step.before[0] == step.before[1] for step in judged)
 
 
-def test_single_messages_of_another_time_leave_nothing_behind() -> None:
-    sampler = Sampler(two_topics())
-    for k in range(100, 500):
-        odd = {150: -100, 200: 100}.get(k, 0)  # one stamp too old, one too far ahead
-        sampler.push(*at("/u", k, k + odd))
-        sampler.push(*at("/c", k, k))
-        assert len(sampler.kept("/u")) <= (102 if 200 <= k < 300 else 2)
-    for k in range(500, 600):
-        odd = -100 if k == 550 else 0
-        sampler.push(*at("/u", k, k))
-        sampler.push(*at("/c", k, k + odd))
-        assert len(sampler.kept("/u")) <= (4 if 550 <= k <= 552 else 2)
-
-
 @settings(max_examples=60)
 @given(cases())
 def test_latest_changes_nothing_and_is_what_would_be_fixed_now(case: tuple[SignalMap, list[Sent]]) -> None:
@@ -707,22 +693,6 @@ def test_little_room_makes_values_missing_and_never_wrong(case: tuple[SignalMap,
         assert mine.status is theirs.status or mine.status is Status.MISSING
         for left, right in ((mine.x, theirs.x), (mine.u, theirs.u), (mine.x_next, theirs.x_next)):
             assert all(math.isnan(a) or a == b for a, b in zip(left, right, strict=True))
-
-
-def test_the_last_transition_of_a_pass_is_judged_though_a_state_topic_starts_the_next_pass_first() -> None:
-    signals = SignalMap(
-        (Signal("x", "/c", "data"), Signal("y", "/s", "data")),
-        clock="/c",
-        max_gap=0.05,
-        time={"/c": "header", "/s": "header"},
-    )
-    one = [m for k in range(10, 14) for m in (at("/s", k, k, float(k)), at("/c", k, k))]
-    again = [m._replace(arrival=m.arrival + 20 * TICK) for m in one]
-    far = [m._replace(stamp=m.stamp + 100 * TICK) for m in one]
-    for stream in (far + again, far + [again[0], again[2], again[1], *again[3:]]):
-        steps = only(run(signals, stream)[0])
-        assert [s.status for s in steps[:5]] == [Status.FIRST, Status.OK, Status.OK, Status.OK, Status.RESET]
-        assert steps[3].x_next.tolist() == [1.0, 13.0]
 
 
 def test_max_skew_that_limits_nothing_is_an_error() -> None:

@@ -23,7 +23,6 @@ from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.sampling.clock import Status
-from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal
 
 pytestmark = pytest.mark.numpy
@@ -74,11 +73,6 @@ def test_two_signals_without_a_sample_have_no_corners() -> None:
 
 def test_a_missing_value_has_no_weights() -> None:
     assert np.isnan(Schedule((SPEED,)).weights(np.array([[np.nan]]))).all()
-
-
-def test_a_schedule_comes_back_from_its_list() -> None:
-    schedule = Schedule((SPEED, GEAR))
-    assert Schedule.from_list(schedule.to_list()) == schedule
 
 
 @pytest.mark.parametrize(
@@ -179,15 +173,6 @@ def test_the_monitor_says_where_the_regime_is_unknown_and_gives_no_verdict_on_a_
     assert verdicts.outside_domain.tolist() == verdicts.unknown_regime.tolist()
     assert "no recording visited speed = 2, gear = 1" in model.why_unknown([2.0, 3.0, 0.0, 1.0])
     assert "speed = 9 is beyond its knots 2 to 5" in model.why_unknown([9.0, 3.0, 0.0, 4.0])
-    sampler_like = [
-        monitor.judge(Step(kind, 0, 0, 0.1, [*x[k - 1], 0.0, *s[k - 1]], x[k].tolist()))
-        for k, kind in enumerate(transient.statuses())
-        if k
-    ]
-    for k, verdict in enumerate(sampler_like, start=1):
-        assert verdict.status is kinds[k]
-        assert verdict.unknown_regime == verdicts.unknown_regime[k]
-        assert verdict.flags.tobytes() == verdicts.flags[k].tobytes()
 
 
 def test_a_free_run_follows_the_schedule() -> None:

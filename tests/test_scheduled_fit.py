@@ -189,9 +189,6 @@ def test_five_knots_reach_the_least_largest_width_and_its_ties():
         assert np.mean(half**2) / unit**2 < 1.05 * squares.value
 
 
-LEAST = Structure(2, 2, lower={"dA": np.array([[1e-3, 0.0], [0.0, 0.0]])})
-
-
 @pytest.mark.parametrize("weight", [1e-18, 1e18])
 def test_the_least_largest_width_whatever_the_weights(weight):
     transient = drawn(THREE, 1000, 8, noise=1e-4)
@@ -377,11 +374,18 @@ def test_a_knot_without_a_schedule_is_refused():
         ({"u1": (0, 1), "u2": (0, 1), "x1": (0, 1)}, "3 scheduling signals"),
         (7, "schedule is int"),
         (Schedule((Axis("speed", knots=(0.0, 1.0)),)), "speed"),
+        ({"u1": (1, -1)}, r"knots of 'u1' must increase, and are \[1.0, -1.0\]"),
+        ({"u3": 3}, "'u3' is constant"),
+        ({"u2": Modes([-1, 1])}, "drawn 2: 'u2' is 2 at t = .* a mode that the schedule does not list"),
     ],
 )
 def test_schedules_that_make_no_sense_are_refused(schedule, words):
+    """Of a control in units of its own, and a second one whose modes are -1, 1, 2; a third stands still."""
+    run = drawn(SCHEDULES["modes"], 300, 2)
+    run = Transient(run.t_ns, run.x, np.column_stack([run.u, np.ones(301)]), name=run.name)
+    point = OperatingPoint(np.zeros(2), np.array([0.5, 0.0, 0.0]), np.ones(2), np.array([2.0, 1.0, 1.0]))
     with pytest.raises(FitError, match=words):
-        fit(drawn(THREE, 300, 1), schedule=schedule)
+        fit(run, schedule=schedule, operating_point=point)
 
 
 def test_one_knot_of_a_further_signal_is_no_schedule():
@@ -391,30 +395,10 @@ def test_one_knot_of_a_further_signal_is_no_schedule():
     assert model.schedule is None and not model.signals.scheduling
 
 
-def test_knots_that_do_not_increase_are_named_in_recorded_units():
-    transient = drawn(THREE, 300, 1)
-    point = OperatingPoint(np.zeros(2), np.array([0.5, 0.0]), np.ones(2), np.array([2.0, 1.0]))
-    with pytest.raises(FitError, match=r"knots of 'u1' must increase, and are \[1.0, -1.0\]"):
-        fit(transient, operating_point=point, schedule={"u1": (1, -1)})
-
-
-def test_a_signal_that_stands_still_has_no_knots():
-    transient = drawn(THREE, 300, 1)
-    still = Transient(transient.t_ns, transient.x, np.column_stack([np.ones(301), transient.u[:, 1]]))
-    with pytest.raises(FitError, match="'u1' is constant"):
-        fit(still, schedule={"u1": 3})
-
-
 def test_one_knot_is_one_block():
     transient = drawn(THREE, 300, 1)
     model, one = fit(transient, schedule={"u1": 1}), fit(transient)
     assert model.schedule is None and (model.A == one.A).all() and (model.dA == one.dA).all()
-
-
-def test_a_mode_that_is_not_listed_is_named():
-    transient = drawn(SCHEDULES["modes"], 300, 2)
-    with pytest.raises(FitError, match="drawn 2: 'u2' is 2 at t = .* a mode that the schedule does not list"):
-        fit(transient, schedule={"u2": Modes([-1, 1])})
 
 
 def test_the_signals_file_schedules_a_fit():

@@ -84,26 +84,14 @@ def test_the_table_is_that_of_validate():
     assert left.model.schedule == model.schedule
 
 
-def test_a_linear_plant_keeps_one_knot():
-    model = fit(LINEAR, schedule={"x1": "auto"}, **options())
-    assert model.schedule is None
+@pytest.mark.parametrize("runs", [LINEAR, [run(3, 40)], [run(3, 150)], APART], ids=["linear", "40", "150", "apart"])
+def test_where_knots_do_not_pay_one_is_kept_and_the_reason_said(runs):
+    """A linear plant, little data, and recordings that visit different regimes."""
+    model = fit(runs, schedule={"x1": "auto"}, **options())
     (facts,) = model.fit_summary["schedule"]
-    assert facts["chosen"] == 1
-    assert "does not pay" in facts["reason"] and facts["reason"] in model.fit_summary["messages"][-1]
-
-
-@pytest.mark.parametrize("N", [40, 150])
-def test_little_data_keeps_one_knot(N):
-    model = fit(run(3, N), schedule={"x1": "auto"}, **options())
-    assert model.schedule is None
-    assert model.fit_summary["schedule"][0]["reason"]
-
-
-def test_recordings_that_visit_different_regimes_keep_one_knot_and_say_why():
-    model = fit(APART, schedule={"x1": "auto"}, **options())
-    assert model.schedule is None
-    (facts,) = model.fit_summary["schedule"]
+    assert model.schedule is None and facts["chosen"] == 1 and facts["reason"]
     assert facts["reason"] in model.fit_summary["messages"][-1]
+    assert "does not pay" in facts["reason"] or runs is not LINEAR
 
 
 def test_a_recording_unlike_all_others_excuses_nothing():
@@ -251,11 +239,6 @@ def test_the_public_fit_takes_what_the_identification_takes():
     chosen = {"criterion", "drop_horizons", "horizons", "widths", "alarm_rule"}  # here what they are chosen by
     assert [outer[name] for name in inner if name not in chosen] == [inner[n] for n in inner if n not in chosen]
     assert set(outer) - set(inner) == {"alarm", "false_alarms", "groups"}
-
-    parameters = inspect.getdoc(uncertain_lti.fit).split("Parameters\n----------\n")[1].split("\n\nReturns")[0]
-    described = {line.split(" : ")[0] for line in parameters.splitlines() if not line.startswith(" ")}
-    assert described == set(outer), "the public fit is where each parameter is described"
-    assert "As in" not in parameters
 
 
 def test_validate_keeps_the_knots_of_the_model():

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -21,16 +20,11 @@ from conftest import ROOT
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from ros_processes import World, open_world, until
+from ros_processes import World, until
+from ros_processes import world as world
 from test_live import by_hand, saved
 
 NODE = "envelope_monitor"
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with open_world(tmp_path) as world:
-        yield world
 
 
 def allowed(kind: str, qualifier: str) -> set[str]:
@@ -48,8 +42,7 @@ def allowed(kind: str, qualifier: str) -> set[str]:
     return set(found)
 
 
-@pytest.mark.parametrize("simulated", [False, True])
-def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp_path: Path, simulated: bool) -> None:
+def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp_path: Path) -> None:
     model = by_hand()
     topics = {"/plant/state": "/engine/state", "/plant/control": "/engine/control"}
     signals = replace(
@@ -60,7 +53,7 @@ def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp
         time={topics[t]: source for t, source in model.signals.time.items()},
     )
     model = type(model)(model.A, model.B, model.dA, model.dB, signals=signals, sampling=model.sampling)
-    world.monitor(saved(model, tmp_path), use_sim_time=simulated)
+    world.monitor(saved(model, tmp_path), use_sim_time=True)
     node = world.node
 
     def names(found: list[tuple[str, list[str]]]) -> set[str]:
@@ -73,7 +66,7 @@ def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp
 
     until(lambda: subscribed() >= {"/engine/state", "/engine/control"}, "the subscriptions in the graph")
     until(lambda: allowed("service", "reply") <= names(node.get_service_names_and_types_by_node(NODE, "/")), "services")
-    assert subscribed() == allowed("topic", "subscribe") - (set() if simulated else {"/clock"})
+    assert subscribed() == allowed("topic", "subscribe")
     assert names(node.get_publisher_names_and_types_by_node(NODE, "/")) == allowed("topic", "publish")
     assert names(node.get_service_names_and_types_by_node(NODE, "/")) == allowed("service", "reply")
     assert names(node.get_client_names_and_types_by_node(NODE, "/")) == allowed("service", "request") == set()

@@ -169,25 +169,6 @@ def test_a_name_that_moves_in_the_name_array_is_followed(side: str) -> None:
         assert value == 1.0 if 1 in order else math.isnan(value)
 
 
-@both
-def test_absent_says_what_is_there(side: str) -> None:
-    message = MESSAGES[side]("sensor_msgs/msg/JointState", JOINTS)
-    there = ", ".join(JOINTS["name"])
-    assert FieldPath("position[hub]").absent(message) == (
-        f"there is no 'hub' in the message's names; names there: {there}"
-    )
-    count = len(JOINTS["position"])
-    assert FieldPath("position[99]").absent(message) == (
-        f"'position' has {count} elements in the message; elements there: 0 to {count - 1}"
-    )
-    assert "elements there: 0 to 1" in FieldPath("velocity[left wheel]").absent(message)
-    empty = MESSAGES[side]("sensor_msgs/msg/JointState", JOINTS | {"effort": []})
-    for field in ("effort[0]", "effort[fan]"):
-        assert FieldPath(field).absent(empty) == "'effort' has no element in the message; choose a field that is filled"
-    for field in ("position[fan]", "position[0]", "header.stamp.sec"):
-        assert FieldPath(field).absent(message) == ""
-
-
 # --- angles -------------------------------------------------------------------------------------------------
 
 angle = st.floats(-3.1, 3.1)
@@ -377,13 +358,6 @@ def test_what_is_not_said_has_the_stated_defaults(tmp_path: Path) -> None:
     assert signals.states == (Signal("x", "/a", "data", 0.0, 1.0, "", "", None, 0),)
 
 
-def test_a_judged_control_has_a_row_behind_those_of_the_states(tmp_path: Path) -> None:
-    signals = SignalMap.load(saved(tmp_path, control("judged: true, max_hold: 0.5")))
-    assert [s.name for s in signals.states] == ["x", "u"] and signals.controls == ()
-    assert (signals.longest_age(1), signals.states[1].judged) == (0.5, True)
-    assert SignalMap.load(saved(tmp_path, control("judged: false"))).controls[0].name == "u"
-
-
 def test_every_shipped_signals_file_loads(signals_folder: Path) -> None:
     files = sorted(signals_folder.glob("*.yaml"))
     assert len(files) >= 6
@@ -559,10 +533,3 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
 
     read = construct(compose("{a: 010, b: 1:30, c: 1_000, d: 10, f: -0.5, g: 0x10, h: 0}"))
     assert read == {"a": "010", "b": "1:30", "c": "1_000", "d": 10, "f": -0.5, "g": 16, "h": 0}
-
-
-def test_a_unit_of_the_table_that_is_a_list(tmp_path):
-    from uncertain_lti.signals.values import TableLayout
-
-    with pytest.raises(SignalError, match="unit is \\['ms'\\]"):
-        TableLayout.from_dict({"unit": ["ms"]}, "table")

@@ -79,13 +79,6 @@ def test_bad_input_gets_one_sentence(folder, capsys, words, sentence):
     assert said.err.startswith("uncertain-lti start: ") and sentence in said.err
 
 
-def test_a_recording_that_cannot_be_reported_on_ends_with_its_reason(folder, capsys):
-    (folder / "broken.mcap").write_bytes(b"nothing")
-    assert main(["start", *HEALTHY, "--check", "broken.mcap"]) == 2
-    said = capsys.readouterr().err
-    assert "broken.mcap" in said and "Traceback" not in said
-
-
 def test_what_is_to_note_of_a_recording_is_said_once(folder, capsys):
     whole = (folder / HEALTHY[0]).read_bytes()
     (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])

@@ -269,25 +269,6 @@ def steps_of(run: Transient) -> list[Step]:
     return found
 
 
-@pytest.mark.parametrize(("masked", "relative"), [((), True), (("x2",), True), (("x2",), False)])
-def test_offline_is_live(masked: tuple[str, ...], relative: bool) -> None:
-    monitor = EnvelopeMonitor(model(RULES, relative=relative), masked=masked)
-    run = a_run(1)
-    verdicts = monitor.check(run)
-    assert verdicts.alarm.any() and not verdicts.alarm.all()
-    assert verdicts.rule_alarms.any(axis=0).all(), "every rule raises the alarm somewhere"
-    assert verdicts.statistics.shape == (400, 16) and verdicts.statistic_names[0] == "energy/x1"
-    assert verdicts.statistic_names[-4:] == ("chi2/joint", "mewma/joint", "chi2@4/joint", "mewma@4/joint")
-    live = EnvelopeMonitor(model(RULES, relative=relative), masked=masked)
-    for k, step in enumerate(steps_of(run)):
-        verdict = live.judge(step)
-        assert verdict.alarm == verdicts.alarm[k]
-        assert verdict.statistics.tobytes() == verdicts.statistics[k].tobytes()
-        assert verdict.raised == verdicts.raised(k)
-        assert bool(verdict.raised) == (verdict.alarm and verdict.judged)
-    assert not monitor.alarm, "check leaves the live alarm alone"
-
-
 def test_a_masked_state_does_not_count() -> None:
     run = a_run(2, drift=0.0)
     x = run.x.copy()
@@ -302,27 +283,19 @@ def test_a_masked_state_does_not_count() -> None:
     assert "x2" not in names and "x1" in names
 
 
-def test_the_alarm_says_which_rule_state_and_value() -> None:
-    monitor = EnvelopeMonitor(model([AlarmRule(50, 50), StatisticRule("mean", 0.05, 0.5)]))
-    x = np.zeros((12, 3))
-    x[:, 2] = [0.0, *(-0.24 * np.arange(1, 12))]
-    verdicts = monitor.check(Transient(np.arange(12) * 0.01, x, np.zeros((12, 1))))
-    first = int(np.argmax(verdicts.alarm))
-    (why,) = verdicts.raised(first)
-    assert (why.label, why.kind, why.horizon, why.state) == ("mean", "mean", 1, "x3") and why.value < -1
-    assert "mean of x3 at 1" in why.words and "its threshold" in why.words
-    assert verdicts.raised(0) == ()
-
-
-def test_check_says_what_raised_the_alarm() -> None:
+def test_the_alarm_says_which_rule_state_and_value_and_so_does_check() -> None:
     given = model([AlarmRule(50, 50), StatisticRule("mean", 0.05, 0.5)])
     x = np.zeros((12, 3))
     x[:, 2] = [0.0, *(-0.24 * np.arange(1, 12))]
     run = Transient(np.arange(12) * 0.01, x, np.zeros((12, 1)), state_names=["x1", "x2", "x3"], control_names=["u1"])
-    data = check_data(given, EnvelopeMonitor(given).check(run))
-    (why,) = data["alarms"][0]["raised"]
-    assert (why["rule"], why["state"], why["horizon"]) == ("mean", "x3", 1) and why["value"] < -1
-    assert f"raised by {why['words']}" in check_text(data)
+    verdicts = EnvelopeMonitor(given).check(run)
+    (why,) = verdicts.raised(int(np.argmax(verdicts.alarm)))
+    assert (why.label, why.kind, why.horizon, why.state) == ("mean", "mean", 1, "x3") and why.value < -1
+    assert "mean of x3 at 1" in why.words and "its threshold" in why.words and verdicts.raised(0) == ()
+    data = check_data(given, verdicts)
+    (said,) = data["alarms"][0]["raised"]
+    assert (said["rule"], said["state"], said["horizon"], said["words"]) == ("mean", "x3", 1, why.words)
+    assert f"raised by {why.words}" in check_text(data)
     assert "alarm: mean of the utilisation over 0.05 s above 0.5" in model_text(given)
 
 

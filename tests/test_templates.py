@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -121,9 +120,3 @@ def test_own_leaves_each_state_its_own_signals_and_those_of_none() -> None:
     assert all(model.B[i, i] >= 0 for i in range(3))
     more = fit(with_memories(run, {"j1_before": ("j1", Memory("lag"))}))
     assert np.flatnonzero(more.B[:, -1]).tolist() == [1, 3] and not more.dB[[0, 2], -1].any()
-
-
-def test_twelve_joints_take_three_lines(signals_folder: Path) -> None:
-    signals = SignalMap.load(signals_folder / "go2.yaml")
-    assert (len(signals.states), len(signals.controls), len(signals.structure)) == (24, 12, 24 * 33)
-    assert len((signals_folder / "go2.yaml").read_text().splitlines()) < 15

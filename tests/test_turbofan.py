@@ -21,7 +21,7 @@ from turbofan_fleet import simulate_fleet
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan_gas as gas
-from uncertain_lti.plants.turbofan import CONTROLS, STATES, Engine, GasPathSolver, Health, engine
+from uncertain_lti.plants.turbofan import CONTROLS, Engine, GasPathSolver, Health, engine
 from uncertain_lti.plants.turbofan_gas import T_STANDARD
 from uncertain_lti.plants.turbofan_runs import (
     DT,
@@ -117,11 +117,10 @@ def test_maximum_regime_is_an_engine_of_its_class():
     assert 0.68 < p.specific_consumption < 0.79
 
 
-@pytest.mark.parametrize("pla", [68.0, 60.0])
-def test_controls_act_as_they_do_on_an_engine(plant, pla):
-    point, t = operating_point(), trim(pla)
-    B = plant.linearise(t.x, t.u, point.X, point.U)[1]
-    gain = -np.linalg.solve(plant.linearise(t.x, t.u, point.X, point.U)[0], B)
+def test_controls_act_as_they_do_on_an_engine(plant):
+    point, t = operating_point(), trim(60.0)
+    A, B = plant.linearise(t.x, t.u, point.X, point.U)
+    gain = -np.linalg.solve(A, B)
     fuel, area, fan_vane, _ = gain.T
     assert (fuel > 0).all()  # more fuel: faster, hotter, more pressure
     assert area[0] > 0 and area[3] < 0 and area[4] < 0  # a wider nozzle unloads the turbine: the fan runs faster
@@ -273,16 +272,6 @@ def test_impossible_requests_are_refused_in_a_sentence(plant):
             call()
 
 
-def test_the_gas_path_does_not_depend_on_where_the_solver_comes_from(plant):
-    t, far = trim(62.0), trim(25.0)
-    solver = GasPathSolver(plant)
-    cold = plant.gas_path(t.x.tolist(), t.u.tolist())
-    solver.solve(far.x.tolist(), far.u.tolist(), Health())
-    warm = plant.gas_path(t.x.tolist(), t.u.tolist(), solver=solver)
-    for name in ("P3", "P5", "T5", "W2", "thrust"):
-        assert getattr(warm, name) == pytest.approx(getattr(cold, name), rel=1e-10)
-
-
 # --- shipped recordings -------------------------------------------------------------------------------------
 
 
@@ -295,11 +284,10 @@ def test_the_signals_file_says_what_the_plant_is():
     assert (read.clock, read.max_gap, dict(read.time)) == (made.clock, made.max_gap, dict(made.time))
 
 
-@pytest.mark.parametrize("name", ["turbofan_check", "turbofan_pulses_up"])
-def test_a_recording_holds_what_a_simulation_gives(name):
+def test_a_recording_holds_what_a_simulation_gives():
     """Read from the bag that two processes made, beside the same run made here: stamps, readings and commands."""
-    (bag,) = read_transients(ROOT / "bags" / f"{name}.mcap", ROOT / "config/signals/turbofan.yaml")
-    made = simulate(make_run(**RECORDINGS[name]))
+    (bag,) = read_transients(ROOT / "bags/turbofan_check.mcap", ROOT / "config/signals/turbofan.yaml")
+    made = simulate(make_run(**RECORDINGS["turbofan_check"]))
     assert bag.t_ns[0] == START_NS
     assert np.array_equal(bag.t_ns, made.t_ns)
     assert bag.usable.all()
@@ -325,22 +313,3 @@ def test_every_recording_is_shipped_and_says_what_happens_in_it():
             assert notes["what happens"] == KINDS[parameters["fault"]]
         assert set(Bag(path).topics) == {"/engine/state", "/engine/control"}
     assert sum(p.stat().st_size for p in (ROOT / "bags").iterdir()) < 4 * 2**20
-
-
-@pytest.mark.slow
-def test_what_node_and_recorder_write_is_the_simulation(tmp_path):
-    """Two processes: bit for bit the same stamps and readings."""
-    pytest.importorskip("rclpy", reason="neither a ROS 2 installation nor the rclpy wheels are here")
-    from ros_processes import open_world
-
-    bag = tmp_path / "run.mcap"
-    with open_world(tmp_path) as world:
-        recorder = world.command("record", "/engine/state", "/engine/control", "--output", bag)
-        world.run_node("turbofan", {"manoeuvre": "check", "noise": 1e-4, "seed": 9, "rate": 4.0}).succeed()
-        recorder.signal(2)
-        recorder.succeed()
-    (read,) = read_transients(bag, ROOT / "config/signals/turbofan.yaml")
-    made = simulate(make_run("check", noise=1e-4, seed=9))
-    assert len(read) == 101 and np.array_equal(read.x, made.x) and np.array_equal(read.t_ns, made.t_ns)
-    assert np.array_equal(read.u[:-1], made.u[:-1])
-    assert list(read.state_names) == list(STATES)

@@ -17,6 +17,7 @@ from math import comb
 import numpy as np
 import pytest
 import validity
+from bag_writer import record
 from engine_bag import engine_bag
 from scipy import stats
 from tanks import Tanks
@@ -28,6 +29,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.alarm import back_and_restarts
+from uncertain_lti.recordings.bag_files import metadata_pairs
 from uncertain_lti.reports.model_text import validation_text
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
 from uncertain_lti.validation.left_out import cut, remaining_spans, validate
@@ -258,14 +260,14 @@ def test_few_recordings_are_said_to_say_little(runs):
     data = validate(runs[:3], additive="noise").to_dict()
     assert any("3 recordings say little" in note for note in data["notes"])
     assert "not enough transients" in data["scenario"]["words"] and "interval" not in data["scenario"]
-    many = validate(Tanks().transients(40, seed=9, noise=1e-3), additive="noise").to_dict()
+    many = validate(Tanks().transients(40, seed=9, noise=1e-3, steps=50), additive="noise").to_dict()
     assert "drawn independently" in many["scenario"]["words"]
     low, high = many["scenario"]["interval"]
     assert 0 < low < 1 - many["parts_inside_share"] < high < 0.9
 
 
 def test_discards_are_counted_as_recordings():
-    runs = Tanks().transients(45, seed=10, noise=1e-3)
+    runs = Tanks().transients(45, seed=10, noise=1e-3, steps=40)
     data = validate(runs[:35], additive="noise", discard=2).to_dict()
     assert "not enough transients" in data["scenario"]["words"]  # 27 unknowns and 2 discards
     assert any("may discard 2" in note for note in data["notes"])
@@ -318,8 +320,6 @@ def test_groups_of_one_recording_are_single_recordings(runs, validation):
 
 
 def test_the_condition_stands_beside_every_interval(days):
-    from uncertain_lti.reports.model_text import validation_text
-
     runs, names = days
     for groups, what in ((None, "recordings"), (names, "groups")):
         validation = validate(runs, groups=groups, additive="noise")
@@ -434,22 +434,17 @@ def test_fit_prints_and_stores_what_leaving_out_gives(folder, capsys):
 
 def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     """Folder, metadata and name group; what the fit was told, validate goes by."""
-    from uncertain_lti.recordings.bag_files import metadata_pairs
-
     bags = []
     for seed in range(6):
         place = folder / f"day{seed % 3}"
         place.mkdir(exist_ok=True)
         bags.append(place / f"run{seed}_m{seed % 2}.mcap")
-        engine_bag(bags[-1], seed=seed)
-        with open(bags[-1], "rb") as stream:
-            content = stream.read()
+        content = engine_bag(bags[-1], seed=seed).read_bytes()
         pairs = b"".join(len(w).to_bytes(4, "little") + w for w in (b"machine", f"M{seed // 2}".encode()))
-        body = (5).to_bytes(4, "little") + b"about" + len(pairs).to_bytes(4, "little") + pairs
-        record = b"\x0c" + len(body).to_bytes(8, "little") + body
+        about = (5).to_bytes(4, "little") + b"about" + len(pairs).to_bytes(4, "little") + pairs
         header = 8 + 9 + int.from_bytes(content[9:17], "little")
         # the footer's places no longer fit, so it goes: a file that was cut is read all the same
-        bags[-1].write_bytes(content[:header] + record + content[header:-37])
+        bags[-1].write_bytes(content[:header] + record(12, about) + content[header:-37])
         assert metadata_pairs(bags[-1]) == {"machine": f"M{seed // 2}", "about/machine": f"M{seed // 2}"}
     model = str(folder / "grouped.json")
     command = ["fit", *map(str, bags), "--signals", str(folder / "signals.yaml"), "--output", model, "--force"]
@@ -457,15 +452,18 @@ def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     capsys.readouterr()
     assert main([*command]) == 0
     assert "lie in 3 folders" in capsys.readouterr().out
-    for key, counted in (("folder", 3), ("metadata=machine", 3), ("name=_m(\\d)", 2)):
-        assert main([*command, "--group", key]) == 0
-        printed = capsys.readouterr().out
-        assert f"left out one group at a time (6 recordings in {counted} groups, by {key})" in printed
-        assert "lie in 3 folders" not in printed
-    assert main(["validate", model]) == 0
-    assert f"{counted} groups, by {key}" in capsys.readouterr().out
-    assert main(["validate", model, "--group", "none"]) == 0
-    assert "groups, by" not in capsys.readouterr().out
+    assert main([*command, "--group", "metadata=machine"]) == 0
+    printed = capsys.readouterr().out
+    assert "left out one group at a time (6 recordings in 3 groups, by metadata=machine)" in printed
+    assert "lie in 3 folders" not in printed
+    for more, said in (
+        ([], "3 groups, by metadata=machine"),
+        (["--group", "folder"], "3 groups, by folder"),
+        (["--group", "name=_m(\\d)"], "2 groups, by name=_m(\\d)"),
+        (["--group", "none"], "one recording at a time"),
+    ):
+        assert main(["validate", model, *more]) == 0
+        assert said in capsys.readouterr().out
     assert main([*command, "--group", "metadata=pilot"]) == 2
     said = capsys.readouterr().err
     assert "no 'pilot' to group by; there is about/machine, machine" in said.splitlines()[-1]
