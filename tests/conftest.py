@@ -42,7 +42,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What another numpy can change: arithmetic, files, the kernel, and the node, as ROS on Ubuntu has numpy 1.26.
 _NUMPY = """
-    cdr_arrays kernel live mcap_batches model monitor operating_point reading sampler signals transient
+    cdr_arrays kernel model monitor node_stream operating_point reading sampler signals transient
 """.split()
 
 
