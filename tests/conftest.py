@@ -47,7 +47,7 @@ _NUMPY = """
 
 
 # Their fixtures cost more than their tests: side by side each worker would make them again.
-_TOGETHER = "archive packaging progress reproduce turbofan validation".split()
+_TOGETHER = "archive containers injected_faults packaging progress reproduce turbofan validation".split()
 
 # They wait for processes of ROS 2 most of the time: half of the workers do, while the others compute.
 _WAITING = "live monitor_faults node_interface other_vendor play_record security_policy".split()

@@ -255,7 +255,7 @@ def assert_same(path: Path, signals: SignalMap) -> tuple[Any, ...]:
     return by_message
 
 
-@examples(100)
+@examples(60)
 @given(
     tops=st.lists(types(), min_size=1, max_size=3),
     seed=st.integers(0, 2**32),

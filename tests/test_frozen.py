@@ -229,23 +229,35 @@ def test_what_does_not_need_a_frozen_state_is_judged_on(masked: tuple[str, ...])
     same_as_live(model, transient, masked=masked)
 
 
+NOISY = [0.0], [0.0], [0.0], [LARGEST]
+
+
 @pytest.mark.parametrize(
-    ("repeats", "steps"),
+    ("repeats", "dt", "rate", "steps"),
     [
-        (([60.0], [1.0], [LARGEST], [LARGEST]), 5),  # beyond twice what was reached, half a half-width a step
-        (([60.0], [0.25], [LARGEST], [LARGEST]), 3),  # and beyond the half-width
-        (([60.0], [LARGEST], [LARGEST], [LARGEST]), None),  # it ran as far in the fit, of a half-width of 0
-        (([1.0],), 5),  # not known how far: after the longest repeat
+        (([60.0], [1.0], [LARGEST], [LARGEST]), 0.25, 1.0, 5),  # beyond twice what was reached, half a width a step
+        (([60.0], [0.25], [LARGEST], [LARGEST]), 0.25, 1.0, 3),  # and beyond the half-width
+        (([60.0], [LARGEST], [LARGEST], [LARGEST]), 0.25, 1.0, None),  # it ran as far in the fit, of a half-width of 0
+        (([1.0],), 0.25, 1.0, 5),  # not known how far: after the longest repeat
+        # a coarse sensor repeats while the machine moves, up to twice the longest of the fit, however far it ran
+        *((([longest], [0.1], [0.1], [LARGEST]), 0.01, 500.0, steps) for longest, steps in ((0.05, 11), (0.0, 1))),
+        (([60.0], [0.1], [0.1], [LARGEST]), 0.01, 500.0, 26),
+        # by noise alone: half a second of a slow state and a quarter of a fast one, if 5000 steps have shown it
+        ((*NOISY, [5000.0]), 0.5, 0.0, 1),
+        ((*NOISY, [5000.0]), 0.25, 0.0, 2),
+        ((*NOISY, [4999.0]), 0.25, 0.0, 3),
+        ((*NOISY, [1000.0]), 0.01, 0.0, 25),
+        ((*NOISY, [999.0]), 0.01, 0.0, None),
     ],
 )
-def test_a_run_is_frozen_beyond_twice_what_was_recorded(repeats: Any, steps: int | None) -> None:
-    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=Repeats(*repeats))
-    x = np.concatenate([np.linspace(5.0, 4.0, 5), np.full(20, 4.0)])[:, None]
-    verdicts = EnvelopeMonitor(model).check(Transient(0.25 * np.arange(25), x, np.ones((25, 1))))
-    told = np.flatnonzero(verdicts.frozen)
-    assert told.tolist() == ([] if steps is None else list(range(4 + steps, 25)))
-    for (k, _), why in verdicts.why_frozen.items():
-        assert k >= told[0] and why.startswith("while the model moves it by ")
+def test_a_state_that_stops_is_frozen_beyond_what_was_recorded(
+    repeats: Any, dt: float, rate: float, steps: int | None
+) -> None:
+    model = UncertainLTI([[0.0]], [[rate]], [[0.0]], [[0.0]], v=[0.5], repeats=Repeats(*repeats))
+    x = np.concatenate([np.linspace(5.0, 4.0, 20), np.full(60, 4.0)])[:, None]
+    verdicts = EnvelopeMonitor(model).check(Transient(dt * np.arange(80), x, np.ones((80, 1))))
+    assert np.flatnonzero(verdicts.frozen).tolist() == ([] if steps is None else list(range(19 + steps, 80)))
+    assert all(not rate or why.startswith("while the model moves it by ") for why in verdicts.why_frozen.values())
 
 
 def test_a_sum_counts_where_another_state_has_moved_by_more_than_its_half_width() -> None:
@@ -413,22 +425,6 @@ def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -
     assert verdicts.repeating[32:].all() and not verdicts.frozen.any()
 
 
-@pytest.mark.parametrize(
-    ("dt", "known", "first"),
-    [(0.5, 5000.0, 1), (0.25, 5000.0, 2), (0.25, 4999.0, 3), (0.01, 1000.0, 25), (0.01, 999.0, None)],
-)
-def test_a_noisy_state_is_frozen_after_half_a_second_of_a_slow_one_and_a_quarter_of_a_fast(
-    dt: float, known: float, first: int | None
-) -> None:
-    """If 5000 steps have shown the noise; else three steps are, and of fewer than 1000 nothing is known."""
-    repeats = Repeats([0.0], [0.0], [0.0], [LARGEST], [known])
-    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
-    x = np.concatenate([np.linspace(1.0, 1.1, 20), np.full(40, 1.1)])[:, None]
-    frozen = EnvelopeMonitor(model).check(Transient(dt * np.arange(60), x, np.zeros((60, 1)))).frozen
-    assert np.flatnonzero(frozen).tolist() == ([] if first is None else list(range(19 + first, 60)))
-    assert UncertainLTI.from_dict(model.to_dict()).to_dict() == model.to_dict()
-
-
 def test_a_parked_machine_is_not_frozen_by_its_noise() -> None:
     """Every state repeats there; one alone does not, whatever the others do before they stop."""
     repeats = Repeats([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [LARGEST] * 2, [5000.0] * 2)
@@ -457,18 +453,6 @@ def test_noise_is_known_of_states_whose_values_never_recur(recur: bool) -> None:
     explained = UncertainLTI([[-0.3]], [[0.3]], [[0.0]], [[0.0]], v=[0.5])
     exact = Transient(np.arange(30.0), 0.7 ** np.arange(30.0)[:, None], np.zeros((30, 1)))
     assert repeats_of(explained, [exact]).noisy_steps.tolist() == [0.0]
-
-
-def test_a_short_repeat_is_usual_up_to_twice_the_longest_of_the_fit() -> None:
-    """A coarse sensor repeats while the machine moves: a chance, however far the model says."""
-    u = np.full((100, 1), 5.0)
-    x = np.concatenate([np.arange(50.0), np.full(50, 49.0)])[:, None]
-    transient = Transient(0.01 * np.arange(100), x, u)
-    for longest, steps in ((0.05, 11), (0.0, 1), (60.0, 26)):
-        repeats = Repeats([longest], [0.1], [0.1], [LARGEST])
-        model = UncertainLTI([[0.0]], [[100.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
-        frozen = EnvelopeMonitor(model).check(transient).frozen[:, 0]
-        assert np.flatnonzero(frozen)[0] == 49 + steps and frozen[49 + steps :].all()
 
 
 def test_a_slow_sensor_repeats_regularly() -> None:

@@ -24,10 +24,10 @@ import pytest
 def test_damage_gives_a_clear_error_or_a_correct_reading(kind: str) -> None:
     if kind == "messages":
         pytest.importorskip("rclpy", reason="rclpy, whose reading layouts are held against, is not installed")
-    outcome = fuzz.run(kind, first=20_000, count=40)
+    outcome = fuzz.run(kind, first=20_000, count=20)
     assert not outcome.failures, "\n".join(outcome.failures)
-    assert sum(outcome.counts.values()) == 40
-    assert outcome.counts["read"] > 8 and outcome.counts["refused"] > 1, "the damage is too small or too great"
+    assert sum(outcome.counts.values()) == 20
+    assert outcome.counts["read"] > 4 and outcome.counts["refused"] > 1, "the damage is too small or too great"
 
 
 def framed(

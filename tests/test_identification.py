@@ -52,6 +52,10 @@ def small_plant(seed, n=2, m=1):
     )
 
 
+def objective(model):
+    return np.asarray(model.fit_summary["objective"])
+
+
 def count_outside(model, transients):
     """Transition by transition with `bounds`, independent of the vectorised path of the fit."""
     outside = 0
@@ -111,7 +115,7 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
     model = fit(transient, criterion, weights, additive)
     problem = assemble([transient], OperatingPoint.identity(n, 2), weights, additive)
     _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL, **CLARABEL)
-    assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
+    assert np.atleast_1d(objective(model)) == pytest.approx(expected, rel=1e-6)
     assert model.fit_summary["optimality_gap"] < 1e-7
     # and the number stored is that of the bounds themselves
     width = widths(model, transient)
@@ -121,7 +125,7 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
     else:
         diagonal = np.diagonal(W, axis1=1, axis2=2) if kind == "full" else W
         stored = np.max(np.sqrt(diagonal) * width, axis=0)
-    assert np.asarray(model.fit_summary["objective"]) == pytest.approx(stored, rel=1e-9)
+    assert objective(model) == pytest.approx(stored, rel=1e-9)
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
@@ -134,7 +138,7 @@ def test_large_problem_reaches_the_same_optimum(criterion, held, monkeypatch):
     model = fit(transient, criterion, additive="noise")
     problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
     _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL if criterion == "qp" else cp.HIGHS)
-    assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
+    assert np.atleast_1d(objective(model)) == pytest.approx(expected, rel=1e-6)
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
 
 
@@ -145,9 +149,7 @@ def test_both_methods_agree_and_contain(criterion):
     assert count_outside(model, [transient]) == 0
     other = fit(transient, criterion)
     # OSQP stops at its tolerance, and the repair pays for what it left outside
-    assert np.asarray(model.fit_summary["objective"]) == pytest.approx(
-        np.asarray(other.fit_summary["objective"]), rel=1e-4
-    )
+    assert objective(model) == pytest.approx(objective(other), rel=1e-4)
 
 
 def test_ties_of_the_linear_programme_are_broken_as_stated():
@@ -220,9 +222,7 @@ def test_operating_point_only_changes_units():
         plain = fit(transient, criterion, additive="noise")
         same = fit(scaled, criterion, additive="noise", operating_point=point)
         assert same.A == pytest.approx(plain.A, rel=1e-4, abs=1e-4)
-        assert np.asarray(same.fit_summary["objective"]) == pytest.approx(
-            np.asarray(plain.fit_summary["objective"]), rel=1e-6
-        )
+        assert objective(same) == pytest.approx(objective(plain), rel=1e-6)
         assert same.fit_summary["mean_width_recorded"] == pytest.approx(plain.fit_summary["mean_width"] * X, rel=1e-4)
 
 
