@@ -24,6 +24,7 @@ A block is run by its language. Comments above it say more:
 """
 
 import contextlib
+import fcntl
 import html
 import io
 import os
@@ -284,13 +285,19 @@ def test_what_is_shown_is_compared_number_by_number():
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    """signals.yaml and engine.model.json, made by the commands of the tutorial."""
-    folder = tmp_path_factory.mktemp("made")
-    reader = Reader(folder / "checkout", domain=1)  # nothing of it starts a node
-    tutorial = [b for b in blocks(ROOT / "docs/tutorial.md") if b.language == "sh" and "not run" not in b.marks]
-    for block in tutorial:
-        if "init" in block.text or "max_hold" in block.text or "uncertain-lti fit" in block.text:
-            reader.follow(block)
+    """signals.yaml and engine.model.json, made by the commands of the tutorial, once for all workers of a run."""
+    run = os.environ.get("PYTEST_XDIST_TESTRUNUID")
+    folder = tmp_path_factory.getbasetemp().parent / f"made-{run}" if run else tmp_path_factory.mktemp("made")
+    folder.mkdir(exist_ok=True)
+    with open(folder / "lock", "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if (folder / "checkout").exists():
+            return folder / "checkout"
+        reader = Reader(folder / "checkout", domain=1)  # nothing of it starts a node
+        for block in blocks(ROOT / "docs/tutorial.md"):
+            wanted = any(word in block.text for word in ("init", "max_hold", "uncertain-lti fit"))
+            if block.language == "sh" and "not run" not in block.marks and wanted:
+                reader.follow(block)
     return reader.folder
 
 
