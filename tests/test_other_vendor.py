@@ -89,7 +89,7 @@ print(json.dumps([got, beats]), flush=True)
 
 
 def test_another_vendor_hears_every_flag(world: World, tmp_path: Path) -> None:
-    path = saved(everything_armed(5, v=0.005), tmp_path)
+    path = saved(everything_armed(), tmp_path)
     bag = header_bag(by_hand(), tmp_path / "run.mcap", 300)
     verdicts = offline(path, bag)
     world.monitor(path)
