@@ -33,15 +33,15 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
 
 
 COMPILED = {
-    "kernel.arithmetic": "-O3",  # its loops are vectorised
+    "kernel.arithmetic": "-O2 -ftree-loop-vectorize",
     "monitor.envelope_monitor": "-O1",
     "monitor.intake": "-O1",
     "monitor.outputs": "-O1",
     "monitor.stream": "-O1",
     "monitor.verdict": "-O1",
-    "recordings.mcap_walk": "-O2",
-    "recordings.message_reader": "-O3",
-    "sampling.sampler": "-O2",
+    "recordings.mcap_walk": "-O1",
+    "recordings.message_reader": "-O1",
+    "sampling.sampler": "-O1",
 }
 """Modules that are compiled, and how: the kernel, and typed Python of the live chain."""
 
@@ -57,7 +57,7 @@ def compiled() -> list[Extension]:
     for dotted, level in COMPILED.items():
         path = Path("core", *dotted.split("."))
         source = next(str(path.with_suffix(end)) for end in (".pyx", ".py") if (ROOT / path).with_suffix(end).exists())
-        arguments = [level, "-g0", "-w", "-ffp-contract=off"]
+        arguments = [*level.split(), "-g0", "-w", "-ffp-contract=off"]
         extensions.append(Extension(f"uncertain_lti.{dotted}", [source], extra_compile_args=arguments))
     found: list[Extension] = cythonize(extensions, build_dir="build/cython", language_level=3, quiet=True)
     return found
