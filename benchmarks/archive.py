@@ -81,14 +81,14 @@ def bags(folder, samples):
 
 
 def killing(cluster, lines):
-    """Progress that kills a worker at the first pass."""
-    pid = next(iter(cluster.workers.values())).process.process.pid
+    """Progress that kills a worker at the first pass, one of those that run then: one killed before starts again."""
     killed = threading.Event()
 
     def say(line):
         lines.append(line)
         if line.startswith("pass ") and not killed.is_set():
-            os.kill(pid, signal.SIGKILL)
+            processes = [worker.process.process for worker in cluster.workers.values() if worker.process is not None]
+            os.kill(next(p.pid for p in processes if p is not None and p.is_alive()), signal.SIGKILL)
             killed.set()
 
     return say, killed

@@ -159,9 +159,10 @@ def test_rules_of_a_file_that_cannot_be_are_refused(rules: Any, words: str) -> N
 def test_residuals_that_cannot_be_are_refused(residuals: Any, words: str) -> None:
     data = two_states().to_dict()
     horizon = data["horizons"][0] | {"residuals": residuals}
-    for section in ({"residuals": residuals}, {"horizons": [horizon]}):
-        with pytest.raises(ModelError, match=words):
+    for section, where in ({"residuals": residuals}, ""), ({"horizons": [horizon]}, "horizon"):
+        with pytest.raises(ModelError, match=words) as refused:
             UncertainLTI.from_dict({**data, **section})
+        assert where in str(refused.value)
 
 
 @pytest.mark.parametrize("counted", [(True, True, True), (True, False, True), (False, False, True)])

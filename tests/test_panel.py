@@ -298,6 +298,7 @@ def test_states_that_are_blind_are_named(runs):
     assert worth(full, blind)[0] == "some" and worth(full, blind)[1].startswith("sees only x1: of x2")
     assert worth(full, replace(panel, biases=0.49 * span))[0] == "good"
     assert worth(full, replace(panel, biases=0.51 * span))[0] == "none"
+    assert "is over ten times the recorded range" in worth(full, replace(panel, biases=1e6 * span))[1]
     assert "per hour with 90% confidence" in promises(full, panel)[0]
 
 

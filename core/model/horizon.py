@@ -173,7 +173,10 @@ class Residuals:
         relative = data.get(_RELATIVE, False)
         if not isinstance(relative, bool):
             raise ModelError(f"field '{name}.{_RELATIVE}' is {reprlib.repr(relative)}; it must be true or false")
-        return cls(data["mean"], data["covariance"], relative)
+        try:
+            return cls(data["mean"], data["covariance"], relative)
+        except ModelError as error:
+            raise ModelError(str(error).replace("residuals", name, 1)) from None
 
 
 class Horizon(Elements):

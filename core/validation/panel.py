@@ -412,8 +412,8 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     if len(still) + len(blind) == model.n:
         least = float(share[share < np.inf].min(initial=np.inf))
         return "none", (
-            f"not worth having: the smallest jump that it sees is {least:.0%} of the recorded range of a state; what "
-            f"moves the states may be missing among the controls, or record more"
+            f"not worth having: the smallest jump that it sees is {_of_range(least)} the recorded range of a state; "
+            f"what moves the states may be missing among the controls, or record more"
         )
     if still or blind:
         seen = [name for name in names if name not in (*still, *blind)]
@@ -436,6 +436,10 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"on one that was not fitted; {sees}"
         )
     return "good", f"worth having: {sees}"
+
+
+def _of_range(share: float) -> str:
+    return f"{share:.0%} of" if share < 10.0 else "over ten times"
 
 
 def promises(model: UncertainLTI, panel: Panel) -> list[str]:
