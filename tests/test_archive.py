@@ -13,6 +13,7 @@ import json
 import os
 import signal
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -151,12 +152,18 @@ def test_bad_archives_are_refused(bags, tmp_path):
         fit_archive([still, control], rest, cache=tmp_path / "c")
 
 
-@pytest.fixture(scope="module")
-def cluster():
+@contextmanager
+def started_cluster():
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0") as local:
         with distributed.Client(local) as client:
             yield local, client
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with started_cluster() as started:
+        yield started
 
 
 def steps_of(lines, what):
@@ -192,16 +199,17 @@ def test_it_says_how_far_it_has_come(bags, tmp_path):
 
 
 @pytest.mark.slow
-def test_a_lost_worker_costs_time_and_nothing_else(bags, cluster):
-    (signals, paths), (local, client) = bags, cluster
+def test_a_lost_worker_costs_time_and_nothing_else(bags):
+    signals, paths = bags
     model = fit(read_transients(paths, signals))
-    pid = next(iter(local.workers.values())).process.process.pid
-    killer = threading.Timer(0.3, os.kill, (pid, signal.SIGKILL))
-    killer.start()
-    again = 0
-    while killer.is_alive() or not again:  # until the kill has fallen into the middle of one of them, and once more
-        again += not killer.is_alive()
-        equal(fit_archive(paths, signals, client=client), model)
+    with started_cluster() as (local, client):
+        pid = next(iter(local.workers.values())).process.process.pid
+        killer = threading.Timer(0.3, os.kill, (pid, signal.SIGKILL))
+        killer.start()
+        again = 0
+        while killer.is_alive() or not again:  # until the kill has fallen into the middle of one of them, and once more
+            again += not killer.is_alive()
+            equal(fit_archive(paths, signals, client=client), model)
 
 
 @pytest.mark.slow

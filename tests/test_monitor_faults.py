@@ -290,7 +290,7 @@ sys.exit(envelope_monitor.main())
 @pytest.mark.slow
 def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
     """`benchmarks/live_monitor.py --soak 600 --armed` in short, slowly enough for a machine that is busy."""
-    soak = ("--soak", "5", "--soak-rate", "150", "--armed")
+    soak = ("--soak", "10", "--soak-rate", "150", "--armed")
     command = [sys.executable, str(ROOT / "benchmarks" / "live_monitor.py"), *soak]
     with own_domain() as domain:
         command += ["--domain", str(domain)]
