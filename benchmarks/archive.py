@@ -80,12 +80,11 @@ def bags(folder, samples):
     return paths
 
 
-def killing(cluster, lines):
+def killing(cluster):
     """Progress that kills a worker at the first pass, one of those that run then: one killed before starts again."""
     killed = threading.Event()
 
     def say(line):
-        lines.append(line)
         if line.startswith("pass ") and not killed.is_set():
             processes = [worker.process.process for worker in cluster.workers.values() if worker.process is not None]
             os.kill(next(p.pid for p in processes if p is not None and p.is_alive()), signal.SIGKILL)
@@ -139,7 +138,7 @@ def main():
                     *best(lambda c=criterion: fit_archive(paths, SIGNALS, c, client=client), 1),
                 )
             for criterion in ("qp", "lp"):
-                say, killed = killing(cluster, [])
+                say, killed = killing(cluster)
                 took, model = best(
                     lambda c=criterion, s=say: fit_archive(paths, SIGNALS, c, client=client, progress=s), 1
                 )
