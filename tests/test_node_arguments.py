@@ -43,7 +43,8 @@ def start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.Capture
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("ROS_LOG_DIR", str(tmp_path / "log"))
-    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "")  # the node sets it
+    monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "")  # the node sets it, and an empty one is complained of
+    monkeypatch.delenv("FASTRTPS_DEFAULT_PROFILES_FILE")
     with own_domain() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         yield call
