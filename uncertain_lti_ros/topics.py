@@ -200,10 +200,6 @@ class MatchedSubscription:
         """How long there have been publishers and not a single message, s; 0 without publishers."""
         return 0.0 if self.received or self._published is None else time.monotonic() - self._published
 
-    def decoded(self) -> Any:
-        """The last message, of raw ones."""
-        return deserialize_message(self.last, self._class)
-
     @property
     def lost(self) -> int:
         """Messages lost on the way or in the queue; those that both ways of counting show count once."""

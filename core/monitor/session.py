@@ -140,17 +140,18 @@ class Session(Stream):
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
-    def why_no_condition(self, data: bytes, decoded: Callable[[], Any]) -> str:
+    def why_no_condition(self, data: bytes) -> str:
         """Why a message of the enable condition's topic says nothing on it, in words; empty if it does."""
         condition = self.arming.condition
         assert condition is not None
         try:
-            (value,) = self._condition_reader(condition, self.enable_type).read(data)[1]
+            reader = self._condition_reader(condition, self.enable_type)
+            (value,) = reader.read(data)[1]
         except UnreadableError as error:
             return f"{condition.topic}: a message {error}"
         if value == value:
             return ""
-        absent = condition.field.absent(decoded())
+        absent = condition.field.absent(reader.decode(data))
         return f"{condition.topic} comes without a number in {condition.field.text}" + f": {absent}" * bool(absent)
 
     def likeness(self) -> Likeness | None:

@@ -27,6 +27,7 @@ class Plan:
 
 class MessageReader:
     type_name: str
+    decode: Callable[[bytes], Any]
     decoded: int
     def __init__(
         self,

@@ -531,8 +531,8 @@ cdef class MessageReader:
     that it was needed for; `largest`: bytes of a message that is read.
     """
 
-    cdef readonly object type_name, decoded
-    cdef object decode, paths
+    cdef readonly object type_name, decode, decoded
+    cdef object paths
     cdef Plan plan
     cdef Py_ssize_t largest
 
