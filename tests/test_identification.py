@@ -129,10 +129,14 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
-@pytest.mark.parametrize("held", [working_set._HELD_BYTES, 1])
-def test_large_problem_reaches_the_same_optimum(criterion, held, monkeypatch):
-    """Beyond the first subsample, where full passes have to correct it; rows proven together, or in groups."""
+@pytest.mark.parametrize(("held", "many"), [(working_set._HELD_BYTES, programmes.MANY), (1, 1)])
+def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypatch):
+    """Beyond the first subsample, where full passes have to correct it; rows proven together, or in groups.
+
+    With many unknowns an interior point begins.
+    """
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
+    monkeypatch.setattr(programmes, "MANY", many)
     monkeypatch.setattr(working_set, "_HELD_BYTES", held)
     transient = drawn(small_plant(8), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")

@@ -20,6 +20,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
 from uncertain_lti.identification.solvers import (
     FEASIBLE,
+    MANY,
     Answer,
     Programme,
     Sense,
@@ -51,6 +52,8 @@ of the squared widths. Whether it was is seen from the optimum of δ alone, at t
 it seldom is small enough, so they are left to the simplex method at once.
 """
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
+_LIKE = 1e4
+"""Factor on the tie-break's weight with which an interior point looks for what is active."""
 _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
 _HOLD = (1e-2, 1e-4, 1e-6)
@@ -126,9 +129,12 @@ class Programmes:
         if last is None and row.basis is None:
             begin[: row.r] = row.scaled()[0]
         limits = *self._with_asked(G, h), lower, upper
+        inside = len(lower) >= MANY and (kind == "quadratic" or last is None)  # (11) moves on with its tie-break
         for self.attempt in _ATTEMPTS:
+            programme = Programme(*objective(*self.attempt), *limits)
+            like = objective(_LIKE * self.attempt[0], self.attempt[1]) if inside else None
             try:
-                answer = solve_near(Programme(*objective(*self.attempt), *limits), begin, start, feasible)
+                answer = solve_near(programme, begin, start, feasible, like=like)
                 break
             except FitError:
                 continue
