@@ -84,6 +84,18 @@ def test_a_damaged_installation_is_no_alarm(module, status):
     assert "uncertain-lti = uncertain_lti.cli.program:main" in (ROOT / "setup.py").read_text()
 
 
+def test_an_interrupt_before_there_is_a_program_is_said():
+    first = (
+        "import builtins, sys; from uncertain_lti.cli.program import main; real = builtins.__import__\n"
+        "def interrupted(name, *rest):\n"
+        "    if name == 'uncertain_lti.base.errors': raise KeyboardInterrupt\n"
+        "    return real(name, *rest)\n"
+        "builtins.__import__ = interrupted; sys.exit(main())"
+    )
+    done = subprocess.run([sys.executable, "-c", first, "play", "x.mcap"], text=True, capture_output=True, timeout=1200)
+    assert (done.returncode, done.stderr) == (130, "uncertain-lti: interrupted before anything was begun\n")
+
+
 def test_nobody_reads_what_is_said(folder):
     with open("/dev/full", "w") as full:
         assert run(["check", "nothing.model.json", "nothing.mcap"], stdout=full, stderr=full).returncode == 2

@@ -12,10 +12,15 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
 import re
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -397,11 +402,32 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
 def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 60 * 10**9, 10**8))).save(tmp_path / "in.mcap")
     heard = world.listen(Float64, "/x")
-    player = world.command("play", bag)
-    heard.count(3)
-    player.signal(signal.SIGINT)
-    assert player.wait() == 130
-    assert re.fullmatch(r"\S+in.mcap: played \d+ messages of 1 topics in \S+ s, then interrupted\n", player.output)
+    ended = r"uncertain-lti play: \S+in.mcap: played \d+ messages of 1 topics in \S+ s, then interrupted\n"
+    for words in ([], ["--quiet"]):
+        player = world.command("play", bag, *words)
+        heard.count(3)
+        player.signal(signal.SIGINT)
+        assert player.wait() == 130 and re.fullmatch(ended, player.output)
+        heard.messages.clear()
+
+
+def test_a_signal_takes_the_bar_of_a_terminal_away(tmp_path: Path) -> None:
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 60 * 10**9, 10**8))).save(tmp_path / "in.mcap")
+    screen, terminal = pty.openpty()
+    with own_domain() as domain:
+        command = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--wait", "0"]
+        env = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        player = subprocess.Popen(command, stdout=terminal, stderr=terminal, env=env, start_new_session=True)
+        os.close(terminal)
+        shown = b""
+        with suppress(OSError):  # as the terminal ends with its last program
+            while text := os.read(screen, 4096):
+                if b"playing:" in text and b"playing:" not in shown:
+                    player.send_signal(signal.SIGINT)
+                shown += text
+        os.close(screen)
+        assert player.wait() == 130
+    assert shown.decode().rstrip().endswith("then interrupted"), shown
 
 
 def test_a_signal_ends_waiting_at_once(world: World, tmp_path: Path) -> None:
@@ -415,7 +441,7 @@ def test_a_signal_ends_waiting_at_once(world: World, tmp_path: Path) -> None:
     player.signal(signal.SIGTERM)
     began = time.monotonic()
     assert player.wait() == 143 and time.monotonic() - began < 300, "it would wait for 600 s"
-    assert player.output == f"{bag}: interrupted before a message was played\n"
+    assert player.output == f"uncertain-lti play: {bag}: interrupted before a message was played\n"
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "nan", "inf", "fast", ""])

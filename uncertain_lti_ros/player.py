@@ -17,6 +17,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,7 +32,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
-from uncertain_lti.cli.command import DONE, Result
+from uncertain_lti.cli.command import DONE, Result, complain
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import TypeFields
@@ -98,25 +99,28 @@ def run(args: argparse.Namespace) -> Result:
         messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
         if args.progress.shown:
             messages = args.progress.iterate("playing")(messages, sum(p.count for p in played.values()))
-        began = time.monotonic()
-        if args.lockstep:
-            _lockstep(life, played, clock, args.lockstep, messages, args.wait)
-        else:
-            behind = _paced(life, played, clock, args.rate or 1.0, messages, crowd := _crowd(bag, played))
-            if behind > 1.0 and life.alive:
-                note(
-                    f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
-                    f"{1e3 / crowd:.2g} ms apart"
-                )
+        began, behind, crowd = time.monotonic(), 0.0, _crowd(bag, played)
+        with closing(messages):  # takes the bar away
+            if args.lockstep:
+                _lockstep(life, played, clock, args.lockstep, messages, args.wait)
+            else:
+                behind = _paced(life, played, clock, args.rate or 1.0, messages, crowd)
+        if behind > 1.0 and life.alive:
+            note(
+                f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
+                f"{1e3 / crowd:.2g} ms apart"
+            )
         took = time.monotonic() - began
         missed = _unconfirmed(life, played)
         if missed:
             note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
     ended = f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s"
-    if life.signal is not None:
-        ended = f"{ended}, then interrupted" if sent else f"{bag.path}: interrupted before a message was played"
-    args.say(ended)
+    if life.signal is None:
+        args.say(ended)
+    else:
+        none = f"{bag.path}: interrupted before a message was played"
+        complain("play", f"{ended}, then interrupted" if sent else none)
     data = {
         "bag": str(bag.path), "messages": sent, "topics": {p.topic: p.sent for p in played.values()}, "seconds": took,
         "unconfirmed": missed, "interrupted": life.signal is not None,

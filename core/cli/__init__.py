@@ -11,3 +11,6 @@
 
 May import every room.
 """
+
+FAULT, INTERRUPTED = 70, 130
+"""Exit statuses: of a fault of the program itself, and of an interrupt; here, as nothing need be imported for them."""

@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from uncertain_lti import Transient, UncertainLTI
     from uncertain_lti.signals.signal_map import SignalMap
 
-DONE, ALARM, BAD_INPUT, UNKNOWN, FAULT, INTERRUPTED, NOT_READ = 0, 1, 2, 3, 70, 130, 141
+DONE, ALARM, BAD_INPUT, UNKNOWN, NOT_READ = 0, 1, 2, 3, 141
 """Exit statuses: 1 means that the alarm was raised, and nothing else; 3 that a check says nothing of the machine.
 
-70 is a fault of the program itself. 141, as shells have it, says that the reader of the output went away before it was
-known whether there is an alarm.
+141, as shells have it, says that the reader of the output went away before it was
+known whether there is an alarm. Two more are in `uncertain_lti.cli`.
 """
 
 

@@ -26,8 +26,8 @@ from typing import Any, NoReturn
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import UncertainLTIError, absent
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import delegated, fit, judge, start
-from uncertain_lti.cli.command import BAD_INPUT, DONE, FAULT, INTERRUPTED, NOT_READ, Command, complain, drop_output, run
+from uncertain_lti.cli import FAULT, INTERRUPTED, delegated, fit, judge, start
+from uncertain_lti.cli.command import BAD_INPUT, DONE, NOT_READ, Command, complain, drop_output, run
 
 COMMANDS: tuple[Command, ...] = (
     start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, delegated.LAYOUT,

@@ -12,9 +12,8 @@
 from __future__ import annotations
 
 import sys
-import traceback
 
-from uncertain_lti.cli.command import FAULT, INTERRUPTED
+from uncertain_lti.cli import FAULT, INTERRUPTED
 
 
 def main() -> int:
@@ -22,8 +21,11 @@ def main() -> int:
     try:
         from uncertain_lti.cli.main import main as run
     except KeyboardInterrupt:
+        print("uncertain-lti: interrupted before anything was begun", file=sys.stderr)
         return INTERRUPTED
     except Exception:
+        import traceback
+
         traceback.print_exc()
         print("uncertain-lti: the installation is damaged; install uncertain-lti-ros again", file=sys.stderr)
         return FAULT
