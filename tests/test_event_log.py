@@ -56,12 +56,13 @@ class Rig:
             return MessageReader(type_name, paths, live_fields, lambda data: deserialize_message(data, kind))
 
         types = topic_types(model, "by hand", live_fields)
-        self.session = Session(model, rule, types, live_fields, reader, self.now)
+        self.session = Session(model, rule, types, live_fields, reader, self.now, catch_up=0.0)
         self.event_log.begin(self.session, self.now)
 
     def take(self, topic: str, data: bytes) -> None:
         before = self.session.alarm
-        verdicts, _ = self.session.take(topic, time.time_ns(), data, self.now)
+        ((_, arrival_ns, _),) = self.session.accept(topic, time.time_ns(), data, self.now)
+        verdicts, _ = self.session.take(topic, arrival_ns, data, self.now)
         if self.session.alarm != before:
             self.event_log.turned(self.session, verdicts, self.now)
 
@@ -271,11 +272,15 @@ def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     ]
 
 
+NO_NAME = f"{STATE}: there is no '{{}}' in the message's names"
+
+
 @pytest.mark.parametrize(
     ("what", "why"),
     [
         ("not a number", "a missing, stale or not finite"),
-        ("a name gone", "b missing, stale or not finite"),
+        ("a name gone", f"b missing, stale or not finite; {NO_NAME.format('b')}; names there: a, c"),
+        ("another machine", f"a, b missing, stale or not finite; {NO_NAME.format('a')}; names there: x"),
         ("no message", f"{STATE}: a message "),
         ("far apart", "the step is longer than max_gap"),
         ("no stamp", f"messages on {STATE} are dropped (no stamp)"),
@@ -293,6 +298,7 @@ def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: st
         sent = {
             "not a number": joint_state(rig.t_ns, [np.nan, x[1]]),
             "a name gone": joint_state(rig.t_ns, x, ("a", "c")),
+            "another machine": joint_state(rig.t_ns, x[:1], ("x",)),
             "no message": b"\x00\x01\x00\x00\x07",
             "no stamp": joint_state(0, x),
             "the same stamp": joint_state(fixed, x),
@@ -301,6 +307,7 @@ def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: st
         rig.t_ns += 10 * STEP_NS * (what == "far apart")
     (line,) = rig.lines
     assert re.match(r"no verdict for 1\.\d s: ", line) and why in line
+    assert why.partition("; ")[2] in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
 def test_problems_and_the_enable_condition_are_told_when_they_change() -> None:

@@ -399,8 +399,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 return  # the middleware takes no other type before it has let go of the former subscription
         if session.enable_type and session.enable_topic not in self.inputs:
             self.subscribe()
-        heard = self.inputs.get(session.enable_topic)
-        if heard is not None and heard.last is not None and (why := session.why_no_condition(heard.last)):
+        if why := session.why_no_condition():
             self._enable_problem = f"parameter enable: {why}"
 
     def _keep_reason(self) -> None:

@@ -165,7 +165,7 @@ class MatchedSubscription:
     `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw, and
     when it was published, ns by its publisher; `requested`: what the user requests; `raw`: whether the callback takes
     bytes; `received, lost, late`: messages received, those lost on the way or in the queue, and deadlines missed by
-    publishers; `last`: the last message; `publishers`: publishers of this type that the graph knows; `qos`: what
+    publishers; `publishers`: publishers of this type that the graph knows; `qos`: what
     is asked of them now; `problems`: publishers that cannot be heard and why, one sentence each.
 
     The middleware reports what its writer gives up, and not what full queues of this reader push out; the numbers that
@@ -186,7 +186,6 @@ class MatchedSubscription:
         self._class, self._callback, self._requested, self._raw = message_class, callback, requested, raw
         self.topic: str = node.resolve_topic_name(topic)
         self.received = self.late = self.publishers = 0
-        self.last: Any = None
         self._reported_lost = self._skipped = 0  # as the middleware has it, and by the numbers of the messages
         self._number: int | None = None  # of the last message
         self._alone = False  # one publisher sends all messages since that one
@@ -266,7 +265,7 @@ class MatchedSubscription:
     def _take(self, *given: Any) -> None:
         """A message with its number; the events executor of Jazzy gives both as one argument."""
         message, info = given if len(given) == 2 else given[0]
-        self.received, self.last = self.received + 1, message
+        self.received += 1
         number, before = info["publication_sequence_number"], self._number
         if before is not None and number is not None and number != before + 1:
             self._count_skipped(number - before - 1)

@@ -16,6 +16,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,6 +35,8 @@ from uncertain_lti.monitor.stream import topic_types as topic_types
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.recordings.message_reader import UnreadableError
 from uncertain_lti.sampling.clock import MISSING, TOO_OLD, Counters, Status
+from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.signal import Signal
 
 _BURST, _REFILL = 6, 10.0  # lines on one subject at once, and s until one more is allowed
 _LOGGED = 5.0  # s between two log entries on unexpected errors
@@ -72,6 +75,7 @@ class Session(Stream):
     ) -> Report:
         never = [topic for topic in self.types if self.heard(topic) is None]
         complaints, calm = list(problems), list[str]()
+        lacking = self.lacking(period.counters)
         if period.last_unknown is not None:
             why = self.model.why_unknown(period.last_unknown.before)
             complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
@@ -81,11 +85,12 @@ class Session(Stream):
             if period.statuses[status]:
                 which = ""
                 if status is Status.MISSING:
-                    which = f" ({shortlist(self.lacking(period.counters), SHOWN)})"
+                    which = f" ({shortlist([signal.name for signal in lacking], SHOWN)})"
                 why = WHY[status]
                 if status is Status.MODE and period.last_unlisted is not None:
                     why = self.model.why_unlisted(period.last_unlisted.before)
                 complaints.append(f"{period.statuses[status]} samples without a verdict: {why}{which}")
+        complaints += self.absent(lacking)
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
             which = ", ".join(f"{status.value} {count}" for status, count in period.statuses.items() if status.dropped)
@@ -140,10 +145,11 @@ class Session(Stream):
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
-    def why_no_condition(self, data: bytes) -> str:
-        """Why a message of the enable condition's topic says nothing on it, in words; empty if it does."""
-        condition = self.arming.condition
-        assert condition is not None
+    def why_no_condition(self) -> str:
+        """Why the last message of the enable condition's topic says nothing on it, in words; empty if it does."""
+        condition, data = self.arming.condition, self._newest.get(self.enable_topic)
+        if condition is None or data is None:
+            return ""
         try:
             reader = self._condition_reader(condition, self.enable_type)
             (value,) = reader.read(data)[1]
@@ -163,11 +169,21 @@ class Session(Stream):
         assert self.model.repeats is not None
         return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
 
-    def lacking(self, before: Counter[str]) -> list[str]:
+    def lacking(self, before: Counter[str]) -> list[Signal]:
         """Signals that samples had no value of since some counters."""
         since = Counters(self.sampler.counters - before)
         lacking = since.of(MISSING) | since.of(TOO_OLD)
-        return [signal.name for signal in self.model.signals if signal.name in lacking]
+        return [signal for signal in self.model.signals if signal.name in lacking]
+
+    def absent(self, lacking: Iterable[Signal]) -> list[str]:
+        """What the last message of each topic has not of what is read from it, the first of these signals in words."""
+        found: dict[str, str] = {}
+        for signal in lacking:
+            data, reader = self._newest.get(signal.topic), self._readers[signal.topic]
+            with suppress(UnreadableError):
+                if data is not None and not found.get(signal.topic) and any(v != v for v in reader.read(data)[1]):
+                    found[signal.topic] = FieldPath(signal.field).absent(reader.decode(data))
+        return [f"{topic}: {why}" for topic, why in found.items() if why]
 
     def rule_text(self) -> str:
         """The rules of the alarm in words."""
@@ -428,8 +444,9 @@ class EventLog:
         if clock not in never and session.silent_for(now) > timeout / 2:
             return "; ".join([f"no message on {clock}", *found])
         since = session.sampler.counters - self._counters
-        if signals := session.lacking(self._counters):
-            found.append(f"{', '.join(signals)} missing, stale or not finite")
+        if lacking := session.lacking(self._counters):
+            found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")
+            found += session.absent(lacking)
         for status, name in (
             (Status.GAP, "gaps"),
             (Status.RESET, "resets"),

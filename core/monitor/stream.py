@@ -148,9 +148,10 @@ class Stream:
     _model_types: Mapping[str, str] = cython.declare(object, visibility="readonly")
     _type_fields: TypeFields = cython.declare(object, visibility="readonly")
     _make_reader: MakeReader = cython.declare(object, visibility="readonly")
-    _readers: dict[str, MessageReader]
+    _readers: dict[str, MessageReader] = cython.declare(dict, visibility="readonly")
     _held: dict[str, float]
     _heard: dict[str, float]
+    _newest: dict[str, bytes] = cython.declare(dict, visibility="readonly")  # the last message of each topic
     _stamped: list[str]
     _window: cython.double
     _stall: cython.double
@@ -187,6 +188,7 @@ class Stream:
         self._window, self._stall = catch_up, max(STALL, 5 * (model.sampling.dt_median or 0.0)) if waits else math.inf
         self.arming = arming if arming is not None else Arming(None, 0)
         self.latched, self.enable_topic, self.enable_type = False, "", ""
+        self._newest: dict[str, bytes] = {}
         self._follow(rule)
         self.restart(now)
 
@@ -239,6 +241,7 @@ class Stream:
         States start over; controls would not arrive again if they are sent on a change only.
         """
         mine, theirs = self.model.signals, other.model.signals
+        self._newest.update(other._newest)
         for topic in self.types:
             if topic in other._heard:
                 self._heard[topic] = other._heard[topic]
@@ -287,6 +290,7 @@ class Stream:
         assert self.arming.condition is not None
         self._reads_condition = self._condition_reader(self.arming.condition, type_name)
         self.enable_type = type_name
+        self._newest.pop(self.enable_topic, None)  # it was of another type
 
     @property
     def enable_type_is_given(self) -> bool:
@@ -353,6 +357,7 @@ class Stream:
         `sent_ns`: when it was published, by the clock of its publisher; 0 if that is not known; `late`: s since then.
         """
         before, self._came = self._came, now
+        self._newest[topic] = data
         if self._catches_up is None:
             if now - before <= self._stall:
                 return ((topic, arrival_ns, data),)
