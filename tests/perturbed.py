@@ -330,7 +330,7 @@ def told(verdicts: Sequence[Any], latched: bool = False) -> list[Row]:
             _row(
                 t_ns=v.t_ns, status=v.status, alarm=v.alarm or latched, flags=v.flags, lower=v.lower, upper=v.upper,
                 utilisation=v.utilisation, horizon_utilisation=v.horizon_utilisation, statistics=v.statistics,
-                raised=v.raised, outside=v.outside_domain, unknown=v.unknown_regime,
+                raised=v.raised, outside=v.outside_domain, unknown=v.unknown_regime, violated=v.violated,
                 frozen=tuple(moved.state for moved in v.frozen),
                 repeating=tuple(moved.state for moved in v.repeating), state=v.state,
             )
@@ -353,7 +353,7 @@ def offline(model: UncertainLTI, rule: Rule, messages: Sequence[Message], path: 
             flags=verdicts.flags[k], lower=verdicts.lower[k], upper=verdicts.upper[k],
             utilisation=verdicts.utilisation[k], horizon_utilisation=verdicts.horizon_utilisation[k],
             statistics=verdicts.statistics[k], raised=verdicts.raised(k), outside=bool(verdicts.outside_domain[k]),
-            unknown=bool(verdicts.unknown_regime[k]),
+            unknown=bool(verdicts.unknown_regime[k]), violated=bool(verdicts.violated[k]),
             frozen=tuple(np.flatnonzero(verdicts.frozen[k]).tolist()),
             repeating=tuple(np.flatnonzero(verdicts.repeating[k]).tolist()), state=verdicts.state[k],
         )

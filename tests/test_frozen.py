@@ -149,6 +149,13 @@ def test_a_wrong_section_is_refused_by_name(model: UncertainLTI, frozen: Any, na
         UncertainLTI.from_dict({**model.to_dict(), "frozen": frozen})
 
 
+def test_of_two_that_which_calls_fewer_states_frozen_counts() -> None:
+    """Noise is known where both have seen it, and as often as in both."""
+    one = Repeats([1.0, 0.0], [1.0, 4.0], [2.0, 5.0], [3.0, 6.0], [500.0, 0.0])
+    both = one.and_of(Repeats([0.5, 0.25], [7.0, 1.0], [8.0, 1.0], [9.0, 1.0], [700.0, 900.0]))
+    assert list(both.to_dict().values()) == [[1.0, 0.25], [7.0, 4.0], [8.0, 5.0], [9.0, 6.0], [1200.0, 0.0]]
+
+
 def test_the_recordings_of_the_fit_raise_no_alarm(model: UncertainLTI) -> None:
     for transient in (run(1), run(2, rest=(3.0, 4.0))):
         verdicts = EnvelopeMonitor(model).check(transient)
@@ -255,22 +262,25 @@ def test_a_state_that_stops_is_frozen_beyond_what_was_recorded(
 ) -> None:
     model = UncertainLTI([[0.0]], [[rate]], [[0.0]], [[0.0]], v=[0.5], repeats=Repeats(*repeats))
     x = np.concatenate([np.linspace(5.0, 4.0, 20), np.full(60, 4.0)])[:, None]
-    verdicts = EnvelopeMonitor(model).check(Transient(dt * np.arange(80), x, np.ones((80, 1))))
-    assert np.flatnonzero(verdicts.frozen).tolist() == ([] if steps is None else list(range(19 + steps, 80)))
-    assert all(not rate or why.startswith("while the model moves it by ") for why in verdicts.why_frozen.values())
+    for margin in (1.0, 2.0):  # half-widths are those of the model
+        verdicts = EnvelopeMonitor(model, margin=margin).check(Transient(dt * np.arange(80), x, np.ones((80, 1))))
+        assert np.flatnonzero(verdicts.frozen).tolist() == ([] if steps is None else list(range(19 + steps, 80)))
+        assert all(not rate or why.startswith("while the model moves it by ") for why in verdicts.why_frozen.values())
 
 
 def test_a_sum_counts_where_another_state_has_moved_by_more_than_its_half_width() -> None:
     """The run rests at half a half-width; the sum adds as much at each step, and the other moves by a quarter."""
-    zeros, repeats = np.zeros((2, 2)), Repeats([0.5, 0.0], [1.0, 0.0], [0.25, 0.0], [LARGEST] * 2)
-    A, B = np.array([[-4.0, 0.0], [0.0, 0.0]]), np.array([[1.0], [0.0]])
-    model = UncertainLTI(A, B, zeros, 0 * B, v=[0.5, 0.5], repeats=repeats)
+    zeros, A, B = np.zeros((2, 2)), np.array([[-4.0, 0.0], [0.0, 0.0]]), np.array([[1.0], [0.0]])
+    model = UncertainLTI(A, B, zeros, 0 * B, v=[0.5, 0.5])
     x = np.zeros((20, 2))
     x[:, 1] = 0.125 * np.arange(20)
     transient = Transient(0.25 * np.arange(20), x, np.ones((20, 1)))
-    verdicts = EnvelopeMonitor(model).check(transient)
-    assert np.flatnonzero(verdicts.frozen[:, 0]).tolist() == list(range(5, 20))
-    assert "the model's steps add up by 2.5 half-widths (at most 0.25 in the fit)" in verdicts.why_frozen[5, 0]
+    for margin, longest, first in ((1.0, 0.5, 5), (2.0, 0.5, 5), (1.0, 1.5, 7)):  # and the fit has no rest as long
+        known = model.replace(repeats=Repeats([longest, 0.0], [1.0, 0.0], [0.25, 0.0], [LARGEST] * 2))
+        verdicts = EnvelopeMonitor(known, margin=margin).check(transient)
+        assert np.flatnonzero(verdicts.frozen[:, 0]).tolist() == list(range(first, 20))
+        why = f"the model's steps add up by {first / 2} half-widths (at most 0.25 in the fit)"
+        assert why in verdicts.why_frozen[first, 0]
 
 
 @pytest.mark.parametrize("beyond", [0.09, 0.11])

@@ -87,6 +87,7 @@ def test_every_statistic_is_its_formula(kind: str, T: float, jitter: float) -> N
     rng = np.random.default_rng(1)
     dt = np.rint(1e9 * 0.01 * (1 + jitter * rng.uniform(-1, 1, 700))) * 1e-9
     rows = rng.normal(size=(700, 3)) + np.linspace(0, 2, 700)[:, None]
+    rows[300:303], rows[500:503] = 30.0, -40.0  # beyond LIMIT
     alarm, values = statistic(kind, T, 0.8, allowance=0.3).push_all(dt, rows)
     expected = oracle(kind, T, dt, rows, 0.3) / 0.8
     np.testing.assert_allclose(values, expected, rtol=1e-9, atol=1e-12)
@@ -157,6 +158,19 @@ def test_a_huge_value_leaves_nothing_behind(kind: str) -> None:
     _, values = statistic(kind, 0.5).push_all(np.full(400, 0.01), rows)
     assert values[149].max() > 1e10
     assert values[150:] == pytest.approx(np.broadcast_to(values[99], (250, values.shape[1])), rel=1e-12)
+
+
+def test_what_is_at_its_threshold_raises_no_alarm() -> None:
+    alarm, _ = statistic("mean", 0.0, 2.0).push_all(np.ones(4), 2.0 * np.eye(4, 3) * [1.0, -1.0, 1.25])
+    assert alarm.tolist() == [False, False, True, False]
+
+
+def test_a_window_holds_a_million_verdicts_at_most() -> None:
+    """However short the steps are: what it takes stays small."""
+    rows = np.zeros((1_000_001, 1))
+    rows[0] = 1.0
+    _, values = statistic("mean", 10.0, n=1).push_all(np.full(len(rows), 1e-6), rows)
+    assert values[-2:, 0] == pytest.approx([1e-7, 0.0], rel=1e-12)
 
 
 def test_lists_and_other_layouts_are_the_same_numbers() -> None:
