@@ -54,6 +54,8 @@ it seldom is small enough, so they are left to the simplex method at once.
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
 _LIKE = 1e4
 """Factor on the tie-break's weight with which an interior point looks for what is active."""
+INDEPENDENT = 1e-6
+"""Least relative singular value of the sizes of samples that leave the half-widths no choice."""
 _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
 _HOLD = (1e-2, 1e-4, 1e-6)
@@ -129,7 +131,7 @@ class Programmes:
         if last is None and row.basis is None:
             begin[: row.r] = row.scaled()[0]
         limits = *self._with_asked(G, h), lower, upper
-        inside = len(lower) >= MANY and (kind == "quadratic" or last is None)  # (11) moves on with its tie-break
+        inside = len(lower) >= MANY and (kind != "regularised" or last is None)  # that moves on with its tie-break
         for self.attempt in _ATTEMPTS:
             programme = Programme(*objective(*self.attempt), *limits)
             like = objective(_LIKE * self.attempt[0], self.attempt[1]) if inside else None
@@ -185,12 +187,52 @@ class Programmes:
         row.store_limited(answer)
         return solver
 
+    def nominal(self) -> str:
+        """Solve (11) on the working set for the nominal elements alone, with half-widths of one size (`box`)."""
+        row, box = self.row, self.box
+        assert box is not None
+        if "nominal" not in self._last:
+            self._set_unit()
+
+        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
+            weight = factor * REGULARISATION * BOUNDED_TIE_BREAK
+            H = REGULARISATION * np.eye(row.r + 1)
+            H[:-1, :-1] = weight * (row.centre + ridge * np.eye(row.r))
+            return H, np.append(-weight * row.target, 1.0)
+
+        limits = np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf)
+        answer, solver = self._solve("nominal", objective, *self._distances(row.pool), *limits)
+        delta = answer[-1] * self._unit
+        row.store_limited(np.concatenate([answer[:-1], box * delta, [delta]]))
+        return solver
+
+    @property
+    def decided(self) -> bool:
+        """The samples on which δ of `nominal` rests leave no other elements either.
+
+        In every optimum of (11) those of positive multiplier are at a bound and as wide as δ: as many as unknowns fix
+        the nominal elements, and, if their sizes are independent, the half-widths.
+        """
+        row, last = self.row, self._last.get("nominal")
+        active = None if last is None else last.active
+        if active is None or np.count_nonzero(active) <= row.r:
+            return False
+        samples = active[row.r + 1 :][: 2 * len(row.pool)].reshape(2, -1).any(axis=0)
+        psi = row.psi[row.pool][samples]
+        if len(psi) < row.q:
+            return False
+        values = np.linalg.svd(psi, compute_uv=False)
+        return bool(values[-1] > INDEPENDENT * values[0])
+
+    def _set_unit(self) -> None:
+        self._unit = float(np.median(self.row.width[self.row.pool] if len(self.row.pool) else self.row.width))
+
     def linear(self) -> str:
         """Solve (11) on the working set, by the simplex method."""
         row = self.row
         box = self.box
         if box is not None and self._simplex is None:
-            self._unit = float(np.median(row.width[row.pool] if len(row.pool) else row.width))
+            self._set_unit()
         G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
         kinds = 3 if box is None else 2
         number = kinds * np.tile(row.samples.index[row.pool], kinds) + np.repeat(np.arange(kinds), len(row.pool))
@@ -270,14 +312,16 @@ class Programmes:
         """A lower bound of δ, in units of scale: by multipliers, or the optimum on the working set."""
         row = self.row
         assert row.limit is not None
-        xi = np.concatenate([*row.scaled(), [row.limit]])
-        cost = np.append(np.zeros(len(xi) - 1), 1.0)
-        low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
-        G, h = self._with_asked(*self.rows(row.pool))
-        for active in self._active_sets("regularised", len(xi) + len(h)):
-            bound = linear_bound(cost, G, h, low, high, xi, active)
-            if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
-                return bound
+        for kind in ("nominal", "regularised") if "nominal" in self._last else ("regularised",):
+            size, unit = (row.r, self._unit) if kind == "nominal" else (row.r + row.q, 1.0)
+            G, h = self._with_asked(*(self._distances if kind == "nominal" else self.rows)(row.pool))
+            xi = np.append(np.concatenate(row.scaled())[:size], row.limit / unit)
+            cost = np.append(np.zeros(size), 1.0)
+            low, high = np.append(row.lower[:size], 0.0), np.append(row.upper[:size], np.inf)
+            for active in self._active_sets(kind, len(xi) + len(h)):
+                bound = linear_bound(cost, G, h, low, high, xi, active) * unit
+                if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+                    return bound
         simplex = self.minimax()
         simplex.add(*self.rows(row.pool))
         return max(bound, 0.0, float(simplex.solve()[-1]))

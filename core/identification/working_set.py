@@ -273,7 +273,10 @@ class WorkingSet:
             own = self.programmes[row.i]
             if not own.exact:
                 try:
-                    self._settle(own, Programmes.regularised, polish=True)
+                    if row.unknown and own.box is not None:
+                        self._settle(own, Programmes.nominal)
+                    if not own.decided:
+                        self._settle(own, Programmes.regularised, polish=True)
                 except FitError:
                     own.exact = True
             if own.exact:
