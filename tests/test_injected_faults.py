@@ -300,7 +300,7 @@ def test_validate_info_and_report_say_which_faults_are_seen(tmp_path, capsys):
     report = ["report", name, str(tmp_path / "run.mcap"), "--output", str(page), "-q"]
     assert main(report) == 0
     text = page.read_text()
-    assert "of others: run uncertain-lti validate MODEL --output MODEL" in text
+    assert f"`uncertain-lti validate {name} --output {name}` finds it out" in text
     assert f"<li>{UncertainLTI.load(name).fit_summary['alarm']['promises'][1]}</li>" in text
     capsys.readouterr()
     assert main(["validate", name, "--within", "0.5", "--output", name]) == 0

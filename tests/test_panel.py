@@ -299,7 +299,15 @@ def test_states_that_are_blind_are_named(runs):
     assert worth(full, replace(panel, biases=0.49 * span))[0] == "good"
     assert worth(full, replace(panel, biases=0.51 * span))[0] == "none"
     assert "is over ten times the recorded range" in worth(full, replace(panel, biases=1e6 * span))[1]
-    assert "per hour with 90% confidence" in promises(full, panel)[0]
+    assert worth(full, replace(panel, biases=0.041 * span))[1].endswith("jumps of 4.1 % of the recorded range")
+    assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0))[0]
+    assert "(0 in 28.8 s left out" in promises(full, replace(panel, hours=0.008, alarms=0))[0]
+    far = promises(full, replace(panel, within=0.5, biases=np.array([0.25, 11.0]) * span))[1]
+    assert far.startswith("sees within 0.5 s a jump of x1 ")
+    assert far.endswith("; of x2 not even a jump of ten times the recorded range")
+    assert promises(full, replace(panel, biases=11.0 * span))[1].endswith(
+        " s of x1, x2 not even a jump of ten times the recorded range"
+    )
 
 
 def test_recordings_far_from_one_another_give_a_panel_that_promises_no_rate():

@@ -48,6 +48,15 @@ def test_start_gives_the_files_of_the_three_commands(folder, capsys):
     assert (folder / "machine.html").read_text().lstrip().lower().startswith("<!doctype html")
 
 
+def test_a_model_that_is_not_worth_having_is_not_sent_to_the_robot(folder, capsys):
+    switch = np.random.default_rng(1).uniform(0, 1, (1000, 5))
+    engine_bag(folder / "rare.mcap", change=lambda k, x: switch[k // 10])
+    assert main(["start", "rare.mcap", "--output", "rare"]) in (0, 3)
+    printed = capsys.readouterr().out
+    assert "may I rely on it? no" in printed and "ROBOT" not in printed
+    assert printed.splitlines()[-1].startswith("not on the robot yet: mend what is said above, in rare.yaml or by")
+
+
 def test_an_edited_signals_file_is_used_as_it_is(folder, capsys):
     assert main(["start", *HEALTHY, "--output", "m", "--quiet"]) == 0
     assert capsys.readouterr().out == ""

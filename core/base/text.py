@@ -134,6 +134,12 @@ def number(value: float | None) -> str:
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"
 
 
+def lasting(hours: float) -> str:
+    """A time in the unit that one would say it in."""
+    seconds = 3600.0 * hours
+    return f"{seconds:.3g} s" if seconds < 120 else f"{60 * hours:.3g} min" if hours < 2 else f"{hours:.3g} h"
+
+
 def share(value: float | None, digits: int = 3) -> str:
     """A share in percent, or a dash for nothing."""
     return "-" if value is None else f"{value:.{digits}%}"

@@ -14,11 +14,12 @@ from __future__ import annotations
 import argparse
 import os
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.base.text import printable
+from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.cli.command import Command, Result, model_target
 from uncertain_lti.cli.options import RECORDINGS, helped
 
@@ -69,7 +70,6 @@ def run_topics(options: argparse.Namespace) -> Result:
 def run_init(options: argparse.Namespace) -> Result:
     """Write or print the proposed signals file."""
     from uncertain_lti.base.files import target, written
-    from uncertain_lti.base.text import shortlist
     from uncertain_lti.proposal.init import propose
 
     output = options.output
@@ -85,23 +85,27 @@ def run_init(options: argparse.Namespace) -> Result:
     if output is not None:
         with written(output, SignalError) as stream:
             stream.write(proposal.text.encode())
+    proposed = {
+        kind: [{"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind]
+        for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
+    }
+    more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
+    data = {"output": output, **proposed, **more}
     if options.json:
-        proposed = {
-            kind: [
-                {"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind
-            ]
-            for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
-        }
-        more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
-        return Result(data={"output": output, **proposed, **more})
-    alike = f"and the same for each of {shortlist(proposal.members, 12)}\n" if proposal.members else ""
+        return Result(data=data)
     options.say(
-        f"states: {', '.join(c.name for c in proposal.states)}\n"
-        f"controls: {', '.join(c.name for c in proposal.controls) or 'none found'}\n{alike}"
+        f"{_proposed(data)}\n"
         f"signals file written to {output}: read it and edit it, it says why; then\n"
         f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
     )
     return Result()
+
+
+def _proposed(data: Mapping[str, Any]) -> str:
+    """The signals that `init` chose."""
+    named = {kind: ", ".join(signal["name"] for signal in data[kind]) for kind in ("states", "controls")}
+    alike = f"\nand the same for each of {shortlist(data['members'], 12)}" if data["members"] else ""
+    return f"states: {named['states']}\ncontrols: {named['controls'] or 'none found'}{alike}"
 
 
 # --- start -----------------------------------------------------------------------------------------------------------
@@ -110,7 +114,7 @@ def run_init(options: argparse.Namespace) -> Result:
 def run_start(options: argparse.Namespace) -> Result:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.findings import findings_text
+    from uncertain_lti.reports.findings import NO, findings_text
     from uncertain_lti.reports.pages import page_target
 
     signals, model, page = (f"{options.output}{ending}" for ending in (".yaml", ".model.json", ".html"))
@@ -124,9 +128,7 @@ def run_start(options: argparse.Namespace) -> Result:
     else:
         group_recordings(options.check or [])
         parts["init"] = _part(options, ["init", *options.bags, "--output", signals]).data
-        for kind in ("states", "controls"):
-            names = ", ".join(signal["name"] for signal in parts["init"][kind])
-            options.say(f"{kind}: {names or 'none found'}")
+        options.say(_proposed(parts["init"]))
         options.say(f"signals file written to {signals}: it says why; edit it and start again with --force")
     forced = ["--force"] * options.force
     parts["fit"] = _part(options, ["fit", *options.bags, "--signals", signals, "--output", model, *forced]).data
@@ -134,7 +136,10 @@ def run_start(options: argparse.Namespace) -> Result:
     if report.data is None:  # no recording could be checked, which is said
         return report
     options.say(findings_text(report.data))
-    options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{_on_the_robot(model)}")
+    then = _on_the_robot(model)
+    if report.data["rely"]["answer"] == NO:
+        then = f"not on the robot yet: mend what is said above, in {signals} or by recording, and start with --force"
+    options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{then}")
     return Result(report.status, {**parts, "findings": report.data, "exit_status": report.status})
 
 
@@ -148,7 +153,7 @@ def _part(options: argparse.Namespace, words: list[str]) -> Result:
 def _on_the_robot(model: str) -> str:
     file = os.path.basename(model)
     return (
-        "on the robot, with this program installed there:\n"
+        "on the robot, with this program installed there (docs/howto/deploy.md):\n"
         f"  scp {shlex.quote(model)} ROBOT:\n"
         f"  envelope_monitor --ros-args -p model:={shlex.quote(file)}\n"
         "  ros2 topic echo /envelope_monitor/violation"

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import os
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -104,7 +105,7 @@ def findings(
             "reasons": [dict(zip(("weight", "about", "text"), reason, strict=True)) for reason in reasons],
         },
         "happened": [_happened(r) for r in recordings],
-        "sees": _sees(model, validation),
+        "sees": _sees(model, os.fspath(model_file), validation),
         "alarm": any(r["alarm"] for r in recordings),
         "rule": {
             "words": "; or ".join(one.words for one in rules),
@@ -165,14 +166,18 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     return {"recording": recording["recording"], "state": state, "text": text}
 
 
-def _sees(model: UncertainLTI, validation: Mapping[str, Any] | None) -> dict[str, Any]:
+def _sees(model: UncertainLTI, file: str, validation: Mapping[str, Any] | None) -> dict[str, Any]:
     """Which faults it would see: those of the validation, else the jumps that the alarm promises to see."""
-    faults, validate = detectable_data(validation or {}), "run uncertain-lti validate MODEL --output MODEL"
+    faults, name = detectable_data(validation or {}), shlex.quote(file)
+    validate = f"`uncertain-lti validate {name} --output {name}` finds it out"
     if faults is not None and not faults.get("refused"):
         answer = f"within {number(faults['within'])} s, from these sizes on"
         return {"answer": answer, "texts": detectable_words(faults)}
     if faults is None and (jumps := [text for text in _promises(model) if _is_jump(text)]):
-        return {"answer": "jumps of these sizes", "texts": [*jumps, f"of others: {validate}"]}
+        return {
+            "answer": "jumps of these sizes",
+            "texts": [*jumps, f"of drifts, noise, stuck sensors and more: {validate}"],
+        }
     return {"answer": "unknown", "texts": [faults["refused"] if faults else validate]}
 
 

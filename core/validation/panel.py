@@ -38,7 +38,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import lasting, plural, shortlist
 from uncertain_lti.identification.memory import as_text, of_text
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -65,6 +65,8 @@ BLIND = 0.5
 """A bias of more than this share of the range of a state is no fault worth an alarm."""
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
+_FAR = 10.0
+"""A jump of so many times the range of a state is none that anybody need be told the size of."""
 _NOTHING = 1e-9
 """Size from which on a peak is one."""
 
@@ -429,7 +431,9 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"worth having within what was recorded: {plural(count, panel.what)} of {panel.units} {verb} not repeat "
             f"what the others show, so nothing vouches for operation that none of them shows"
         )
-    sees = f"it sees jumps of {share.min():.2g} to {share.max():.2g} of the recorded ranges"
+    low, high = (f"{100 * extreme:.2g}" for extreme in (share.min(), share.max()))
+    ranges = f"{low} % of the recorded range" if low == high else f"{low} to {high} % of the recorded ranges"
+    sees = f"it sees jumps of {ranges}"
     if panel.what == "block":
         return "some", (
             f"worth having while the machine runs as in the one recording, which says nothing of another day: check it "
@@ -439,27 +443,28 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
 
 
 def _of_range(share: float) -> str:
-    return f"{share:.0%} of" if share < 10.0 else "over ten times"
+    return f"{share:.0%} of" if share < _FAR else "over ten times"
 
 
 def promises(model: UncertainLTI, panel: Panel) -> list[str]:
     """What the panel promises, a sentence each: false alarms, jumps seen, and what rate was asked for."""
-    signals = model.signals.states
-    each = [
-        f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "")
-        for s, b in zip(signals, panel.biases.tolist(), strict=True)
-    ]
+    span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    of = list(zip(model.signals.states, panel.biases.tolist(), (panel.biases < _FAR * span).tolist(), strict=True))
+    each = [f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "") for s, b, near in of if near]
+    blind = [s.name for s, _, near in of if not near]
+    sees = [f"a jump of {', '.join(each)}"] if each else []
+    sees += [f"of {shortlist(blind, 4)} not even a jump of ten times the recorded range"] if blind else []
     if math.isfinite(panel.limit):
         first = (
-            f"false alarms: at most {panel.limit:.2g} per hour with {CONFIDENCE:.0%} confidence, while the machine is "
-            f"run as in the recordings ({panel.alarms} in {panel.hours:.3g} h left out, "
+            f"false alarms: at most {float(f'{panel.limit:.2g}'):.7g} per hour with {CONFIDENCE:.0%} confidence, while "
+            f"the machine is run as in the recordings ({panel.alarms} in {lasting(panel.hours)} left out, "
             f"{plural(panel.units, panel.what)})"
         )
     else:
         first = "false alarms: one stretch says nothing of their rate; record more"
-    found = [first, f"sees within {panel.within:.3g} s a jump of {', '.join(each)}"]
+    found = [first, f"sees within {panel.within:.3g} s {'; '.join(sees)}"]
     if panel.asked is not None and not panel.limit <= panel.asked:
         more = panel.needed_hours - panel.hours
-        remedy = f"{more:.3g} h more without an alarm would" if more > 0 else "record more"
+        remedy = f"{lasting(more)} more without an alarm would" if more > 0 else "record more"
         found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {remedy}")
     return found
