@@ -258,6 +258,7 @@ def test_a_short_recording_is_drawn_sample_by_sample():
     panel = page["views"]["values"][0]
     assert [p["title"] for p in page["views"]["values"]] == ["x1", "x2", "u1"] and "greatest" not in panel["values"]
     (top,) = page["top"]
+    assert top["title"] not in page["note"] and top["note"] not in page["note"], "it is said above the panel"
     assert top["levels"] == [1.0] and np.nanmax(array(top["values"]["least"])) > 1 and "x1" in top["note"]
     shown, drawn = times(page["times"][0]), array(panel["values"]["least"])
     assert (

@@ -171,6 +171,12 @@ def test_an_image_on_a_full_disk_is_one_sentence_that_names_it(tmp_path, monkeyp
         save(figure, tmp_path / "f.svg")
 
 
+def test_half_widths_that_are_rounding_are_left_blank():
+    model = by_hand(2, 1).replace(dA=np.array([[0.5, 1e-14], [0.25, 0.0]]))
+    written = [text.get_text() for text in matrices_figure(model).axes[1].texts]
+    assert {"0.5", "0.25"} <= set(written) and not [text for text in written if "e-14" in text]
+
+
 @pytest.mark.parametrize("n, width", [(2, 0.0), (2, 1.0), (50, 1.0)])
 def test_matrices_and_coverage(n, width, tmp_path):
     model = by_hand(n, 4, LONG, width)

@@ -43,6 +43,7 @@ _LOOKS = {
 }  # fmt: skip
 _MOST_ROWS = 48  # elements in a heat map
 _NUMBERS = 250  # cells whose numbers are written
+_ROUNDED = 1e-9  # share of the largest half-width that is rounding
 
 
 def alarm_figure(
@@ -217,7 +218,7 @@ def matrices_figure(model: UncertainLTI) -> Any:
         _Grid("A | B, nominal elements [1/s]", rows, columns, nominal, "signed", parted, doubtful),
         _Grid("ΔA | ΔB, half-widths [1/s]", rows, columns, half, "width", parted),
     ]
-    return _heat_maps(grids, f"{note}dot: the half-width is greater than the element; white: zero")
+    return _heat_maps(grids, f"{note}dot: the half-width is greater than the element; blank: zero, or as good as")
 
 
 def coverage_figure(model: UncertainLTI, checked: Verdicts | Sequence[Verdicts]) -> Any:
@@ -423,7 +424,9 @@ def _heat_maps(grids: Sequence[_Grid], note: str) -> Any:
     figure = _new_figure(max(label + width + 0.9, 4.6), len(grids) * (height + 0.55) + below + 0.3)
     axes = figure.subplots(len(grids), 1, sharex=True, squeeze=False)[:, 0]
     for axis, grid in zip(axes, grids, strict=True):
-        shown = np.where(grid.values == 0.0, np.nan, grid.values) if grid.kind == "width" else grid.values
+        shown = grid.values
+        if grid.kind == "width":
+            shown = np.where(shown <= _ROUNDED * np.nanmax(shown, initial=0.0), np.nan, shown)
         image = axis.imshow(shown, **_scale(grid.values, grid.kind), aspect="auto", interpolation="nearest")
         bar = figure.colorbar(image, ax=axis, fraction=0.04, pad=0.01)
         bar.minorticks_off()
@@ -435,14 +438,14 @@ def _heat_maps(grids: Sequence[_Grid], note: str) -> Any:
         axis.set_yticks(range(len(rows)), rows, fontsize=size)
         for place in grid.parted:
             axis.axvline(place - 0.5, color=RECORDED, linewidth=0.8)
-        for i, j in np.argwhere(np.isfinite(grid.values)) if numbers else ():
+        for i, j in np.argwhere(np.isfinite(shown)) if numbers else ():
             red, green, blue, _ = image.cmap(image.norm(grid.values[i, j]))
             ink = "w" if 0.3 * red + 0.6 * green + 0.1 * blue < 0.5 else "k"
             if (value := float(grid.values[i, j])) or grid.kind == "share":
                 axis.text(j, i, _brief(value), ha="center", va="center", fontsize=6.5, color=ink)
         if grid.marked is not None:
             i, j = grid.marked.nonzero()
-            axis.plot(j + 0.36, i - 0.3, ".", color=VIOLATED, markersize=5 if numbers else 3)
+            axis.plot(j + 0.36, i - 0.3, "o", color=VIOLATED, mec="w", mew=0.5, markersize=3.5 if numbers else 2)
         axis.set_xlim(-0.5, len(columns) - 0.5)
     some = range(0, len(columns), math.ceil(len(columns) * size / (72 * max(width, 0.6))))
     axes[-1].set_xticks(some, [columns[j] for j in some], rotation=90, fontsize=size)

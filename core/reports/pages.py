@@ -264,7 +264,7 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
     }
     run, controls = verdicts.transient, [(s.name, s.unit) for s in model.signals.controls]
     views["values"] += _panels(columns, run.u, controls, "control")
-    note = f"{charts.heading(verdicts)}. {top.title}: {top.note}{_how(columns)}."
+    note = f"{charts.heading(verdicts)}{_how(columns)}."
     name = charts.base_name(run.name)
     return Plotted(name, note, list(views.items()), [(columns, top)], columns.alarms, columns.silent)
 
