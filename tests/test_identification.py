@@ -514,6 +514,15 @@ def test_known_kinematics_leave_only_the_noise():
         assert count_outside(model, [noisy]) == 0 and 1e-4 < model.v[0] < 1e-3
 
 
+def test_half_widths_that_the_largest_width_leaves_open_are_the_least():
+    """One sample alone is as wide as the largest width where A is known: the others are no wider than they need be."""
+    x = np.ones((201, 1))
+    for k in range(200):  # disturbed in proportion to x
+        x[k + 1] = x[k] * (1.1 if x[k] < 0.5 else 0.9)
+    model = with_structure(Transient(np.arange(201) * 0.1, x, np.empty((201, 0))), "noise", "lp", fixed={"A": [[0.0]]})
+    assert model.dA == pytest.approx(1.0, rel=1e-4) and model.v < 1e-5
+
+
 def test_contradictions_of_a_structure_are_named():
     transient = drawn(small_plant(1), 50, 1)
     nan = np.nan

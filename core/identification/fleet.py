@@ -32,9 +32,8 @@ T = TypeVar("T")
 
 _LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
-_PART, _PART_NUMBERS = 100_000, 2_000_000
-"""Transitions per part, about, of many states so many numbers: the sums of the parts are added in their order, however
-many threads there are."""
+_PART = 100_000
+"""Transitions per part, about: the sums of the parts are added in their order, however many threads there are."""
 _COMPARED = 20_000
 """Residuals that the two forms of `model.residuals` are compared on, about."""
 
@@ -60,7 +59,7 @@ class Fleet:
     @classmethod
     def of(cls, problem: Problem) -> Fleet:
         """A problem in memory, in parts for all cores if it is large; how many there are depends on its size alone."""
-        count = max(problem.N // _PART, problem.N * problem.p // _PART_NUMBERS, 1)
+        count = max(problem.N // _PART, 1)
         edges = np.linspace(0, problem.N, count + 1).astype(int).tolist()
         return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)], min(count, core_count()))
 
