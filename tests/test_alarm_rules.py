@@ -178,6 +178,8 @@ def test_a_state_that_follows_from_others_adds_nothing_to_the_chi_square() -> No
     C = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     white = Residuals(np.zeros(3), C).whitening([True] * 3)
     assert np.array_equal(white, [[1.0, 0, 0], [0, 0, 0], [0, 0, 0]])
+    of_one = np.outer(v := [3.0, 0.7, 1.9], v)  # rounding leaves 1e-16 of the others
+    assert not Residuals(np.zeros(3), of_one).whitening([True] * 3)[1:].any()
 
 
 @pytest.mark.parametrize("scheduled", [False, True])

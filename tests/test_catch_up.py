@@ -246,6 +246,13 @@ def test_another_clock_of_a_publisher_changes_no_order(ahead: float) -> None:
     assert [topic for topic, _, _ in released] == order
 
 
+def test_messages_of_one_topic_stay_as_they_came_where_its_clock_steps_back() -> None:
+    catch_up = waiting()
+    for k, sent_at in enumerate((0.3, 0.1, 0.2)):
+        put(catch_up, "x", k, sent_at, 0.3 + 1e-3 * k)
+    assert [k for _, k, _ in catch_up.finish(1.0)] == [0, 1, 2] and catch_up.reordered == 0
+
+
 def test_messages_of_which_nobody_knows_when_they_were_sent_stay_as_they_came() -> None:
     catch_up = waiting()
     for k in range(40):

@@ -18,11 +18,12 @@ from bag_writer import Message, Topic, float64, write
 from engine_bag import joint_state
 from perturbed import GEAR as MODE
 
-from uncertain_lti import EnvelopeMonitor, read_transients
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor.alarm import Arming, Condition
+from uncertain_lti.monitor.deployed import DeployedMonitor
 from uncertain_lti.monitor.session import Rule
 from uncertain_lti.plants.leibov import CONTROL_TOPIC as CONTROL
 from uncertain_lti.plants.leibov import STATE_TOPIC as STATE
@@ -144,6 +145,17 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
     assert "from 3 s" in said and "first at" in said
     first_alarm = float(said.split("first at ")[1].split()[0])
     assert first_alarm >= 3.0
+
+
+@pytest.mark.parametrize("values", [[0.0, 1.0], [1.0, 0.0]])
+def test_from_a_time_on_the_condition_is_the_last_that_was_heard(values):
+    """As if the node were started then, with the condition known; the last sample is the one at the end asked for."""
+    none = np.empty((1, 0))
+    monitor = EnvelopeMonitor(UncertainLTI([[0.0]], none, [[0.0]], none, v=[0.1]))
+    deployed = DeployedMonitor(monitor, Condition.parse("/mode data == 1"), start=3.0, stop=5.0)
+    verdicts = deployed.check(Transient(np.arange(7.0), np.arange(7.0), []), [1, 2], values)
+    assert verdicts.judged.tolist() == [False] * 4 + [True] * 2 + [False]
+    assert verdicts.alarm.tolist() == [False] * 4 + [values[-1] == 1.0] * 2 + [False]
 
 
 @pytest.mark.parametrize(

@@ -376,17 +376,18 @@ def test_a_masked_state_and_a_model_without_repeats_are_not_watched(model: Uncer
 
 def test_a_machine_that_is_active_is_not_parked() -> None:
     """The control goes to and fro, so the model never moves the state by its wide half-width; three steps tell."""
-    u = np.repeat([1.0, -1.0] * 40, 2)
-    x = np.zeros((len(u), 1))
-    x[:40, 0] = 0.01 * np.arange(40)  # fresh values first
-    x[40:, 0] = x[40, 0]
-    transient = Transient(0.1 * np.arange(len(u)), x, u[:, None])
-    for beyond, told in ((0.3, True), (0.5, False)):
-        repeats = Repeats([60.0], [0.4], [0.4], [beyond])  # of a machine that was parked for a minute
-        model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
-        frozen = EnvelopeMonitor(model).check(transient).frozen[:, 0]
-        assert np.flatnonzero(frozen).tolist() == (list(range(43, len(u))) if told else [])
-        same_as_live(model, transient)
+    for dt, each, limits in ((0.1, 2, (0.3, 0.5)), (0.25, 1, (0.9, 1.1))):
+        u = np.tile(np.repeat([1.0, -1.0], each), 80 // each)
+        x = np.zeros((len(u), 1))
+        x[:40, 0] = 0.01 * np.arange(40)  # fresh values first
+        x[40:, 0] = x[40, 0]
+        transient = Transient(dt * np.arange(len(u)), x, u[:, None])
+        for beyond, told in zip(limits, (True, False), strict=True):
+            repeats = Repeats([60.0], [0.4], [0.4], [beyond])  # of a machine that was parked for a minute
+            model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats)
+            frozen = EnvelopeMonitor(model).check(transient).frozen[:, 0]
+            assert np.flatnonzero(frozen).tolist() == (list(range(43, len(u))) if told else [])
+            same_as_live(model, transient)
     parked = Transient(transient.t_ns, np.zeros_like(x), np.ones_like(transient.u))
     assert not EnvelopeMonitor(model.replace(repeats=Repeats([60.0], [40.0], [40.0], [0.0]))).check(parked).frozen.any()
 
@@ -401,6 +402,10 @@ def test_a_fit_learns_how_active_a_machine_is_whose_state_changes(model: Uncerta
     assert (0.0 < learnt).all() and (learnt < briefly).all()
     held_once = repeats_of(model, [*many, held(run(5), 0, 200, 350)]).active_beyond
     assert held_once[0] > learnt[0] and held_once[1] == pytest.approx(learnt[1], rel=0.2)
+    one, t = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5]), np.arange(80)
+    for x, left_out in ((t // 2, True), (t * 3 // 4, False)):  # half of four steps, and one of them, repeat
+        windows = repeats_in(one, Transient(0.25 * t, x[:, None], np.zeros((80, 1)))).windows
+        assert len(windows) == 20 and np.isnan(windows).all() == np.isnan(windows).any() == left_out
 
 
 def noisy(seed: int, steps: int = 1500) -> Transient:

@@ -161,7 +161,8 @@ def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(
         for which in (LOWER, UPPER, RESIDUAL, FLAGS, UTILISATION):
             assert same(found.numbers(which), numbers[which]), which
         assert same(lower, numbers[LOWER]) and same(upper, numbers[UPPER])
-        assert found.contained == (not numbers[FLAGS].any()) and found.unknown_regime == strange
+        assert found.contained == (not numbers[FLAGS].any())
+        assert found.unknown_regime == strange == model.unknown(z[:, None])[0]
         assert found.violation == bool((numbers[FLAGS] * counted).any())
         flags |= set(numbers[FLAGS])
         unknown += strange

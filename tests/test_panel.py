@@ -20,7 +20,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
-from uncertain_lti.validation.panel import CONFIDENCE, Panel, learn, promises, rules_for, worth
+from uncertain_lti.validation.panel import CONFIDENCE, Evidence, Panel, learn, promises, rules_for, worth
 from uncertain_lti.validation.part import fitted_parts
 from uncertain_lti.validation.result import false_alarms
 
@@ -113,6 +113,43 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
     weights = [part.judged for part in parts]
     half = np.average([part.usual_width for part in parts], axis=0, weights=weights) / 2
     np.testing.assert_allclose(panel.biases, half * np.sqrt(energy.thresholds(2)), rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("what", "count", "verdicts", "taken"),
+    [
+        ("recording", 3, 4000, "a"),
+        ("recording", 3, 400, "as"),
+        ("recording", 4, 4000, "an"),
+        ("recording", 4, 400, "asn"),
+        ("block", 5, 4000, "an"),
+        ("block", 5, 400, "as"),
+    ],
+)
+def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
+    """A window of ten steps, so 200 windows or 20, which are few: with an allowance, shared, and of the next one."""
+    peaks, top, windows = np.ones((count, 2)), np.array([4.0, 8.0]), verdicts / 2 / 10
+    peaks[1::2, 1] = 8.0
+    logs = np.log(peaks)
+    spread = math.sqrt((1 + 1 / count) * logs.var(axis=0, ddof=1).mean())
+    limits = {
+        "a": 0.5 + math.sqrt(math.log(2 * windows) / math.log(windows)) * (top - 0.5),
+        "s": np.exp(logs.mean(axis=0)) * 4.0,
+        "n": np.exp(logs.mean(axis=0) + scipy.stats.t.ppf(0.95 if what == "block" else 0.9, count - 1) * spread),
+    }
+    one, rule = Evidence(peaks, top, np.full(2, 0.5), verdicts, np.ones((2, 2)), 1, 1, DT), StatisticRule("mean", 1, 1)
+    (found,) = one.thresholds([rule], 2, what)
+    np.testing.assert_allclose(found, np.max([limits[kind] for kind in taken], axis=0), rtol=1e-12)
+    assert one.learnt([rule], what)[0].threshold == tuple(found)
+    assert one.learnt([StatisticRule("energy", 1, 1)], what)[0].threshold == tuple(found**2)
+
+
+def test_the_limit_counts_a_cluster_of_alarms_for_every_rule_but_one():
+    rules = [StatisticRule("energy", window, 1) for window in (0, 1, 3)]
+    counts, near = np.array([0.0, 1.0, 0.0, 0.0]), np.array([0.0, 3.0, 1.0, 0.0])  # clusters of (9 + 1) / 4
+    one = Evidence(np.ones((4, 6)), np.ones(6), np.ones(6), 400, np.ones((2, 2)), 1, 5.0, DT, 1.0, counts, near)
+    limit = rate_interval(counts + 2 * 2.5 / 4, 5.0, CONFIDENCE, 2.5, one_sided=True)[1]
+    assert Panel.of(one, rules, "recording", (), None).limit == pytest.approx(limit, rel=1e-12)
 
 
 def test_thresholds_of_a_single_recording_are_for_one_more_block():

@@ -47,7 +47,12 @@ def test_rate_interval_of_single_events_is_garwoods(total, parts):
     counts[:total] = 1
     low, high = rate_interval(counts, 2.0, 0.9)
     exact = (stats.chi2.ppf(0.05, 2 * total) / 2 if total else 0.0, stats.chi2.isf(0.05, 2 * total + 2) / 2)
-    assert low <= exact[0] / 2.0 and high >= exact[1] / 2.0
+    tail, of = stats.norm.cdf(stats.t.ppf(0.05, parts - 1)), 2 * total
+    wide = (stats.chi2.ppf(tail, of) / 4.0 if total else 0.0, stats.chi2.isf(tail, of + 2) / 4.0)
+    assert (low, high) == pytest.approx(wide, rel=1e-9) and low <= exact[0] / 2.0 and high >= exact[1] / 2.0
+    assert rate_interval(counts, 2.0, 0.95, one_sided=True) == (0.0, pytest.approx(high))
+    in_fours = stats.chi2.isf(tail, of / 4.0 + 2)  # alarms are known to come so
+    assert rate_interval(counts, 2.0, 0.9, 4.0)[1] == pytest.approx(in_fours)
     if parts == 200:
         assert (low, high) == pytest.approx(np.array(exact) / 2.0, rel=0.02)
 
