@@ -256,6 +256,8 @@ def test_a_verdict_counts_while_the_condition_holds_and_its_grace_is_over() -> N
     assert not arming.at(130) and not arming.at(125, steps_back=True)
     arming.learn(3.0)
     assert [arming.at(t) for t in (140, 159, 160)] == [False, False, True]
+    said = [arming.said_on(Condition.parse(f"/machine/{which} < 7")) for which in ("mode data", "mode x", "x data")]
+    assert said == [3.0, None, None]
     arming.restart(200)
     assert [arming.at(t) for t in (201, 219, 220)] == [False, False, True]
     arming.restart()

@@ -119,6 +119,11 @@ def test_a_free_run_follows_its_own_memory_and_its_radius_is_that_of_the_recursi
     free = model.simulate((values[1:2] - 2.0) / 4.0, u, dt)
     np.testing.assert_allclose(free[:, 0] * 4.0 + 2.0, values[1:], rtol=1e-9)
     assert model.spectral_radius() == pytest.approx(math.sqrt(0.8))
+    steps = np.where(np.arange(30) % 2, 0.2, 0.1)
+    run = model.simulate((values[1:2] - 2.0) / 4.0, u, steps)[:, 0]
+    of_run = recall(4.0 * run + 2.0, Memory(kind), np.append(math.nan, steps), np.arange(31) == 0)
+    moved = steps * (model.A[0, 0] * run[:-1] + model.B[0, 0] * (of_run[:-1] - memory.steady) / 3.0)
+    np.testing.assert_allclose(np.diff(run)[1:], moved[1:], rtol=1e-9, atol=1e-12)
 
 
 def test_a_model_that_remembers_has_a_newer_format_and_an_older_one_may_not_say_so() -> None:
