@@ -29,6 +29,7 @@ from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import BLOCK
+from uncertain_lti.proposal import public_fit
 from uncertain_lti.reports.model_text import fit_text, next_text
 
 ARRAYS = ("A", "B", "dA", "dB", "c", "dc", "v")
@@ -63,6 +64,25 @@ def test_from_disk_as_in_memory(bags, tmp_path, criterion, additive):
     model = fit(transients, criterion, additive=additive)
     same = fit_archive(paths, signals, criterion, additive, cache=tmp_path / "cache")
     equal(same, model)
+
+
+def test_an_archive_has_the_alarm_of_a_fit(bags, tmp_path, monkeypatch):
+    """Of all recordings where memory holds them, of some spread over them where it does not."""
+    signals, paths = bags
+    model = uncertain_lti.fit(read_transients(paths, signals))
+    same = public_fit.fit_many(paths, signals, cache=tmp_path / "all")
+    equal(same, model)
+    assert [rule.to_dict() for rule in same.alarm] == [rule.to_dict() for rule in model.alarm]
+    assert same.fit_summary["alarm"] == model.fit_summary["alarm"]
+    assert same.validation["parts"] == model.validation["parts"] == 8
+    monkeypatch.setattr(public_fit, "SAMPLE", sum(t.x.size + t.u.size for t in read_transients(paths[:7:2], signals)))
+    some = public_fit.fit_many(paths, signals, cache=tmp_path / "some")
+    equal(some, fit(read_transients(paths, signals), some.fit_summary["criterion"]))
+    assert some.fit_summary["alarm"]["note"] == "learnt on 4 of 8 recordings, as many as memory is for"
+    assert some.fit_summary["alarm"]["units"] == 4 and some.alarm != model.alarm
+    by_hand = public_fit.fit_many(paths, signals, "qp", alarm="containment", cache=tmp_path / "hand")
+    equal(by_hand, fit(read_transients(paths, signals), "qp"))
+    assert [rule.kind for rule in by_hand.alarm] == ["containment"]
 
 
 def random_problem(seed, N, n=3, m=2, noise=1e-3):

@@ -94,7 +94,7 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
 
 
 def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
-    from uncertain_lti.identification.archive import fit_archive
+    from uncertain_lti.proposal.public_fit import fit_many
 
     for given, what, also in (
         (options.discard, "--discard goes through all transitions", ""),
@@ -118,8 +118,9 @@ def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
             except (OSError, TimeoutError, ValueError):
                 raise FitError(f"no Dask scheduler answers at {where}; start one with `dask scheduler`") from None
         with options.progress.stage("fitting") as step:
+            asked = {name: getattr(options, name) for name in ("additive", "alarm", "false_alarms")}
             given = {"schedule": schedule, "cache": options.cache, "client": client, "progress": step}
-            model = fit_archive(options.bags, options.signals, options.criterion or "qp", options.additive, **given)
+            model = fit_many(options.bags, options.signals, options.criterion, **asked, **given)
     return _with_sources(model, model.fit_summary["sources"])
 
 

@@ -145,12 +145,7 @@ def fit_archive(
     on = signals_of(schedule, [s.name for s in signals.signals])
     messages = unused([s.name for s in signals.scheduling], on)
     signals = signals.scheduled_on(on)
-    for signal in signals.signals:
-        if "auto" in (signal.steady, signal.scale):
-            raise SignalError(
-                f"{signals.source}: '{signal.name}' has auto, and an archive is read one recording at a time; write "
-                f"numbers (a fit to a few of the recordings prints them)"
-            )
+    refuse_auto(signals)
     say = progress or (lambda text: None)
     bags = group_recordings(list(paths), indexed=True, layout=signals.table)
     if not bags:
@@ -226,6 +221,16 @@ def fit_archive(
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
     return with_repeats(model.replace(fit_summary=facts), visit("repeats in", repeats, model))
+
+
+def refuse_auto(signals: SignalMap) -> None:
+    """Steady states and scales that are to be found need all recordings at once."""
+    for signal in signals.signals:
+        if "auto" in (signal.steady, signal.scale):
+            raise SignalError(
+                f"{signals.source}: '{signal.name}' has auto, and an archive is read one recording at a time; write "
+                f"numbers (a fit to a few of the recordings prints them)"
+            )
 
 
 def _stream(recording: Recording, signals: SignalMap) -> Stream:

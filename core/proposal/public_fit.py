@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, Literal
@@ -20,6 +21,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
+from uncertain_lti.identification.archive import fit_archive, refuse_auto
 from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of, unused
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import Rule
@@ -28,10 +30,15 @@ from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.search import choose_horizons, choose_knots, knots_of, lengths_of
+from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.sampling.reading import load_signals, read_transients
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.values import Additive, HorizonRule, WidthChoice
-from uncertain_lti.validation.monitor_fit import choose_monitored
+from uncertain_lti.validation.monitor_fit import choose_monitored, monitored_like, point_of
+
+SAMPLE = 2e7
+"""Numbers of the recordings of an archive that are left out in turn, at most: 160 MB."""
 
 
 def fit(
@@ -213,11 +220,7 @@ def fit(
     options["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
     options |= {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
     if alarm == "panel" and method == "working-set":
-        ways: list[dict[str, Any]] = [
-            {"criterion": one, "additive": terms}
-            for terms in ((additive,) if additive else ("noise",) if asked else ("noise", "both"))
-            for one in ((criterion,) if criterion else ("lp", "qp"))
-        ]
+        ways = _ways(criterion, additive, bool(asked))
         if len(ways) > 2 and operating_point is None:
             ways.append({"criterion": "qp", "additive": "both", "centred": True})
         taken = choose_monitored(transients, ways, groups=groups, false_alarms=false_alarms, **options)
@@ -238,6 +241,70 @@ def fit(
         there = model.fit_summary.get("messages", [])
         model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
     return model
+
+
+def fit_many(
+    paths: Sequence[str | os.PathLike[str]],
+    signals: SignalMap | str | os.PathLike[str],
+    criterion: Literal["qp", "lp"] | None = None,
+    additive: Additive | None = None,
+    *,
+    schedule: Schedule | Mapping[str, Knots] | None = None,
+    alarm: Literal["panel", "containment"] | Sequence[Rule] = "panel",
+    false_alarms: float | None = None,
+    progress: Callable[[str], None] | None = None,
+    **where: Any,
+) -> UncertainLTI:
+    """`fit` over recordings that together need not fit in memory: the optimum of all, with what some of them leave out.
+
+    Criterion, additive term and panel are those of a `fit` of recordings from the whole row that have SAMPLE numbers
+    together; `where`: cache or client, as for `fit_archive`.
+    """
+    if not isinstance(signals, SignalMap):
+        signals = load_signals(signals, paths)
+    additive = additive or signals.additive
+    asked = asked_by(signals) if schedule is None else schedule
+    refuse_auto(signals.scheduled_on(signals_of(asked, [s.name for s in signals.signals])))
+    taken, some = None, list[Transient]()
+    if alarm == "panel":
+        bags = group_recordings(paths, indexed=True, layout=signals.table)
+        some = _some([list(bag.parts) for bag in bags], signals)
+        ways, said = _ways(criterion, additive, bool(asked)), {"describe_data": False, "progress": progress}
+        own = {"schedule": asked, "operating_point": point_of(some[0]), "false_alarms": false_alarms}
+        taken = choose_monitored(some, ways, **own, **said)
+        criterion, additive = (taken.model.fit_summary[name] for name in ("criterion", "additive"))
+    model = fit_archive(
+        paths, signals, criterion or "lp", additive or "noise", schedule=schedule, progress=progress, **where
+    )
+    if taken is None:
+        return model if isinstance(alarm, str) else model.replace(alarm=alarm)
+    count = len({run.sources for run in some})
+    note = f"learnt on {count} of {plural(len(bags), 'recording')}, as many as memory is for" * (count < len(bags))
+    return monitored_like(taken, model, some, false_alarms, note).finished()
+
+
+def _some(bags: Sequence[Sequence[os.PathLike[str]]], signals: SignalMap) -> list[Transient]:
+    """Recordings spread over the whole row, with SAMPLE numbers together."""
+    order = sorted(range(len(bags)), key=lambda i: int(f"{i:064b}"[::-1], 2))
+    found: dict[int, list[Transient]] = {}
+    left = SAMPLE
+    for i in order:
+        for run in read_transients(list(bags[i]), signals):
+            size = run.x.size + run.u.size + run.s.size
+            if size > left and found:
+                return [run for i in sorted(found) for run in found[i]]
+            found.setdefault(i, []).append(run if size <= left else run.replace(slice(0, int(len(run) * left / size))))
+            left -= size
+    return [run for i in sorted(found) for run in found[i]]
+
+
+def _ways(criterion: str | None, additive: str | None, scheduled: bool) -> list[dict[str, Any]]:
+    """Criteria and additive terms to choose from, the simplest first."""
+    return [
+        {"criterion": one, "additive": terms}
+        for terms in ((additive,) if additive else ("noise",) if scheduled else ("noise", "both"))
+        for one in ((criterion,) if criterion else ("lp", "qp"))
+    ]
 
 
 def _horizons_asked_for(

@@ -116,6 +116,17 @@ def fit_monitored(
         return Monitored(model, None, None, str(error), centred)
 
 
+def monitored_like(
+    taken: Monitored, model: UncertainLTI, transients: Sequence[Transient], rate: float | None, note: str
+) -> Monitored:
+    """The model of all recordings with the panel that some of them left out, as `taken` was; `note`: on which."""
+    if taken.panel is None:
+        return replace(taken, model=model)
+    seen, left = _seen(model, transients, _SHOWN), taken.validation and replace(taken.validation, model=model)
+    fitted = fitted_parts(model, transients) if left else seen.parts
+    return Monitored(*_armed(left or seen, fitted, rate), left, "; ".join(filter(None, (taken.why, note))))
+
+
 def _seen(model: UncertainLTI, transients: Sequence[Transient], most: float) -> Validation:
     """Some of what was fitted, so many transitions, judged by the fit as if it had been left out."""
     return Validation(model, fitted_parts(model, transients, most), "transients", 0.0, 0.9)
