@@ -236,6 +236,17 @@ def test_what_does_not_need_a_frozen_state_is_judged_on(masked: tuple[str, ...])
     same_as_live(model, transient, masked=masked)
 
 
+def test_a_masked_state_that_leaves_its_bounds_beside_a_frozen_one_raises_no_rule() -> None:
+    x = np.random.default_rng(0).uniform(-0.02, 0.02, (200, 3)) + 0.5
+    x[50:100, 2] = x[50, 2]
+    x[80, 1] += 5.0
+    transient = Transient(DT * np.arange(200), x, np.zeros((200, 1)))
+    verdicts = EnvelopeMonitor(three(), masked=("x2",)).check(transient)
+    assert verdicts.frozen[80].tolist() == [False, False, True] and verdicts.flags[80, 1] == 1.0
+    assert verdicts.alarm[80] and verdicts.raised(80) == ()
+    same_as_live(three(), transient, masked=("x2",))
+
+
 NOISY = [0.0], [0.0], [0.0], [LARGEST]
 
 

@@ -126,6 +126,13 @@ def test_a_pattern_starts_over_after_a_hundred_quiet_verdicts(model: UncertainLT
     assert [explainer.push(row, -side, side, quiet) for quiet in (0, 100, 101)] == [True, False, True]
 
 
+def test_one_sample_is_not_all_of_a_pattern() -> None:
+    pattern = Pattern((1,), 2)
+    for row in ([1e6, 0.0], [0.0, -10.0]):  # the first counts as 10
+        pattern.add(np.array([row]), np.ones(2))
+    np.testing.assert_allclose(pattern.signature("some").moments, [np.eye(2) / np.sqrt(2)], rtol=1e-12)
+
+
 def test_outside_the_fitted_domain_nothing_is_pointed_to(model: UncertainLTI) -> None:
     steps = (1, *(horizon.steps for horizon in model.horizons))
     table = np.tile(model.blocks[0].B[:, 0] * 100.0, (len(steps), 1))

@@ -152,26 +152,6 @@ def test_the_limit_counts_a_cluster_of_alarms_for_every_rule_but_one():
     assert Panel.of(one, rules, "recording", (), None).limit == pytest.approx(limit, rel=1e-12)
 
 
-def test_thresholds_of_a_single_recording_are_for_one_more_block():
-    """The limit of the largest size of the next block, where there are windows enough; in numpy."""
-    from uncertain_lti.identification import fit as plain
-
-    run = plant(3, steps=1500)
-    full = plain([run], "lp", additive="noise", describe_data=False)
-    left = validate([run], full=full, operating_point=full.operating_point, criterion="lp", additive="noise", blocks=5)
-    rules = learn(left, fitted_parts(full, [run])).rules
-    peaks = np.array([np.abs(p.utilisation).max(axis=0) for p in left.parts])
-    every = np.concatenate([*(np.abs(p.utilisation) for p in left.parts), np.abs(full_utilisation(full, run))])
-    N, median = len(every) / 2, np.median(every, axis=0)
-    allowed = median + math.sqrt(math.log(2 * N) / math.log(N)) * (every.max(axis=0) - median)
-    logs = np.log(peaks)
-    beyond = scipy.stats.t.ppf(0.95, 4) * math.sqrt((1 + 1 / 5) * logs.var(axis=0, ddof=1).mean())
-    one_more = np.exp(logs.mean(axis=0) + beyond)
-    assert (one_more > allowed).any()
-    found = np.sqrt(rules[0].thresholds(2))
-    np.testing.assert_allclose(found, np.maximum(allowed, one_more), rtol=1e-9)
-
-
 def test_false_alarms_are_counted_per_hour_of_verdicts(runs):
     """A margin that some verdicts of the left-out recordings exceed, counted in numpy."""
     parts = validate(runs, criterion="lp", additive="noise").parts

@@ -94,6 +94,15 @@ def test_a_message_that_cannot_be_read_leaves_the_condition_as_it_was(tmp_path: 
     assert not perturbed.difference(rows, perturbed.offline(model, rule, whole, tmp_path / "run.mcap"))
 
 
+def test_an_unexpected_error_ends_no_latched_alarm_and_no_count() -> None:
+    session = session_of(plain(), Rule(latch=True))
+    perturbed.live(session, both(0) + both(1) + both(2, a=0.9))
+    session.failed()
+    assert session.alarm and session.failures == 1
+    (row,) = perturbed.live(session, both(3))
+    assert (row["status"], row["alarm"], session.sampler.counters["samples"]) == (Status.FIRST, True, 4)
+
+
 def test_a_swapped_model_takes_values_that_did_not_count_for_the_one_before() -> None:
     """A control that is sent once does not come again when its limits are mended."""
     mended = plain()
