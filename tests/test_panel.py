@@ -10,6 +10,7 @@
 """The panel: what `fit` arms without being asked keeps to its promise, and what it says of its worth is so."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,8 +21,8 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
-from uncertain_lti.validation.panel import CONFIDENCE, Evidence, Panel, learn, promises, rules_for, worth
-from uncertain_lti.validation.part import fitted_parts
+from uncertain_lti.validation.panel import CONFIDENCE, Evidence, Panel, learn, promises, rules_for, sizes_of, worth
+from uncertain_lti.validation.part import fitted_parts, rising
 from uncertain_lti.validation.result import false_alarms
 
 DT = 0.1
@@ -110,6 +111,11 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
         assert math.sqrt(sample.thresholds(2)[i]) == pytest.approx(expected, rel=1e-9)
         window = [np.convolve(p.utilisation[:, i] ** 2, np.ones(10) / 10, "valid").max() for p in parts]
         assert energy.thresholds(2)[i] > max(window) * (1 - 0.06)  # a window of 10.5 steps
+    rules, evidence = [replace(rule, threshold=1.0) for rule in panel.rules], panel.evidence
+    limits = np.concatenate(evidence.thresholds(rules, 2, "recording"))
+    levels = [(np.hstack(sizes_of(rules, part)) / limits).max(axis=1) for part in parts]
+    near = min(1.0, max(0.95 * sorted(each.max() for each in levels)[-3], 0.75))  # just below the third largest
+    assert evidence.near.tolist() == [rising(v > near, p.starts) for v, p in zip(levels, parts, strict=True)]
     weights = [part.judged for part in parts]
     half = np.average([part.usual_width for part in parts], axis=0, weights=weights) / 2
     np.testing.assert_allclose(panel.biases, half * np.sqrt(energy.thresholds(2)), rtol=1e-12)
@@ -142,6 +148,14 @@ def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
     np.testing.assert_allclose(found, np.max([limits[kind] for kind in taken], axis=0), rtol=1e-12)
     assert one.learnt([rule], what)[0].threshold == tuple(found)
     assert one.learnt([StatisticRule("energy", 1, 1)], what)[0].threshold == tuple(found**2)
+
+
+def test_evidence_of_more_recordings_adds_up():
+    """Medians by their verdicts, and widths by those that were left out."""
+    one = Evidence(np.ones((2, 1)), np.full(1, 2.0), np.ones(1), 300, np.array([[1.0], [2.0]]), 100, 1.0, DT)
+    both = one + Evidence(np.ones((3, 1)), np.ones(1), np.full(1, 5.0), 100, np.array([[3.0], [6.0]]), 300, 2.0, DT)
+    assert (both.peaks.shape, both.top, both.median, both.verdicts) == ((5, 1), 2.0, 2.0, 400)
+    assert (both.widths.tolist(), both.judged, both.hours) == ([[2.5], [5.0]], 400, 3.0)
 
 
 def test_the_limit_counts_a_cluster_of_alarms_for_every_rule_but_one():
@@ -308,8 +322,6 @@ def test_states_that_are_blind_are_named(runs):
     full = plain(runs, "lp", additive="noise", describe_data=False)
     left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
     panel = learn(left, fitted_parts(full, runs))
-    from dataclasses import replace
-
     span = full.domain.x_max - full.domain.x_min
     blind = replace(panel, biases=np.array([panel.biases[0], 0.51 * span[1]]))
     assert worth(full, blind)[0] == "some" and worth(full, blind)[1].startswith("sees only x1: of x2")
