@@ -214,14 +214,12 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     with nogil:
         while tiles.take():
             tiles.sizes(elements.p, psi)
-            for i in range(n):
+            for i in range(n):  # what a tile is filled up with is at its centre, of the least width
                 tiles.bounds(elements, i, psi, centre, half)
                 end, k = tiles.end + i * _TOGETHER, 0
                 for q in range(tiles.many):
                     k += not is_contained(lower_of(centre[q], half[q], 1.0), end[q], upper_of(centre[q], half[q], 1.0))
                 left_out[i] += k
-                for q in range(tiles.many, tiles.whole):
-                    half[q] = 0.0
                 width, weighted = 2.0 * greatest_of(half, tiles.whole), 0.0
                 most[0, i] = width if width > most[0, i] else most[0, i]
                 if each:
@@ -233,8 +231,6 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
                 for q in range(tiles.whole):
                     left[q] = end[q] - centre[q]
                     utilised[q] = utilisation_of(left[q], half[q])
-                for q in range(tiles.many, tiles.whole):
-                    utilised[q] = left[q] = 0.0
                 sum_of[0, i] += dot(utilised, tiles.ones, tiles.whole)
                 sum_of[1, i] += dot(left, tiles.ones, tiles.whole)
                 for q in range(tiles.many if tiles.corners else 0):
