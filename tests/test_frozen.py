@@ -411,7 +411,9 @@ def test_a_fit_learns_how_active_a_machine_is_whose_state_changes(model: Uncerta
     learnt = repeats_of(model, many).active_beyond
     briefly = repeats_of(model, [run(1), run(2, rest=(3.0, 3.5)), run(3), run(4)]).active_beyond
     assert (0.0 < learnt).all() and (learnt < briefly).all()
-    held_once = repeats_of(model, [*many, held(run(5), 0, 200, 350)]).active_beyond
+    found = [repeats_in(model, transient) for transient in (*many, held(run(5), 0, 200, 350))]
+    held_once = together(model.n, found).active_beyond
+    assert held_once[0] == 2.0 * max(one.most[3, 0] for one in found)
     assert held_once[0] > learnt[0] and held_once[1] == pytest.approx(learnt[1], rel=0.2)
     one, t = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5]), np.arange(80)
     for x, left_out in ((t // 2, True), (t * 3 // 4, False)):  # half of four steps, and one of them, repeat
