@@ -267,6 +267,8 @@ def test_what_is_foreseen_is_judged_when_the_longest_horizon_ends() -> None:
         assert packed[place_of("lower", model.n)] == found.lower.tobytes()
         assert packed[place_of("upper", model.n)] == found.upper.tobytes()
     assert EnvelopeMonitor(model.replace(horizons=())).foresee(0, [*x[0], *u[0]], dt) is None
+    of_modes = EnvelopeMonitor(with_horizons(rng, (2, 5), Schedule((Axis("x1", modes=(1.0, 2.0)),))))
+    assert [of_modes.foresee(0, [mode, 0.1, 0.3], dt) is None for mode in (1.0, 3.0)] == [False, True]
 
 
 @pytest.mark.parametrize("schedule", [None, SPEED])

@@ -226,7 +226,7 @@ def test_reset_forgets_everything() -> None:
     rng = np.random.default_rng(5)
     for kind in KINDS:
         one = statistic(kind, 0.1, allowance=0.1 if kind == "cusum" else 0.0)
-        first = one.push_all(np.full(90, 0.01), rng.normal(size=(90, 3)) * 9)
+        first = one.push_all(np.full(90, 0.03), rng.normal(size=(90, 3)) * 9)
         one.reset()
         assert not one.alarm and np.isnan(one.values()).all() and first[0].any()
         rows = rng.normal(size=(90, 3))
