@@ -14,8 +14,8 @@ import pytest
 from test_update import runs_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, fit
+from uncertain_lti.monitor.drift import Days, _student, drift_in_words
 from uncertain_lti.reports.check import check_data
-from uncertain_lti.reports.drift import _student, drift_in_words
 
 
 @pytest.fixture(scope="module")
@@ -44,6 +44,18 @@ def test_without_dates_recordings_are_counted(model):
     assert "a recording over 8 recordings" in text and "reaches its threshold of 1 in" in text
     (text,) = drift_in_words(model, checked(model, 0.3, 0.0, 0.0))
     assert "it is past its threshold of 1" in text
+
+
+def test_a_node_that_runs_for_weeks_says_it_of_its_days(model):
+    days, noon = Days(model), int(1.79e18)
+    for number in range(15):
+        for part in range(3):
+            assert days.words == [] or number > 5
+            peaks = [0.5 * 1.05**number / (1 + part), *[0.5] * (model.n - 1)]
+            days.take(noon + number * 86_400 * 10**9 + part, peaks)
+    (text,) = days.words
+    assert text.startswith("the largest utilisation of x1 rises by 41 % a week over 14 days")
+    assert "it reaches its threshold of 1 on 2026-10-0" in text
 
 
 def test_what_does_not_move_or_is_short_is_not_said(model):

@@ -97,6 +97,22 @@ def test_the_first_verdict_is_told_and_nothing_after_it() -> None:
     assert rig.lines == ["judging a, b; alarm when at least 2 of 5 verdicts violated; masked: b"]
 
 
+def test_a_state_that_drifts_from_day_to_day_is_told_once_a_day() -> None:
+    """Of days without an alarm, in the log and in diagnostics; an alarm is no drift."""
+    rig = Rig()
+    for day in range(8):
+        rig.send(20, off=0.3 * 1.1**day)
+        assert max(rig.session.period.largest) == pytest.approx(0.3 * 1.1**day, rel=1e-6)
+        report = rig.session.report(rig.now, TIMEOUT)[0]
+        for off in (3.0, 0.0):
+            rig.send(10, off)
+            rig.session.report(rig.now, TIMEOUT)
+        rig.t_ns += 86_400 * 10**9
+    words = [line for line in rig.lines if line.startswith("the largest utilisation of ")]
+    assert len(words) == 4 and words[0].startswith("the largest utilisation of a rises by 10 % a day over 6 days; ")
+    assert words[-1] in report.message and "over 7 days" in words[-1]
+
+
 def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end_is_none() -> None:
     rig = Rig()
     rig.send(10)

@@ -110,8 +110,8 @@ def _judged(options: argparse.Namespace) -> Judged:
 
 def run_check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
+    from uncertain_lti.monitor.drift import drift_in_words
     from uncertain_lti.reports.check import check_data, check_text, outcome
-    from uncertain_lti.reports.drift import drift_in_words
 
     judged = _judged(options)
     model, bags, deployed = judged.model, judged.bags, judged.deployed

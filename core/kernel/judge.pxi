@@ -39,6 +39,14 @@ cdef class Judgement:
         cdef Py_ssize_t n = len(self._values) // 5
         return self._values[which * n : which * n + n]
 
+    def reach(self, double[::1] largest):
+        """Raise the largest |utilisation| of each state so far to that of this transition."""
+        cdef Py_ssize_t i, n = largest.shape[0]
+        cdef const double* utilisation = self._values.data.as_doubles + 4 * n  # the last of them
+        for i in range(n):
+            if fabs(utilisation[i]) > largest[i]:
+                largest[i] = fabs(utilisation[i])
+
     def packed(self):
         """All of it, one kind after another, as bytes."""
         return self._values.tobytes()

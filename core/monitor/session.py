@@ -23,9 +23,11 @@ from typing import Any
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
 from uncertain_lti.model.repeats import Moved
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.deployed import listed_states as listed_states
+from uncertain_lti.monitor.drift import Days
 from uncertain_lti.monitor.frozen import frozen_words, repeat_words
 from uncertain_lti.monitor.likeness import Likeness
 from uncertain_lti.monitor.outputs import JUDGED
@@ -61,9 +63,15 @@ class Report:
 class Session(Stream):
     """A stream that reports on itself, in the words and levels of diagnostics; takes what `Stream` takes."""
 
+    def __init__(self, model: UncertainLTI, *args: Any, **kwargs: Any) -> None:
+        super().__init__(model, *args, **kwargs)
+        self.days = Days(model)
+
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call."""
         period = self.pass_over(now)
+        if period.verdicts and self.last is not None and not period.alarm:
+            self.days.take(self.last.t_ns, period.largest)
         without = self.without_verdict(now)
         reports = [self._report_monitor(period, now, without, state_timeout, problems)]
         for i, name in enumerate(self.model.state_names):
@@ -108,6 +116,7 @@ class Session(Stream):
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
             complaints.insert(0, "alarm: latched until ~/reset")
+        calm += self.days.words
         silent = self.silent_for(now)
         frozen = [self.frozen_text(moved) for moved in period.frozen.values()]
         if frozen and self.monitor.alarm and silent <= timeout:
@@ -385,6 +394,9 @@ class EventLog:
         if self._matter("arming").becomes(session.arming.on, now):
             condition = session.arming.condition or "there is no condition any more"
             self._log(OK, session.arming.why_off() or f"alarms count from now on: {condition}")
+        if (drift := session.days.words) and self._matter("drift").becomes(drift, now):
+            for text in drift:
+                self._log(OK, text)
         if session.caught_up and self._matter("catching up").becomes((session.reordered, session.caught_up), now):
             self._log(OK, session.caught_up)
         if (lags := session.lags) and self._matter("lags").becomes(tuple(lags), now):

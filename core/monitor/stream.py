@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from array import array
 from collections import Counter, deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -55,12 +56,13 @@ class Period:
     """What has happened since the last report.
 
     `began`: steady time, s; `verdicts`: verdicts given in it; `outside`: those from outside the fitted domain;
-    `unknown`: those of a regime that was not fitted; `last_unknown`: the last of these; `last_unlisted`: the last in it
-    on a mode that the model does not list; `alarm`: the alarm was raised at some time in it; `frozen, repeating`: by
-    number of the state, the last repeat of those that were frozen, and of others that repeat for longer than ever in
-    the fit; `withheld`: by number of the state, samples without a verdict on it as it needs a frozen one; `violations`:
-    by number of the state; `jumps`: the first jumps larger than any of the fit, in words; `statuses`: of the samples in
-    it; `counters, late, unreadable, future`: of the sampler, and of messages, when it began.
+    `unknown`: those of a regime that was not fitted; `last_unknown`: the last of these; `last_unlisted`: the last
+    in it on a mode that the model does not list; `alarm`: the alarm was raised at some time in it; `frozen,
+    repeating`: by number of the state, the last repeat of those that were frozen, and of others that repeat for
+    longer than ever in the fit; `withheld`: by number of the state, samples without a verdict on it as it needs a
+    frozen one; `violations`: by number of the state; `largest` (n,): largest |utilisation|; `jumps`: the first
+    jumps larger than any of the fit, in words; `statuses`: of the samples in it; `counters, late, unreadable,
+    future`: of the sampler, and of messages, when it began.
     """
 
     began: float
@@ -78,6 +80,7 @@ class Period:
     withheld: Counter[int] = field(default_factory=Counter)
     repeating: dict[int, Moved] = field(default_factory=dict)
     violations: Counter[int] = field(default_factory=Counter)
+    largest: array[float] = field(default_factory=lambda: array("d"))
     jumps: list[str] = field(default_factory=list)
     statuses: Counter[Status] = field(default_factory=Counter)
 
@@ -208,7 +211,7 @@ class Stream:
         self._behind: dict[str, deque[float]] = {}
         self._catches_up = self._catch_up(self._stamped, start=True) if math.isfinite(self._stall) else None
         self.reordered, self.caught_up = 0, ""
-        self.period = Period(now)
+        self.period = Period(now, largest=self._no_peaks())
 
     def _start(self) -> None:
         self.sampler = Sampler(self.model.signals)
@@ -449,6 +452,7 @@ class Stream:
             self.last, self._judged = verdict, now
             self.verdicts += 1
             period.verdicts += 1
+            verdict.reach(period.largest)
         if verdict.ordinary and not self.latched and self.reasons.text == QUIET:
             self._quiet += 1
             return
@@ -538,5 +542,9 @@ class Stream:
     def pass_over(self, now: float) -> Period:
         """Begin another period for `report`."""
         counts = self.late, self.unreadable.total(), self.future.total()
-        period, self.period = self.period, Period(now, Counter(self.sampler.counters), self.alarm, *counts)
+        period, largest = self.period, self._no_peaks()
+        self.period = Period(now, Counter(self.sampler.counters), self.alarm, *counts, largest=largest)
         return period
+
+    def _no_peaks(self) -> array[float]:
+        return array("d", bytes(8 * self.model.n))

@@ -207,6 +207,16 @@ class Verdict:
             return [math.nan] * len(self._after)
         return list[float](self._judgement.numbers(_OF_JUDGEMENT[name]).tolist())
 
+    def reach(self, largest: Any) -> None:
+        """Raise the largest |utilisation| of each state so far to that of a verdict that is judged.
+
+        Parameters
+        ----------
+        largest : array of doubles (n,)
+            Takes the result.
+        """
+        self._judgement.reach(largest)
+
     def packed(self) -> bytes:
         """All numbers, one kind after another; `place` says where each is.
 

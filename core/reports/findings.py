@@ -23,9 +23,9 @@ from uncertain_lti.base.text import finite_data, list_of, number, numbers_of, pl
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.overview import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.drift import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import UNVOUCHED, check_data
-from uncertain_lti.reports.drift import drift_in_words
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5

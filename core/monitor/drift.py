@@ -26,20 +26,40 @@ CHANCE, RECORDINGS = 0.01, 5
 """Share of checks in which a state at most seems to move that does not, and recordings from which on one shows it."""
 _WEEK, _YEAR_2001, _FAR = 7 * 86_400e9, 978_307_200e9, 520
 """ns; ns since 1970; weeks or recordings from which on nobody wants to know."""
+_DAY, _KEPT = 86_400 * 10**9, 60  # ns; days
 
 
-def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> list[str]:
+class Days:
+    """Largest utilisation of each state on each day without an alarm, of a monitor that runs for weeks."""
+
+    def __init__(self, model: UncertainLTI) -> None:
+        self._model = model
+        self._days: list[dict[str, Any]] = []
+        self.words: list[str] = []
+
+    def take(self, t_ns: int, largest: Sequence[float]) -> None:
+        """What the verdicts up to an instant reached; with a new day the words are those of the days before it."""
+        if not self._days or t_ns // _DAY != self._days[-1]["t_ns"] // _DAY:
+            if len(self._days) > RECORDINGS:
+                self.words = drift_in_words(self._model, self._days, "day")
+            states = {name: {"largest": 0.0} for name in self._model.state_names}
+            self._days = [*self._days[-_KEPT:], {"t_ns": t_ns, "verdicts": 1, "states": states}]
+        for state, value in zip(self._days[-1]["states"].values(), largest, strict=True):
+            state["largest"] = max(state["largest"], value)
+
+
+def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]], what: str = "recording") -> list[str]:
     """A sentence on each state whose largest utilisation moves, and when it reaches its threshold.
 
     Its logarithm is a line over the weeks, or over the recordings where their stamps are no dates; `recordings`: as of
-    `check_data`.
+    `check_data`; `what`: they are.
     """
     some = sorted((r for r in recordings if r["verdicts"]), key=lambda r: int(r["t_ns"]))
     if len(some) < RECORDINGS:
         return []
     stamps = np.array([r["t_ns"] for r in some], dtype=np.float64)
     dated = stamps[0] > _YEAR_2001 and stamps[-1] - stamps[0] > _WEEK
-    unit, at = ("week", (stamps - stamps[0]) / _WEEK) if dated else ("recording", np.arange(len(some)) * 1.0)
+    unit, at = ("week", (stamps - stamps[0]) / _WEEK) if dated else (what, np.arange(len(some)) * 1.0)
     x, found = at - at.mean(), []
     sure = _student(len(x) - 2, CHANCE / model.n)
     for name, limit in zip(model.state_names, _limits(model), strict=True):
@@ -50,10 +70,10 @@ def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
         if not abs(slope) > sure * error:  # not of what was not judged, either
             continue
         text = f"the largest utilisation of {shortened(name)} {'rises' if slope > 0.0 else 'falls'} by "
-        text += f"{100 * abs(math.expm1(slope)):.2g} % a {unit} over {plural(len(x), 'recording')}"
+        text += f"{100 * abs(math.expm1(slope)):.2g} % a {unit} over {plural(len(x), what)}"
         left = (math.log(limit) - float(np.log(peaks).mean())) / slope - float(x[-1])
         if slope > 0.0 and left < _FAR:
-            when = f"in {plural(math.ceil(left), 'recording')}"
+            when = f"in {plural(math.ceil(left), what)}"
             if dated:
                 when = f"on {datetime.fromtimestamp(stamps[-1] / 1e9, UTC) + timedelta(weeks=left):%Y-%m-%d}"
             text += f"; at that rate it reaches its threshold of {limit:.3g} {when}" if left > 0.0 else "; it is past "
