@@ -66,10 +66,12 @@ def numbers(packed: dict[str, Any]) -> np.ndarray:
 def test_the_page_draws_what_the_monitor_said(world, tmp_path):
     model = fit(read_transients(FITTED, turbofan_signals()))
     model.save(tmp_path / "model.json")
-    world.monitor(tmp_path / "model.json")
     watch = world.command("watch", "--port", "0")
     address = address_of(watch)
-    until(lambda: "Waiting" in drawn(address)["note"], "a page without a verdict")
+    until(lambda: "; no such node is in ROS domain" in drawn(address)["note"], "a page without a node")
+    assert drawn(address)["title"] == "SILENT /envelope_monitor" and drawn(address)["top"][0]["note"] == ""
+    monitor = world.monitor(tmp_path / "model.json")
+    until(lambda: drawn(address)["note"].endswith("nothing is heard on /envelope_monitor/flags."), "the node")
     world.command("play", DAMAGED, "--rate", "2", "--wait", "20").succeed()
     (run,) = read_transients([DAMAGED], model.signals)
     offline = EnvelopeMonitor(model).check(run)
@@ -102,7 +104,11 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
         profile = f"--user-data-dir={tmp_path / 'browser'}"
         shown = subprocess.run([*command, profile, address], capture_output=True, text=True, timeout=120).stdout
         assert shown.count('class="uplot') == 1 + model.n
-        assert "ALARM /envelope_monitor</title>" in shown
+        assert re.search(r"<title>ALARM (SILENT )?/envelope_monitor</title>", shown)
+        assert re.search(r'<h1 class="bad">ALARM', shown) and not re.search(r'id="keys" hidden', shown)
+    monitor.signal(2)
+    until(lambda: "Nothing has come" in (note := drawn(address)["note"]) and "; no such node" in note, "its end")
+    assert drawn(address)["title"] == "ALARM SILENT /envelope_monitor"
     watch.signal(2)
     assert watch.wait() == 0
 

@@ -16,6 +16,7 @@ address is given; a request that names another host is refused, so that no other
 from __future__ import annotations
 
 import argparse
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -69,7 +70,7 @@ class Watched:
     """
 
     def __init__(self, node: Node, name: str, window: float) -> None:
-        self.name, self._window = resolved_name(node, name), window
+        self.name, self._window, self._node = resolved_name(node, name), window, node
         self._lock = threading.Lock()
         self._said = _Said([])
         self._heard, self._reason = 0.0, ""
@@ -130,17 +131,19 @@ class Watched:
         shown = t_ns > t_ns[-1:] - self._window * 1e9
         alarm, flags, utilisation, statistics = (row[shown] for row in rows)
         t = (t_ns[shown] - t_ns[-1:]) * 1e-9
-        note, quiet = f"Waiting for {self.name}: nothing is heard on {self.name}/flags.", time.monotonic() - heard
+        quiet, raised = time.monotonic() - heard, bool(alarm[-1:].any())
+        silent, gone = quiet > _SILENT, ""
+        if silent and not self._node.count_publishers(f"{self.name}/flags"):
+            gone = f"; no such node is in ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}"
         if len(t):
             note = f"{plural(len(t), 'sample')}, 0 s is the newest" + (f"; {reason}." if reason else ".")
-            if quiet > _SILENT:
-                note = f"Nothing has come for {quiet:.0f} s. {note}"
-        raised = bool(alarm[-1:].any())
-        if raised:
-            note = f"ALARM. {note}"
+            note = f"Nothing has come for {quiet:.0f} s{gone}. {note}" if silent else note
+        else:
+            note = f"Waiting for {self.name}: nothing is heard on {self.name}/flags{gone}."
+        note, state = f"{'ALARM. ' if raised else ''}{note}", ["ALARM"] * raised + ["SILENT"] * silent
         of_each = dict(zip(statistic_names, statistics.T, strict=True))
         found = plotted_live(self.name, said.names, t, flags, alarm, utilisation, of_each, note)
-        return replace(found, title=f"{'ALARM ' if raised else ''}{self.name}")
+        return replace(found, title=" ".join([*state, self.name]))
 
 
 @contextmanager

@@ -251,12 +251,12 @@ def alarm_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tu
 def score_panel(columns: Columns, score: Array, note: str = "") -> Panel:
     """A score (P,) over its threshold, which it is never below while the alarm is up."""
     score = np.where(columns.alarm, np.fmax(score, 1.0), score)
-    greatest = float(np.nanmax(score, initial=0.0))
+    greatest, never = float(np.nanmax(score, initial=0.0)), "never over it" if np.isfinite(score).any() else ""
     capped = np.minimum(score, FARTHEST)
     return Panel(
         "alarm score, 1 is the threshold", (Series("score", np.where(np.isnan(capped), np.nan, 0.0), capped),),
         limits=(0.0, float(np.clip(1.1 * greatest, 1.5, 6.0))), levels=(1.0,),
-        note=note or ("never over it" if greatest <= 1 else f"greatest {greatest:.3g}"),
+        note=note or (never if greatest <= 1 else f"greatest {greatest:.3g}"),
     )  # fmt: skip
 
 

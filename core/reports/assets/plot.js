@@ -112,6 +112,7 @@
   };
 
   function limits(u, levels, c) { // the bounds of a utilisation, the threshold of a score
+    u.ctx.save(); // uPlot goes on with the colour that it has set
     u.ctx.strokeStyle = levels.length > 1 ? c.bounds : c.violated;
     u.ctx.lineWidth = devicePixelRatio;
     for (const v of levels) {
@@ -121,6 +122,7 @@
       u.ctx.lineTo(u.bbox.left + u.bbox.width, y);
       u.ctx.stroke();
     }
+    u.ctx.restore();
   }
 
   function span() { // of the whole recording
@@ -216,6 +218,11 @@
     show(...range);
   }
 
+  function call(title) {
+    document.title = document.querySelector("h1").textContent = title;
+    document.querySelector("h1").className = title.startsWith("ALARM") ? "bad" : "";
+  }
+
   async function look() { // at what a running monitor has said since; not while something is dragged
     if (document.querySelector(":active")) return;
     const before = Object.values(views()).flat().map((p) => p.title).join(), [low, high] = span();
@@ -224,10 +231,11 @@
       page = await (await fetch("data")).json();
     } catch {
       $("note").textContent = "The program that serves this page has ended.";
+      call(`ENDED ${page.recordings[0].name}`);
       return;
     }
     times = unpacked();
-    document.title = page.recordings[0].title;
+    call(page.recordings[0].title);
     const same = Object.values(views()).flat().map((p) => p.title).join() === before;
     if (same) render(!whole); else choose(0);
   }
@@ -253,8 +261,9 @@
   page.recordings.forEach((r, i) => $("recording").append(Object.assign(element("option", r.name), { value: i })));
   $("recording").hidden = page.recordings.length < 2;
   $("view").hidden = $("view").options.length < 2;
-  $("keys").hidden = $("view").hidden;
-  for (const id of ["before", "after"]) $(id).hidden = $("view").hidden;
+  const judged = !$("view").hidden || page.every;
+  $("keys").hidden = !judged;
+  for (const id of ["before", "after"]) $(id).hidden = !judged;
   $("recording").addEventListener("change", () => choose(Number($("recording").value)));
   $("view").addEventListener("change", () => { view = $("view").value; render(true); });
   $("whole").addEventListener("click", () => show(...span()));
