@@ -67,6 +67,8 @@ _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
 _FAR = 10.0
 """A jump of so many times the range of a state is none that anybody need be told the size of."""
+_ABOVE = 1.0 + 1e-10
+"""A threshold is this times the size that it is learnt from, which must not pass it by rounding."""
 _NOTHING = 1e-9
 """Size from which on a peak is one."""
 
@@ -361,7 +363,7 @@ def _threshold(
         found = np.maximum(found, typical * (top / typical).max())
     if len(peaks) >= TELLING and not (blocks and windows < FEW):
         found = np.maximum(found, _of_next(peaks, ALIKE if blocks else CONFIDENCE))
-    return np.asarray(np.clip(found, 1e-6, LARGEST**0.5))
+    return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
 
 
 def _of_next(peaks: Array, confidence: float) -> Array:
