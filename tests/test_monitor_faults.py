@@ -667,6 +667,12 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     assert world.set(enable=f"{STATE} position[b] > -9") == (True, "")
 
 
+def test_a_second_node_of_the_same_name_is_told(world: World, tmp_path: Path) -> None:
+    model = saved(by_hand(), tmp_path)
+    for process in (world.monitor(model), world.run_node("envelope_monitor", {"model": str(model)})):
+        process.says("another node publishes /envelope_monitor/violation too; give one of them another name")
+
+
 def test_publishers_that_nothing_comes_from_are_told(bench: StartBench) -> None:
     on = bench()
     on.diagnostics.reaches(STALE, saying=f"{STATE}: nothing received in 2 s, and there is 1 publisher")

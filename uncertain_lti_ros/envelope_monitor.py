@@ -31,6 +31,7 @@ from std_srvs.srv import Trigger
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
+from uncertain_lti.monitor.outputs import VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
 from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
@@ -91,7 +92,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self.inputs: dict[str, MatchedSubscription] = {}
         self._prefix = ""
-        self._enable_problem = ""
+        self._enable_problem, self._twin = "", False
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._looked = self._reported = time.monotonic()
@@ -376,6 +377,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         for subscription in self.inputs.values():
             subscription.look()
         self.outputs.look()
+        self._twin = self.count_publishers(f"~/{VIOLATION.name}") > 1
         self._find_enable_type()
 
     def _find_enable_type(self) -> None:
@@ -437,6 +439,9 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _lasting_problems(self) -> list[str]:
         """Problems that last and concern no topic of the model."""
         problems = [self._enable_problem] if self._enable_problem else []
+        if self._twin:
+            topic = f"{self.get_fully_qualified_name()}/{VIOLATION.name}"
+            problems.append(f"another node publishes {topic} too; give one of them another name, -r __node:=NAME")
         problems += self.outputs.sender.problems
         if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
             problems.append("use_sim_time is true, and no time has come on /clock")
