@@ -270,6 +270,10 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
     [
         (["fit", "a.mcap", "--signals", "s.yaml", "--outptu", "m"], "there is no --outptu (is --output meant?)"),
         (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
+        (
+            ["topics", "a.mcap", "b.mcap"],
+            "arguments: b.mcap; that is one more than it takes: uncertain-lti topics --help",
+        ),
         (["check", "m", "a.mcap", "--discard", "1"], "--discard 1 (an option of fit)"),
         (["chek", "m", "b"], "(is check meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--additive", "noies"], "(is noise meant?)"),

@@ -390,7 +390,8 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
     assert "there is no subscriber to /good after 0.2 s" in said and "played 1 messages of 1 topics" in said
     for arguments, sentence in (
         ([bag, "--topics", "/foreign"], "no topic of it can be played"),
-        ([bag, "--topics", "/nowhere"], "there is no topic /nowhere; topics there: /foreign, /good"),
+        ([bag, "--topics", "/a"], "there is no topic /a; topics there: /foreign, /good"),
+        ([bag, "--topics", "good"], "there is no topic good (is /good meant?); topics there: /foreign, /good"),
         ([tmp_path / "none.mcap"], "none.mcap"),
         ([bag, "--lockstep", "nobody", "--wait", "0.2"], "/nobody/status: no such service after 0.2 s"),
         ([bag, "--lockstep", "nobody", "--rate", "2"], "leave out --rate"),

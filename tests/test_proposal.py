@@ -305,7 +305,9 @@ def test_topics_and_names_that_yaml_would_misread(tmp_path):
 def test_nothing_to_propose_is_said(tmp_path):
     messages = [Message("/talk", k, cdr("std_msgs/msg/String", data="x"), k) for k in range(50)]
     path = save(tmp_path / "a.mcap", messages, {"/talk": "std_msgs/msg/String"})
-    with pytest.raises(BagError, match="nothing in it looks like the state of a machine .*; record the machine at"):
+    with pytest.raises(
+        BagError, match="looks like the state of a machine .*; record .* in `uncertain-lti init --states`"
+    ):
         propose([path])
 
 

@@ -326,6 +326,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
+        ("a.csv", b'time,y\n"0,1","6,2"\n"0,2","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-13-22T06:28:00,2\n2026-11-22T06:28:01,3\n", "is no day or time that there is"),
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),

@@ -32,6 +32,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
+from uncertain_lti.base.text import meant
 from uncertain_lti.cli.command import DONE, Result, complain
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
@@ -135,7 +136,8 @@ def _offer(
     asked = list(bag.topics) if topics is None else list(dict.fromkeys(topics))
     for topic in asked:
         if topic not in bag.topics:
-            raise BagError(f"{bag.path}: there is no topic {topic}; topics there: {', '.join(bag.topics) or 'none'}")
+            there = f"{meant(topic, bag.topics)}; topics there: {', '.join(bag.topics) or 'none'}"
+            raise BagError(f"{bag.path}: there is no topic {topic}{there}")
     played: dict[str, _Played] = {}
     for topic in asked:
         info = bag.topics[topic]

@@ -163,6 +163,8 @@ class _Parser(argparse.ArgumentParser):
             word = message.split(": ")[1].split()[0].partition("=")[0]
             takes = sorted({name for g in commands for name, p in g.items() if word in p._option_string_actions})
             message += f" (an option of {', '.join(takes)})" if takes else meant(word, known, 1)
+            if not word.startswith("-"):
+                message += f"; that is one more than it takes: {chosen.prog} --help"
         super().error(message)
 
 

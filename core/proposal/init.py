@@ -387,10 +387,10 @@ def propose(
     sources += [s for s in commands if not any(s is other for other in sources)]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
-        reasons = "; ".join(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8])
+        reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
         raise BagError(
-            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); "
-            f"record the machine at work, or name the topics of its states with --states"
+            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); record the "
+            f"machine at work, and longer, or name the topics of its states in `uncertain-lti init --states`"
         )
     chosen, doubt = choose(measured, commands, like)
     doubt = doubt or ("" if commands else at_rest(sources))

@@ -205,6 +205,8 @@ def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
             raise BagError(
                 f"{where}: '{text[:40]}' in row {row + 1} is neither a number nor an ISO time such as "
                 f"2026-11-22T06:28:01.25Z; write all of them as one or the other"
+                + ", with a point before decimals"
+                * bool(re.fullmatch(r"-?\d+,\d+", text))
             )
     if plain:
         for text in plain:
