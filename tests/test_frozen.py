@@ -349,6 +349,16 @@ def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     assert "warning: position repeats exactly for 6.99 s (at most 0.99 s in the fit) from 2.0000 s" in check_text(data)
 
 
+def test_jitter_of_the_steps_makes_no_repeat_longer() -> None:
+    """Each value comes twice, as in the fit, whose longest step was a little shorter."""
+    t = np.cumsum(np.tile([0.0099, 0.0101], 100))
+    transient = Transient(t, np.repeat(np.arange(100.0), 2)[:, None], np.zeros((200, 1)))
+    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[2.0], repeats=Repeats([0.01], [40.0], [40.0], [1e9]))
+    assert not EnvelopeMonitor(model).check(transient).repeating.any()
+    short = model.replace(repeats=Repeats([0.0], [40.0], [40.0], [1e9]))
+    assert EnvelopeMonitor(short).check(transient).repeating.any()
+
+
 @pytest.mark.parametrize("seed", range(2))
 def test_offline_and_live_give_the_same(model: UncertainLTI, seed: int) -> None:
     rng = np.random.default_rng(seed)

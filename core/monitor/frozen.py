@@ -120,7 +120,7 @@ class FrozenWatch:
                 continue
             if why := self._frozen.get(i) or ("" if step.outside else self._why(moved, step)):
                 frozen.append(moved._replace(why=why))
-            elif moved.seconds > self.repeats.longest_repeat_s[i]:
+            elif moved.seconds > self.repeats.longest_repeat_s[i] + step.dt / 2:  # not by jitter of its steps
                 repeating.append(moved)
         now = {moved.state: moved.why for moved in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
