@@ -22,6 +22,7 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
+from uncertain_lti.recordings.table_files import read_table
 from uncertain_lti.signals.values import TableLayout
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -115,6 +116,14 @@ def test_parquet_and_feather(shipped, names, tmp_path):
         (tmp_path / f"run{suffix}").write_bytes((tmp_path / f"run{suffix}").read_bytes()[:5000])
         with pytest.raises(BagError, match=f"run{suffix}: is damaged or no {suffix} file"):
             open_recording(tmp_path / f"run{suffix}")
+
+
+def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_path):
+    rows = [f'"{k / 10:.1f}","{1.25 + k:.2f}","{1.5 + k:.3f}"'.replace(".", ",") for k in range(9)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join(["time,y,z", *rows]))
+    table = read_table(path)
+    assert np.allclose(table.columns["y"], 1.25 + np.arange(9)) and table.columns["z"].dtype == object
 
 
 def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
@@ -326,7 +335,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
-        ("a.csv", b'time,y\n"0,1","6,2"\n"0,2","7,3"\n', "as one or the other, with a point before decimals"),
+        ("a.csv", b'time,y\n"0,125","6,2"\n"0,250","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-13-22T06:28:00,2\n2026-11-22T06:28:01,3\n", "is no day or time that there is"),
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),

@@ -34,6 +34,7 @@ _MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|nan$", re.IGNORECASE)
 _WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
+_THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}$")
 _INSTANT = re.compile(r"\d{4}-\d\d-\d\d([T ]|$)|\d{1,2}:\d\d(:\d\d|$)|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
@@ -190,6 +191,8 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
         except ValueError:
             pass
     numbers = np.full(len(plain), np.nan)
+    # in quotes between commas they may part thousands, which nothing but other cells tells
+    decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _THOUSANDS.match(cell) for cell in plain)
     comma = missing = odd = 0
     first = ""
     for i, cell in enumerate(plain):
@@ -198,7 +201,7 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
             missing += 1
         elif _NUMBER.match(cell):
             numbers[i] = float(cell)
-        elif delimiter != "," and _WITH_COMMA.match(cell):
+        elif decimal and _WITH_COMMA.match(cell):
             numbers[i] = float(cell.replace(",", "."))
             comma += 1
         elif low in _TRUTH:
