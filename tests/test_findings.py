@@ -20,6 +20,7 @@ from test_pages import by_hand
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.text import beyond
 from uncertain_lti.identification import fit
+from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.reports.check import APART
 from uncertain_lti.reports.findings import CARE, NO, YES, findings, findings_text
 from uncertain_lti.reports.pages import html_report
@@ -56,14 +57,14 @@ def test_episodes_hold_every_violation(letters):
         )
 
 
-def judged(widths, validation=None, decay=1.0):
+def judged(widths, validation=None, decay=1.0, **more):
     """Findings on a run of states that move between -1 and 1, by bounds of these half-widths."""
     rng = np.random.default_rng(3)
     n = len(widths)
     x = np.clip(np.cumsum(rng.uniform(-0.1, 0.1, (600, n)), axis=0), -1, 1)
     run = Transient(np.arange(600) * 0.01, x, np.zeros((600, 1)))
     model = fit([run], additive="noise").replace(A=-decay * np.eye(n), B=np.zeros((n, 1)), v=np.array(widths))
-    model = model.replace(fit_summary={"criterion": "qp"}, validation=validation or {})
+    model = model.replace(fit_summary={"criterion": "qp"}, validation=validation or {}, **more)
     return findings(model, "m", [EnvelopeMonitor(model).check(run)])
 
 
@@ -97,6 +98,11 @@ def test_a_nominal_model_that_runs_away_is_named():
     assert not any(r["about"] == "stability" for r in judged([0.15, 0.15])["rely"]["reasons"])
     (reason,) = [r for r in judged([0.15, 0.15], decay=1800.0)["rely"]["reasons"] if r["about"] == "stability"]
     assert reason["weight"] == CARE and "17 times in a step" in reason["text"]
+
+
+def test_an_alarm_without_a_violation_is_told():
+    (happened,) = judged([3.0, 3.0], alarm=(StatisticRule("mean", 0.05, 0.01),))["happened"]
+    assert "every one inside all bounds. The alarm was raised " in happened["text"]
 
 
 @given(st.floats(1.0, 1e6, exclude_min=True), st.sampled_from([-1.0, 1.0]))

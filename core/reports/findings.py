@@ -156,9 +156,13 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         most = sorted(states, key=lambda name: -states[name])[:3]
         count, first = recording["episode_count"], recording["episodes"][0]["first"]["t"]
         text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first:.8g} s; "
-        text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}. The alarm was "
-        text += "not raised" if not recording["alarm"] else f"raised {times(len(recording['alarms']))}, first at "
-        text += f"{recording['alarms'][0]['t']:.8g} s" if recording["alarm"] else ""
+        text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}"
+    if recording["alarm"]:
+        text += (
+            f". The alarm was raised {times(len(recording['alarms']))}, first at {recording['alarms'][0]['t']:.8g} s"
+        )
+    elif bad:
+        text += ". The alarm was not raised"
     if judged and state == "unknown":
         text += f", but {recording['reason']}"
     if frozen := [f"{repeat['text']}, {repeat['why']}" for repeat in recording["frozen"]]:
