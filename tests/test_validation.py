@@ -32,7 +32,7 @@ from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.recordings.bag_files import metadata_pairs
 from uncertain_lti.reports.model_text import validation_text
 from uncertain_lti.validation.intervals import discarding_bound, rate_interval, scenario_interval, share_interval
-from uncertain_lti.validation.left_out import cut, remaining_spans, validate
+from uncertain_lti.validation.left_out import cut, guard_interval, remaining_spans, validate
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import fitted_parts, judge, rising
 from uncertain_lti.validation.result import raised_on
@@ -226,6 +226,13 @@ def test_blocks_keep_their_distance():
         assert distance.min() >= 2.0 - 1e-9
         assert len(kept) >= 2001 - (stop - start) - 2 * 20
     assert "not independent" in validation.to_dict()["scenario"]["words"]
+
+
+@pytest.mark.parametrize(("middle", "gap"), [(50, 6.0), (8, 4.0)])
+def test_the_guard_is_three_of_the_slowest_time_constants_or_half_of_the_shortest_block(middle, gap):
+    zeros, run = np.zeros((3, 1)), Transient(np.arange(101.0), np.zeros((101, 3)), np.zeros((101, 1)))
+    model = UncertainLTI(np.diag([-0.5, -4.0, 1.0]), zeros, np.zeros((3, 3)), zeros)
+    assert guard_interval(model, [(run, 0, middle + 1), (run, middle, 101)]) == pytest.approx(gap)
 
 
 def test_weights_go_with_their_samples():
