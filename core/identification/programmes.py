@@ -211,15 +211,16 @@ class Programmes:
         """The samples on which δ of `nominal` rests leave no other elements either.
 
         In every optimum of (11) those of positive multiplier are at a bound and as wide as δ: as many as unknowns fix
-        the nominal elements, and, if their sizes are independent, the half-widths.
+        the nominal elements, and, if their sizes are independent, the half-widths. Of many the next is so near that
+        one may be missing: what it leaves open is rounding.
         """
         row, last = self.row, self._last.get("nominal")
-        active = None if last is None else last.active
-        if active is None or np.count_nonzero(active) <= row.r:
+        active, missing = None if last is None else last.active, int(row.r + row.q >= MANY)
+        if active is None or np.count_nonzero(active) + missing <= row.r:
             return False
         samples = active[row.r + 1 :][: 2 * len(row.pool)].reshape(2, -1).any(axis=0)
         psi = row.psi[row.pool][samples]
-        if len(psi) < row.q:
+        if len(psi) + missing < row.q:
             return False
         values = np.linalg.svd(psi, compute_uv=False)
         return bool(values[-1] > INDEPENDENT * values[0])
