@@ -452,7 +452,8 @@ class Stream:
             self.last, self._judged = verdict, now
             self.verdicts += 1
             period.verdicts += 1
-            verdict.reach(period.largest)
+            if not verdict.withheld:
+                verdict.reach(period.largest)
         if verdict.ordinary and not self.latched and self.reasons.text == QUIET:
             self._quiet += 1
             return
