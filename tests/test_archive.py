@@ -80,6 +80,8 @@ def test_an_archive_has_the_alarm_of_a_fit(bags, tmp_path, monkeypatch):
     equal(some, fit(read_transients(paths, signals), some.fit_summary["criterion"]))
     assert some.fit_summary["alarm"]["note"] == "learnt on 4 of 8 recordings, as many as memory is for"
     assert some.fit_summary["alarm"]["units"] == 4 and some.alarm != model.alarm
+    with pytest.raises(FitError, match="false_alarms is what the panel is learnt for"):
+        public_fit.fit_many(paths, signals, alarm="containment", false_alarms=1.0, cache=tmp_path / "none")
     by_hand = public_fit.fit_many(paths, signals, "qp", alarm="containment", cache=tmp_path / "hand")
     equal(by_hand, fit(read_transients(paths, signals), "qp"))
     assert [rule.kind for rule in by_hand.alarm] == ["containment"]

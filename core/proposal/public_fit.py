@@ -150,10 +150,7 @@ def fit(
         raise FitError("no transients; give at least one recording")
     if criterion not in (None, "qp", "lp"):
         raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
-    if isinstance(alarm, str) and alarm not in ("panel", "containment"):
-        raise FitError(f"alarm is {alarm!r}; it must be panel, containment, or a list of rules")
-    if false_alarms is not None and alarm != "panel":
-        raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")
+    _check_alarm(alarm, false_alarms)
     first, signals = transients[0], transients[0].signals
     names = [*first.state_names, *first.control_names, *first.scheduling_names]
     if additive is None and signals is not None:
@@ -260,6 +257,7 @@ def fit_many(
     Criterion, additive term and panel are those of a `fit` of recordings from the whole row that have SAMPLE numbers
     together; `where`: cache or client, as for `fit_archive`.
     """
+    _check_alarm(alarm, false_alarms)
     if not isinstance(signals, SignalMap):
         signals = load_signals(signals, paths)
     additive = additive or signals.additive
@@ -281,6 +279,14 @@ def fit_many(
     count = len({run.sources for run in some})
     note = f"learnt on {count} of {plural(len(bags), 'recording')}, as many as memory is for" * (count < len(bags))
     return monitored_like(taken, model, some, false_alarms, note).finished()
+
+
+def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> None:
+    """Refuse an alarm that there is not, and a rate for one that is not learnt."""
+    if isinstance(alarm, str) and alarm not in ("panel", "containment"):
+        raise FitError(f"alarm is {alarm!r}; it must be panel, containment, or a list of rules")
+    if false_alarms is not None and alarm != "panel":
+        raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")
 
 
 def _some(bags: Sequence[Sequence[os.PathLike[str]]], signals: SignalMap) -> list[Transient]:
