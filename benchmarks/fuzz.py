@@ -313,7 +313,7 @@ def middleware() -> tuple[Any, Any, Any]:
     from rclpy.serialization import deserialize_message
 
     from uncertain_lti.recordings.message_reader import MessageReader
-    from uncertain_lti_ros.messages import live_fields, message_class
+    from uncertain_lti_ros.topics import live_fields, message_class
 
     return MessageReader, cache(live_fields), lambda kind: lambda data: deserialize_message(data, message_class(kind))
 

@@ -9,7 +9,7 @@
 
 """Many runs of the turbofan at once: the plant's own source on arrays, one column per run, about 20 times as fast.
 
-The equations are those of `uncertain_lti.plants`: the two modules of the gas path are loaded a second time, with
+The equations are those of `uncertain_lti.plants`: the module of the gas path is loaded a second time, with
 NumPy's functions in place of Python's, so that a float may be an array of floats. Faults, lever, controller and noise
 are the objects of `turbofan_runs.simulate`, one per run. What differs is numerical: Newton's method stops at a relative
 mismatch of 1e-10 in every run, and two steps of Runge-Kutta's fourth order take the place of DOP853.
@@ -57,25 +57,22 @@ TOLERANCE = 1e-10
 @cache
 def _on_arrays() -> one_engine.Engine:
     """The engine whose `_path` and `derivative` take arrays in place of floats."""
-    gas, turbofan = (_again(f"uncertain_lti.plants.{name}") for name in ("turbofan_gas", "turbofan"))
-    turbofan.gas = gas
-    for name in ("CompressorMap", "TurbineMap", "burn", "nozzle"):
-        setattr(turbofan, name, getattr(gas, name))
+    turbofan = _again("uncertain_lti.plants.turbofan")
     engine: one_engine.Engine = turbofan.Engine()  # its sizes, before functions are replaced
-    for module in (gas, turbofan):
-        vars(module).update(sqrt=np.sqrt, exp=np.exp, log=np.log, max=np.maximum, min=np.minimum)
+    vars(turbofan).update(sqrt=np.sqrt, exp=np.exp, log=np.log, max=np.maximum, min=np.minimum)
 
     def mass_flow(area: Array, P: Array, T: Array, w: Array, p: Array) -> Array:
-        """As `turbofan_gas.mass_flow`, whose one branch arrays cannot take."""
-        g = gas.gamma(T, w)
+        """As `turbofan.mass_flow`, whose one branch arrays cannot take."""
+        g = turbofan.gamma(T, w)
         ratio = p / P
         back = ratio >= 1.0
         open_ = np.maximum(np.where(back, 0.5, ratio), (2.0 / (g + 1.0)) ** (g / (g - 1.0)))
         x = open_ ** (1.0 / g)
         forward = x * np.sqrt(2.0 * g / (g - 1.0) * (1.0 - open_ / x))
-        return area * P / np.sqrt(gas.R * T) * np.where(back, -np.sqrt(2.0 * np.maximum(ratio - 1.0, 0.0)), forward)
+        size = area * P / np.sqrt(turbofan.R * T)
+        return size * np.where(back, -np.sqrt(2.0 * np.maximum(ratio - 1.0, 0.0)), forward)
 
-    gas.mass_flow = mass_flow
+    turbofan.mass_flow = mass_flow
     return engine
 
 
@@ -130,7 +127,7 @@ class FleetSolver:
         self._inverse: Array | None = None
 
     def solve(self, x: Array, u: Array, health: one_engine.Health) -> one_engine.GasPath:
-        """As `GasPathSolver.solve`; called by `Engine.gas_path`."""
+        """As `GasPathSolver.solve`; called by `Engine.derivative`."""
         q = self._q
         mismatch, path = self._engine._path(q, x, u, health)
         before = np.inf
@@ -175,10 +172,10 @@ def simulate_fleet(runs: Sequence[Run], controls: Array | None = None) -> list[T
     samples = runs[0].samples
     if any(run.samples != samples for run in runs):
         raise UncertainLTIError("runs that are simulated together have one length")
-    engine, point, plant = _on_arrays(), operating_point(), one_engine.engine()
-    starts = {pla: trim(pla, plant) for pla in sorted({run.lever[0][1] for run in runs})}
+    engine, point = _on_arrays(), operating_point()
+    starts = {pla: trim(pla) for pla in sorted({run.lever[0][1] for run in runs})}
     begin = [starts[run.lever[0][1]] for run in runs]
-    controllers = [Controller(plant, replace(b, x=_rounded(b.x, point.X)), DT) for b in begin]
+    controllers = [Controller(replace(b, x=_rounded(b.x, point.X))) for b in begin]
     generators = [np.random.default_rng(run.seed) for run in runs]
     faults = [run.fault or Fault("fan_damage", np.inf) for run in runs]
     solver = FleetSolver(engine, len(runs))

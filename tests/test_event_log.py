@@ -30,7 +30,7 @@ from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, joint_state, v
 
 from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
-from uncertain_lti_ros.messages import live_fields, message_class
+from uncertain_lti_ros.topics import live_fields, message_class
 
 TIMEOUT = 1.0
 STEP = STEP_NS * 1e-9

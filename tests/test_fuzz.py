@@ -95,7 +95,7 @@ def made(kind: str, *values: object) -> bytes:
     """A message of the middleware with these values in its fields, in order."""
     from rclpy.serialization import serialize_message
 
-    from uncertain_lti_ros.messages import message_class
+    from uncertain_lti_ros.topics import message_class
 
     message = message_class(kind)()
     for name, value in zip(message.get_fields_and_field_types(), values, strict=False):

@@ -591,7 +591,7 @@ def test_without_a_folder_there_are_no_snapshots(bench: StartBench, tmp_path: Pa
 
 def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) -> None:
     from uncertain_lti.monitor.snapshot import Album, Entry, Scene
-    from uncertain_lti_ros.messages import definition
+    from uncertain_lti_ros.topics import definition
 
     folder = tmp_path / "album"
     rng = np.random.default_rng(3)

@@ -53,7 +53,7 @@ from std_msgs.msg import Empty, Float64, Float64MultiArray, Header, MultiArrayDi
 from std_srvs.srv import Trigger
 
 from uncertain_lti_ros import player
-from uncertain_lti_ros.messages import definition, live_fields, message_class
+from uncertain_lti_ros.topics import definition, live_fields, message_class
 
 ROOT = Path(__file__).resolve().parents[1]
 Command = Callable[..., tuple[int, str]]

@@ -43,7 +43,7 @@ def bag_fields(type_name: str) -> dict[str, FieldType]:
 def live_fields(type_name: str) -> dict[str, FieldType]:
     """As the installed message class describes it."""
     pytest.importorskip("rclpy", reason="rclpy is not installed")
-    return dict(importlib.import_module("uncertain_lti_ros.messages").live_fields(type_name))
+    return dict(importlib.import_module("uncertain_lti_ros.topics").live_fields(type_name))
 
 
 FIELDS: dict[str, TypeFields] = {"bag": bag_fields, "live": live_fields}

@@ -20,9 +20,8 @@ from turbofan_fleet import simulate_fleet
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.plants import turbofan_gas as gas
-from uncertain_lti.plants.turbofan import CONTROLS, Engine, GasPathSolver, Health, engine
-from uncertain_lti.plants.turbofan_gas import T_STANDARD
+from uncertain_lti.plants import turbofan as gas
+from uncertain_lti.plants.turbofan import CONTROLS, HEALTHY, T_STANDARD, Engine, GasPathSolver, engine
 from uncertain_lti.plants.turbofan_runs import (
     DT,
     KINDS,
@@ -143,12 +142,12 @@ def test_a_step_is_integrated_to_nine_digits(plant):
     """One step of the run equals a hundred with Runge and Kutta's classical method."""
     point, t = operating_point(), trim(66.0)
     u = t.u * [1.1, 1.05, 1.0, 1.0] + [0.0, 0.0, 2.0, -2.0]
-    once = _advance(plant, GasPathSolver(plant), t.x, u, point.X, Health())
+    once = _advance(GasPathSolver(plant), t.x, u, point.X, HEALTHY)
     x, h = t.x.copy(), DT / 100
     solver = GasPathSolver(plant)
 
     def rate(x):
-        return plant.derivative(x.tolist(), u.tolist(), Health(), solver)
+        return plant.derivative(x.tolist(), u.tolist(), HEALTHY, solver)
 
     for _ in range(100):
         a = rate(x)
@@ -165,8 +164,8 @@ def accelerated():
     return simulate(Run(801, lever=((0.0, 60.0), (1.0, 68.0), (10.0, 62.0))))
 
 
-def test_fan_speed_follows_the_lever(plant, accelerated):
-    x, demand = accelerated.x, [fan_speed(pla, plant) for pla in (60.0, 68.0, 62.0)]
+def test_fan_speed_follows_the_lever(accelerated):
+    x, demand = accelerated.x, [fan_speed(pla) for pla in (60.0, 68.0, 62.0)]
     for second, target in ((0.9, demand[0]), (9.9, demand[1]), (20.0, demand[2])):
         assert x[round(second / DT), 0] == pytest.approx(target, rel=2e-3)
     assert x[:, 0].max() < 1.01 * demand[1]

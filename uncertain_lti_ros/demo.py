@@ -30,12 +30,13 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
 from uncertain_lti.cli.command import BAD_INPUT, DONE, Result
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
+from uncertain_lti.recordings.bag_files import metadata_pairs
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.figures import alarm_figure, envelope_figure, matrices_figure, save
 from uncertain_lti.reports.model_text import fit_text
 from uncertain_lti.sampling.reading import read_as_fitted
-from uncertain_lti_ros.messages import stamp_ns
 from uncertain_lti_ros.process import Life, living, speed
+from uncertain_lti_ros.topics import stamp_ns
 
 FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
 CHECK = "turbofan_fan_damage.mcap"
@@ -82,7 +83,8 @@ def run(args: argparse.Namespace) -> Result:
         for t_ns, flags in zip(offline.transient.t_ns[offline.judged].tolist(), expected, strict=True)
     )
     say(f"live and offline verdicts: {same} of {len(expected)} equal")
-    t, what = _fault(bags / CHECK)
+    about = metadata_pairs(bags / CHECK)
+    event = t, what = float(about["fault_at"].split()[0]), about["what happens"]
     left = offline.transient.t_ns[0] + t * 1e9
     after = offline.judged & (offline.transient.t_ns > left)
     (early, of_early), (late, of_late) = (
@@ -94,7 +96,6 @@ def run(args: argparse.Namespace) -> Result:
         "the alarm is raised "
         + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
     )
-    event = (t, what)
     figures = {
         "alarm.png": alarm_figure(model, offline, event=event, most=3),
         "envelope.png": envelope_figure(model, offline, states=SHOWN, event=event),
@@ -119,8 +120,8 @@ def run(args: argparse.Namespace) -> Result:
 
 def _bags() -> Path:
     """Folder of the shipped recordings: in a checkout, or in the share folder of an installation."""
-    roots = [Path(__file__).resolve().parents[1], *(Path(p) / "share/uncertain_lti_ros" for p in _prefixes())]
-    for root in roots:
+    prefixes = [*os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), sys.prefix]
+    for root in (Path(__file__).resolve().parents[1], *(Path(p) / "share/uncertain_lti_ros" for p in prefixes)):
         if (root / "bags" / CHECK).is_file():
             return root / "bags"
     raise BagError(
@@ -128,74 +129,57 @@ def _bags() -> Path:
     )
 
 
-def _prefixes() -> Iterator[str]:
-    yield from os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    yield sys.prefix
-
-
-def _fault(bag: Path) -> tuple[float, str]:
-    """Onset of the fault in s after the first state and what happens, from the recording's own metadata."""
-    from mcap.reader import make_reader
-
-    with open(bag, "rb") as stream:
-        for record in make_reader(stream).iter_metadata():
-            if "fault_at" in record.metadata:
-                return float(record.metadata["fault_at"].split()[0]), record.metadata["what happens"]
-    raise BagError(f"{bag}: its metadata does not state when a fault begins; make it with bags/make.py")
-
-
 def _watch(life: Life, args: argparse.Namespace, model: Path, bag: Path, expected: Any) -> dict[int, Any]:
     """Start monitor and player as processes, show the flags as they come; {t_ns: flags}."""
     flags: dict[int, Any] = {}
     names: list[str] = []
+    shown, heard = 0, time.monotonic()
 
     def take(message: JointState) -> None:
+        nonlocal heard
         names[:] = message.name
         flags[stamp_ns(message)] = np.array(message.position)
+        heard = time.monotonic()
+
+    def over() -> bool:
+        nonlocal shown
+        _refuse_others(life, 1)
+        if len(flags) - shown >= 100 or len(flags) == len(expected) > shown:
+            args.say(_shown(flags, shown, names, int(expected[0])))
+            shown = len(flags)
+        patience = _PATIENCE if playing.poll() is None else 2.0
+        return len(flags) >= len(expected) or time.monotonic() - heard > patience
 
     subscription = life.node.create_subscription(JointState, _FLAGS, take, QoSProfile(depth=1000))
     monitor = [sys.executable, "-m", "uncertain_lti_ros.envelope_monitor", "--ros-args", "-p", f"model:={model}"]
     player = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--rate", str(args.rate)]
-    _refuse_others(life, 0)
+    life.until(lambda: _refuse_others(life, 0), _DISCOVERY)
     with _process([*monitor, "--log-level", "warn"]):
-        _until(life, lambda: life.node.count_publishers(_FLAGS) > 0, "the envelope_monitor node did not start")
+        if not life.until(lambda: life.node.count_publishers(_FLAGS), _PATIENCE):
+            if not life.alive:
+                raise KeyboardInterrupt
+            raise UncertainLTIError(
+                f"the envelope_monitor node did not start within {_PATIENCE:g} s; look at its messages above"
+            )
         with _process(player) as playing:
-            shown, silent_since = 0, time.monotonic()
-            while life.alive and len(flags) < len(expected):
-                before = len(flags)
-                _refuse_others(life, 1)
-                life.spin_once(0.1)
-                if len(flags) > before:
-                    silent_since = time.monotonic()
-                elif time.monotonic() - silent_since > _PATIENCE or (
-                    playing.poll() is not None and time.monotonic() - silent_since > 2.0
-                ):
-                    args.progress.note(f"no more flags after {len(flags)} of {len(expected)}")
-                    break
-                if len(flags) - shown >= 100 or len(flags) == len(expected):
-                    args.say(_shown(flags, shown, names, int(expected[0])))
-                    shown = len(flags)
-            confirmed_by = time.monotonic() + _PATIENCE  # the player ends once its messages are confirmed
-            while life.alive and playing.poll() is None and time.monotonic() < confirmed_by:
-                life.spin_once(0.1)
+            heard = time.monotonic()
+            life.until(over)
+            if life.alive and len(flags) < len(expected):
+                args.progress.note(f"no more flags after {len(flags)} of {len(expected)}")
+            life.until(lambda: playing.poll() is not None, _PATIENCE)  # it ends once its messages are confirmed
     life.node.destroy_subscription(subscription)
     return flags
 
 
 def _refuse_others(life: Life, own: int) -> None:
     """Refuse to go on where another monitor publishes too: each would hear the other's recording."""
-    until = time.monotonic() + (0.0 if own else _DISCOVERY)
-    while life.alive:
-        if life.node.count_publishers(_FLAGS) > own:
-            domain = os.environ.get("ROS_DOMAIN_ID", "0")
-            raise UncertainLTIError(
-                f"another envelope_monitor publishes {_FLAGS} in ROS domain {domain}, perhaps of another demo, and "
-                f"each would hear the other's recording; end it, or choose another domain: export ROS_DOMAIN_ID="
-                f"{int(domain) % 100 + 1 if domain.isdigit() else 1}"
-            )
-        if time.monotonic() >= until:
-            return
-        life.spin_once(0.1)
+    if life.node.count_publishers(_FLAGS) > own:
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        raise UncertainLTIError(
+            f"another envelope_monitor publishes {_FLAGS} in ROS domain {domain}, perhaps of another demo, and "
+            f"each would hear the other's recording; end it, or choose another domain: export ROS_DOMAIN_ID="
+            f"{int(domain) % 100 + 1 if domain.isdigit() else 1}"
+        )
 
 
 def _shown(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -> str:
@@ -225,13 +209,3 @@ def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
         except subprocess.TimeoutExpired:
             process.kill()
             process.wait()
-
-
-def _until(life: Life, done: Any, otherwise: str) -> None:
-    limit = time.monotonic() + _PATIENCE
-    while not done():
-        if not life.alive:
-            raise KeyboardInterrupt
-        if time.monotonic() > limit:
-            raise UncertainLTIError(f"{otherwise} within {_PATIENCE:g} s; look at its messages above")
-        life.spin_once(0.1)

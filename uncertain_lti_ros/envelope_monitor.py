@@ -33,11 +33,10 @@ from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.outputs import VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
-from uncertain_lti_ros.messages import message_class
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
-from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, input_values
+from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, input_values, message_class
 
 NAME = "envelope_monitor"
 _SUMMARY = (

@@ -32,9 +32,8 @@ from uncertain_lti.monitor.catch_up import WINDOW
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Declared
-from uncertain_lti_ros.topics import DEPTH, DURABILITY, RELIABILITY, RequestedQos, sendable
+from uncertain_lti_ros.topics import DEPTH, DURABILITY, RELIABILITY, RequestedQos, live_fields, message_class, sendable
 
 _RESTARTS = "Changing it restarts the alarm, unless it is latched."
 RULE = ("violations", "window", "margin", "masked", "enable", "enable_type", "grace", "latch")

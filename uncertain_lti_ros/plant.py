@@ -17,7 +17,6 @@ from typing import Any
 
 import rclpy
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 
@@ -106,11 +105,12 @@ class Plant(Node):
 
 def publish(life: Life, node: Plant, make: Callable[[], Transient]) -> int:
     """Publish a transient once both topics have subscribers, and wait until it has been received."""
-    publishers, wait = node.outputs, node.given["wait"]
-    if not _subscribed(life, publishers, wait):
+    wait = node.given["wait"]
+    if not life.until(lambda: all(publisher.get_subscription_count() for publisher in node.outputs), wait):
         if life.alive:
             node.get_logger().error(f"no subscriber of both topics within {wait:g} s; start one first")
         return 2
+    life.until(lambda: False, _SETTLE)
     run = make()
     node.get_logger().info(f"publishing {run}")
     began = time.monotonic()
@@ -120,27 +120,12 @@ def publish(life: Life, node: Plant, make: Callable[[], Transient]) -> int:
             life.spin_once(rest)
         if not life.alive:
             return 0
-        sides = zip(publishers, (run.state_names, run.control_names), (run.x, run.u), strict=True)
+        sides = zip(node.outputs, (run.state_names, run.control_names), (run.x, run.u), strict=True)
         for publisher, names, values in sides:
             message = JointState(name=names, position=values[k])
             message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
             publisher.publish(message)
-    for publisher in publishers:
+    for publisher in node.outputs:
         publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=10.0))
     node.get_logger().info(f"published {len(run)} samples")
     return 0
-
-
-def _subscribed(life: Life, publishers: Sequence[Publisher], limit: float) -> bool:
-    began = time.monotonic()
-    since: float | None = None
-    while life.alive:
-        now = time.monotonic()
-        if all(publisher.get_subscription_count() for publisher in publishers):
-            since = since or now
-            if now - since >= _SETTLE:
-                return True
-        elif now - began > limit:
-            return False
-        life.spin_once(0.05)
-    return False

@@ -17,8 +17,8 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import closing
-from dataclasses import dataclass, field
+from contextlib import closing, suppress
+from dataclasses import dataclass
 from typing import Any
 
 import yaml
@@ -37,8 +37,8 @@ from uncertain_lti.cli.command import DONE, Result, complain
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import TypeFields
-from uncertain_lti_ros.messages import live_fields, message_class
 from uncertain_lti_ros.process import Life, living, seconds, speed
+from uncertain_lti_ros.topics import live_fields, message_class
 
 CLOCK = "/clock"
 _DEPTH = 1000
@@ -72,12 +72,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass
 class _Played:
-    """A topic that can be played."""
+    """A topic that can be played, its messages and how many were sent."""
 
-    topic: str
     count: int
     publisher: Publisher
-    sent: int = field(default=0)
+    sent: int = 0
 
 
 def run(args: argparse.Namespace) -> Result:
@@ -105,7 +104,11 @@ def run(args: argparse.Namespace) -> Result:
             if args.lockstep:
                 _lockstep(life, played, clock, args.lockstep, messages, args.wait)
             else:
-                behind = _paced(life, played, clock, args.rate or 1.0, messages, crowd)
+                for message, late in when_due(messages, args.rate or 1.0, crowd, lambda: life.alive):
+                    behind = max(behind, late)
+                    if clock is not None:
+                        clock.publish(_clock(message.log_time_ns))
+                    _send(played, message)
         if behind > 1.0 and life.alive:
             note(
                 f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
@@ -123,8 +126,8 @@ def run(args: argparse.Namespace) -> Result:
         none = f"{bag.path}: interrupted before a message was played"
         complain("play", f"{ended}, then interrupted" if sent else none)
     data = {
-        "bag": str(bag.path), "messages": sent, "topics": {p.topic: p.sent for p in played.values()}, "seconds": took,
-        "unconfirmed": missed, "interrupted": life.signal is not None,
+        "bag": str(bag.path), "messages": sent, "topics": {topic: p.sent for topic, p in played.items()},
+        "seconds": took, "unconfirmed": missed, "interrupted": life.signal is not None,
     }  # fmt: skip
     return Result(_SIGNALLED + life.signal if life.signal is not None else DONE, data)
 
@@ -153,7 +156,7 @@ def _offer(
             continue
         qos = QoSProfile(depth=_DEPTH, durability=_durability(bag, topic))
         publisher = node.create_publisher(kind, topic, qos)
-        played[topic] = _Played(topic, info.count, publisher)
+        played[topic] = _Played(info.count, publisher)
     if not played:
         raise BagError(f"{bag.path}: no topic of it can be played here; the lines above say why")
     return played
@@ -180,12 +183,13 @@ def _hold_layout(type_name: str, recorded: TypeFields, installed: TypeFields) ->
 
 def _durability(bag: Bag, topic: str) -> DurabilityPolicy:
     """Transient local where every publisher was, as the recorder wrote down."""
-    first = next((message for message in bag.raw_messages([topic]) if message.channel.counted), None)
-    try:
-        offered = yaml.safe_load(first.channel.metadata.get("offered_qos_profiles") or "[]") if first else []
-        lasting = bool(offered) and all(o["durability"] in (1, "transient_local") for o in offered)
-    except (yaml.YAMLError, TypeError, LookupError):  # notes of some recorder; nothing else depends on them
-        lasting = False
+    lasting = False
+    for message in bag.raw_messages([topic]):
+        if message.channel.counted:
+            with suppress(yaml.YAMLError, TypeError, LookupError):  # notes of some recorder
+                offered = yaml.safe_load(message.channel.metadata.get("offered_qos_profiles") or "[]")
+                lasting = bool(offered) and all(o["durability"] in (1, "transient_local") for o in offered)
+            break
     return DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE
 
 
@@ -199,23 +203,23 @@ def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
 
 def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[str], None]) -> None:
     """Wait until every subscription that the graph shows is connected, and no new one appears for a while."""
-    began = changed = time.monotonic()
-    connected: dict[str, int] = {}
-    while life.alive:
-        now = time.monotonic()
-        counts = {p.topic: p.publisher.get_subscription_count() for p in played.values()}
-        wanted = {p.topic: life.node.count_subscribers(p.topic) for p in played.values()}
-        if counts != connected:
-            connected, changed = counts, now
-        if any(counts.values()) and counts == wanted and now - changed >= _SETTLE:
-            return
-        if now - began > limit:
-            break
-        life.spin_once(0.05)
-    if not life.alive:
+    changed = time.monotonic()
+    counts: list[int] = []
+
+    def settled() -> bool:
+        nonlocal changed, counts
+        before, counts = counts, [p.publisher.get_subscription_count() for p in played.values()]
+        if counts != before:
+            changed = time.monotonic()
+        return any(counts) and counts == wanted() and time.monotonic() - changed >= _SETTLE
+
+    def wanted() -> list[int]:
+        return [life.node.count_subscribers(topic) for topic in played]
+
+    if life.until(settled, limit) or not life.alive:
         return
-    unmet = [t for t in played if wanted[t] > counts[t]]
-    if not any(wanted.values()):
+    unmet = [topic for topic, there, found in zip(played, wanted(), counts, strict=True) if there > found]
+    if not any(wanted()):
         note(f"there is no subscriber to {', '.join(played)} after {limit:g} s; playing nevertheless")
     elif unmet:
         note(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
@@ -243,27 +247,13 @@ def when_due(
         yield message, last - due
 
 
-def _paced(
-    life: Life, played: dict[str, _Played], clock: Publisher | None, rate: float, messages: Iterator[RawMessage],
-    crowd: float,
-) -> float:  # fmt: skip
-    """Send each message at its time; by how many seconds it fell behind."""
-    behind = 0.0
-    for message, late in when_due(messages, rate, crowd, lambda: life.alive):
-        behind = max(behind, late)
-        if clock is not None:
-            clock.publish(_clock(message.log_time_ns))
-        _send(played, message)
-    return behind
-
-
 def _unconfirmed(life: Life, played: dict[str, _Played]) -> list[str]:
     """Topics with a subscriber that does not confirm all messages in time; none where a signal came first."""
-    end = time.monotonic() + _ACKNOWLEDGED
-    waiting = list(played.values())
+    end, waiting = time.monotonic() + _ACKNOWLEDGED, list(played)
     while life.alive and waiting and time.monotonic() < end:
-        waiting = [p for p in waiting if not p.publisher.wait_for_all_acked(Duration(seconds=_REPEAT))]
-    return [p.topic for p in waiting] if life.alive else []
+        some = Duration(seconds=_REPEAT)
+        waiting = [topic for topic in waiting if not played[topic].publisher.wait_for_all_acked(some)]
+    return waiting if life.alive else []
 
 
 def _send(played: dict[str, _Played], message: RawMessage) -> None:
@@ -305,11 +295,8 @@ class _Follower:
         self._life, self._name = life, name
         self._client: Client = life.node.create_client(Trigger, name)
         self.status: dict[str, Any] = {}
-        began = time.monotonic()
-        while life.alive and not self._client.service_is_ready():
-            if time.monotonic() - began > wait:
-                raise UncertainLTIError(f"{name}: no such service after {wait:g} s; start the monitor, or name it so")
-            life.spin_once(0.05)
+        if not life.until(self._client.service_is_ready, wait) and life.alive:
+            raise UncertainLTIError(f"{name}: no such service after {wait:g} s; start the monitor, or name it so")
         self._ask()
 
     def received(self, topic: str) -> int | None:

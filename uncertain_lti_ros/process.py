@@ -106,9 +106,8 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
         if given is not None:
             node._parameter_overrides[parameter.name] = whole_to_real(given, parameter.default)
         try:
-            values[parameter.name] = node.declare_parameter(
-                parameter.name, parameter.default, parameter.descriptor()
-            ).value
+            declared = node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+            values[parameter.name] = declared.value
         except (InvalidParameterTypeException, InvalidParameterValueException):
             given = node._parameter_overrides[parameter.name].value
             shown = repr(given) if isinstance(given, str) else _shown(given)
@@ -199,38 +198,30 @@ def _shown(default: object) -> str:
 
 def _check(given: Sequence[str], name: str) -> None:
     """Raise ArgumentError for what is no ROS argument, or half of one."""
-    inside, at = False, 0
-    while at < len(given):
-        word, at = given[at], at + 1
+    inside, words = False, iter(given)
+    for word in words:
         if word in ("--ros-args", "--"):
             inside = word == "--ros-args"
+        elif inside and word in _FORMS:
+            _hold_value(word, next(words, ""))
+        elif inside and word not in _LOGGING:
+            raise ArgumentError(f"{word} is no ROS argument; {_remedy(word, 'write', '-p', name)}")
         elif not inside:
-            _refuse(word, given[at : at + 1], name)
-        elif word in _FORMS:
-            value = given[at] if at < len(given) else ""
-            at += 1
-            _hold_value(word, value)
-        elif word not in _LOGGING:
-            remedy = "--help lists what there is"
-            if ":=" in word:
-                remedy = f"write -p {word}"
-            elif name == "envelope_monitor" and not word.startswith("-"):
-                remedy = f"if it is the model file, write -p model:={word}"
-            raise ArgumentError(f"{word} is no ROS argument; {remedy}")
+            remedy = _remedy(word, "write --ros-args", "-r" if word.startswith("_") else "-p", name)
+            if word in _FORMS:
+                after = next(words, None)
+                remedy = f"write --ros-args {_FORMS[word] if after is None else f'{word} {after}'}"
+            elif word.startswith("-") and ":=" not in word:
+                remedy = "a parameter is given as --ros-args -p NAME:=VALUE, and --help lists them"
+            raise ArgumentError(f"argument {word} has no meaning here; {remedy}")
 
 
-def _refuse(word: str, after: Sequence[str], name: str) -> None:
+def _remedy(word: str, write: str, flag: str, name: str) -> str:
     if ":=" in word:
-        remedy = f"write --ros-args {'-r' if word.startswith('_') else '-p'} {word}"
-    elif word in _FORMS:
-        remedy = f"write --ros-args {' '.join([word, *after]) if after else _FORMS[word]}"
-    elif word.startswith("-"):
-        remedy = "a parameter is given as --ros-args -p NAME:=VALUE, and --help lists them"
-    elif name == "envelope_monitor":
-        remedy = f"if it is the model file, write --ros-args -p model:={word}"
-    else:
-        remedy = "--help lists what there is"
-    raise ArgumentError(f"argument {word} has no meaning here; {remedy}")
+        return f"{write} {flag} {word}"
+    if name == "envelope_monitor" and not word.startswith("-"):
+        return f"if it is the model file, {write} -p model:={word}"
+    return "--help lists what there is"
 
 
 def _hold_value(flag: str, value: str) -> None:
@@ -339,6 +330,17 @@ class Life:
         """Wait for work, and do it."""
         self.executor.spin_once(timeout_sec=min(seconds, _LATENCY))
 
+    def until(self, done: Callable[[], object], seconds: float = math.inf) -> bool:
+        """Work until something is done; whether it was, before a signal came and within this time."""
+        began = time.monotonic()
+        while self.alive:
+            if done():
+                return True
+            if time.monotonic() - began > seconds:
+                return False
+            self.spin_once(0.05)
+        return False
+
     def spin(self, note: Callable[[str, Exception], None]) -> None:
         """Work until the end; an error that a callback lets through is noted, and the work goes on.
 
@@ -390,7 +392,7 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
         for life in lives:
             life.end()
 
-    before = {name: signal.signal(name, end) for name in _SIGNALS}
+    before = {name: signal.signal(name, end) for name in (signal.SIGINT, signal.SIGTERM)}
     node = None
     try:
         try:
@@ -412,32 +414,22 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
             node.destroy_node()
         rclpy.try_shutdown()
         signal.alarm(0)
-        # A process often gets the signal twice, from the terminal and from its parent.
         for name, handler in before.items():
-            signal.signal(name, signal.SIG_IGN if stop else handler)
-
-
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+            signal.signal(name, signal.SIG_IGN if stop else handler)  # a process often gets it twice
 
 
 def seconds(text: str) -> float:
     """Parse an argument that is a time: a finite number, 0 or more."""
-    value = _number(text)
-    if not 0 <= value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not a time; give seconds, 0 or more")
-    return value
+    return _number(text, 0.0, "is not a time; give seconds, 0 or more")
 
 
 def speed(text: str) -> float:
     """Parse an argument that is a speed, times real time: a finite number above 0."""
-    value = _number(text)
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text} is not a speed; give a number above 0, such as 1 or 0.5")
-    return value
+    return _number(text, math.ulp(0.0), "is not a speed; give a number above 0, such as 1 or 0.5")
 
 
-def _number(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return math.nan
+def _number(text: str, least: float, otherwise: str) -> float:
+    with suppress(ValueError):
+        if least <= (value := float(text)) < math.inf:
+            return value
+    raise argparse.ArgumentTypeError(f"{text} {otherwise}")

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import time
 from collections.abc import Callable
@@ -26,9 +27,8 @@ from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.command import Result
-from uncertain_lti_ros.messages import definition, message_class
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
-from uncertain_lti_ros.topics import POLL, MatchedSubscription
+from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition, message_class
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
@@ -91,23 +91,25 @@ def resolved_name(node: Node, topic: str) -> str:
 
 def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable[[str], None]) -> dict[str, str]:
     """Type of each topic, as soon as all are there; {} when a signal came first."""
-    began, told = time.monotonic(), False
-    while life.alive:
-        there = dict(life.node.get_topic_names_and_types())
-        missing = [topic for topic in topics if topic not in there]
+    there: dict[str, list[str]] = {}
+    missing: list[str] = []
+
+    def found() -> bool:
+        there.clear()
+        there.update(life.node.get_topic_names_and_types())
+        missing[:] = [topic for topic in topics if topic not in there]
         for topic in topics:
             if len(there.get(topic, ())) > 1:
                 raise BagError(f"{topic}: is published as {' and '.join(there[topic])}; record one type at a time")
-        if not missing:
-            return {topic: there[topic][0] for topic in topics}
-        waited = time.monotonic() - began
-        if limit is not None and waited > limit:
-            raise BagError(f"{', '.join(missing)}: not there after {limit:g} s; start what publishes it")
-        if waited > 1.0 and not told:
-            note(f"waiting for {', '.join(missing)}")
-            told = True
-        life.spin_once()
-    return {}
+        return not missing
+
+    limit = math.inf if limit is None else limit
+    if not life.until(found, min(1.0, limit)) and life.alive and limit > 1.0:
+        note(f"waiting for {', '.join(missing)}")
+        life.until(found, limit - 1.0)
+    if missing and life.alive:
+        raise BagError(f"{', '.join(missing)}: not there after {limit:g} s; start what publishes it")
+    return {topic: there[topic][0] for topic in topics} if life.alive else {}
 
 
 def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSubscription:

@@ -20,8 +20,8 @@ from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.outputs import RECORDED
 from uncertain_lti.monitor.session import Session
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
-from uncertain_lti_ros.messages import definition
 from uncertain_lti_ros.parameters import Settings
+from uncertain_lti_ros.topics import definition
 
 _SERVICE_WAIT = 0.2  # s that ~/snapshot waits for its file
 

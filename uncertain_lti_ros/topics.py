@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Topics of the node: subscriptions that take the quality of service offered, outputs, diagnostics, who listens.
+"""Topics: their message classes, subscriptions that take the quality of service offered, outputs, diagnostics.
 
 Events of the middleware are polled instead of handed to the executor: one that arrives while the executor removes its
 handler makes the events executor of Jazzy run Python without Python's lock, and the process dies (ros2/rclpy, issue
@@ -16,11 +16,14 @@ handler makes the events executor of Jazzy run Python without Python's lock, and
 
 from __future__ import annotations
 
+import importlib
+import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Literal
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
@@ -33,13 +36,106 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
 
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.monitor.catch_up import MOST
 from uncertain_lti.monitor.intake import Sender
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION, NamedVector, VerdictMessages
 from uncertain_lti.monitor.session import Report, Session
-from uncertain_lti_ros.messages import full_name, message_class
+from uncertain_lti.signals.field_path import FieldType, full_name
+
+_ARRAY = re.compile(r"(?P<element>[^\[\]]+)\[(?P<count>\d+)\]")
+_SEQUENCE = re.compile(r"sequence<(?P<element>[^,]+?)(?:,\s*(?P<bound>\d+))?>")
+_NUMBERS = {
+    "float": "float32", "double": "float64", "char": "char",
+    **{f"{sign}int{bits}": f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)},
+}  # fmt: skip
+
+
+@cache
+def message_class(type_name: str) -> Any:
+    """Class of a message type such as `sensor_msgs/msg/JointState`."""
+    parts = type_name.split("/")
+    package, name = parts[0], parts[-1]
+    if not (len(parts) == 2 or (len(parts) == 3 and parts[1] == "msg")) or not (package and name.isidentifier()):
+        raise SignalError(f"{type_name!r} is not a message type; one reads like sensor_msgs/msg/JointState")
+    try:
+        module = importlib.import_module(f"{package}.msg")
+    except ImportError as error:
+        missing = (getattr(error, "name", None) or package).split(".")[0]
+        raise SignalError(
+            f"{type_name}: the Python package {missing} is not installed; install it "
+            f"(ros-$ROS_DISTRO-{missing.replace('_', '-')}), or build and source the workspace that defines it"
+        ) from None
+    found = getattr(module, name, None)
+    if not hasattr(found, "get_fields_and_field_types"):
+        raise SignalError(f"{type_name}: the installed Python package {package} has no message {name}; update it")
+    return found
+
+
+def live_fields(type_name: str) -> Mapping[str, FieldType]:
+    """Fields of an installed message type."""
+    described = message_class(type_name).get_fields_and_field_types()
+    return {name: _field_type(text) for name, text in described.items()}
+
+
+def _split(text: str) -> tuple[str, int | None, str]:
+    """Element type, array length as in FieldType, and the array as a .msg file writes it."""
+    if match := _ARRAY.fullmatch(text):
+        return match["element"], int(match["count"]), f"[{match['count']}]"
+    if match := _SEQUENCE.fullmatch(text):
+        return match["element"], 0, f"[<={match['bound']}]" if match["bound"] else "[]"
+    return text, None, ""
+
+
+def _field_type(text: str) -> FieldType:
+    element, array, _ = _split(text)
+    kind: Literal["number", "bool", "string", "message", "other"] = "other"
+    if element in _NUMBERS:
+        kind, element = "number", _NUMBERS[element]
+    elif element == "boolean":
+        kind, element = "bool", "bool"
+    elif element.startswith(("string", "wstring")):
+        kind = "string"
+    elif element == "octet":
+        element = "byte"
+    elif "/" in element:
+        kind, element = "message", full_name(element)
+    return FieldType(kind, element, array)
+
+
+def stamp_ns(message: Any) -> int:
+    """The header stamp of a message, ns."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
+
+
+def definition(type_name: str) -> str:
+    """Definition of an installed type and of all it uses, as MCAP's schema encoding `ros2msg` wants it.
+
+    Constants and default values are not in it: a class does not hold them, and no reader of messages needs them.
+    """
+    bodies: dict[str, str] = {}
+    waiting = [full_name(type_name)]
+    while waiting:
+        name = waiting.pop(0)
+        if name in bodies:
+            continue
+        lines = []
+        for field, text in message_class(name).get_fields_and_field_types().items():
+            element, _, array = _split(text)
+            if "/" in element:
+                waiting.append(full_name(element))
+            written = {"boolean": "bool", "octet": "byte"}.get(element, _NUMBERS.get(element, element))
+            written = re.sub(r"<(\d+)>", r"<=\1", written)  # a bounded string
+            lines.append(f"{written}{array} {field}\n")
+        bodies[name] = "".join(lines) or "uint8 structure_needs_at_least_one_member\n"
+    first, *others = bodies.items()
+    parts = [first[1]]
+    for name, body in others:
+        package, _, short = name.split("/")
+        parts.append(f"{'=' * 80}\nMSG: {package}/{short}\n{body}")
+    return "".join(parts)
+
 
 POLL = 0.1
 """s between two polls: who listens, and publishers that changed, are known that late at most."""

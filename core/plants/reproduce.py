@@ -15,9 +15,9 @@ import json
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.linalg import expm
@@ -40,8 +40,7 @@ SHORT = ("N1", "N2", "P3", "P5", "T5")
 SHORT_CONTROLS = ("fuel", "area", "fan vanes", "comp. vanes")
 
 
-@dataclass(frozen=True)
-class Case:
+class Case(NamedTuple):
     """One identification and its check on another transient.
 
     `numbers`: of the fit and the check, as `reproduce.json` has them. Shares and widths are of the check's transitions,
@@ -49,42 +48,39 @@ class Case:
     (2006), eq. (4) with W = I and (5).
     """
 
-    name: str
     model: UncertainLTI
     verdicts: Verdicts
     numbers: dict[str, Any]
 
-    @classmethod
-    def of(
-        cls, name: str, transients: Sequence[Transient], check: Transient, criterion: Any, additive: Any = "none"
-    ) -> Case:
-        """Fit a model and check it on another transient."""
-        began = time.perf_counter()
-        model = fit(transients, criterion, additive=additive)
-        seconds = time.perf_counter() - began
-        monitor = EnvelopeMonitor(model)
-        verdicts = monitor.check(check)
-        judged, steps, point = verdicts.judged, check.transitions(), model.operating_point
-        ranges = replace(model.domain, measure=None)  # pulses, one control at a time, fit few combinations
-        width = ((verdicts.upper - verdicts.lower) / model.operating_point.X)[judged]
-        squared, largest = model.discrepancy(check)
-        numbers = {
-            "identified_from": name,
-            "criterion": criterion,
-            "additive": additive,
-            "objective": np.asarray(model.fit_summary["objective"]).tolist(),
-            "outside_identification": sum(int(monitor.check(t).violated.sum()) for t in transients),
-            "inside": (1.0 - (verdicts.flags[judged] == 1.0).mean(axis=0)).tolist(),
-            "inside_all": 1.0 - float(verdicts.violated[judged].mean()),
-            "mean_width": width.mean(axis=0).tolist(),
-            "max_width": width.max(axis=0).tolist(),
-            "discrepancy_4": squared,
-            "discrepancy_5": largest.tolist(),
-            "outside_domain": int(ranges.outside(point.normalise_x(steps.x), point.normalise_u(steps.u)).sum()),
-            "eigenvalues": [[v.real, v.imag] for v in model.eigenvalues().tolist()],
-            "seconds": seconds,
-        }
-        return cls(name, model, verdicts, numbers)
+
+def fit_and_check(name: str, transients: Sequence[Transient], check: Transient, additive: Any, criterion: Any) -> Case:
+    """Fit a model and check it on another transient."""
+    began = time.perf_counter()
+    model = fit(transients, criterion, additive=additive)
+    seconds = time.perf_counter() - began
+    monitor = EnvelopeMonitor(model)
+    verdicts = monitor.check(check)
+    judged, steps, point = verdicts.judged, check.transitions(), model.operating_point
+    ranges = replace(model.domain, measure=None)  # pulses, one control at a time, fit few combinations
+    width = ((verdicts.upper - verdicts.lower) / point.X)[judged]
+    squared, largest = model.discrepancy(check)
+    numbers = {
+        "identified_from": name,
+        "criterion": criterion,
+        "additive": additive,
+        "objective": np.asarray(model.fit_summary["objective"]).tolist(),
+        "outside_identification": sum(int(monitor.check(t).violated.sum()) for t in transients),
+        "inside": (1.0 - (verdicts.flags[judged] == 1.0).mean(axis=0)).tolist(),
+        "inside_all": 1.0 - float(verdicts.violated[judged].mean()),
+        "mean_width": width.mean(axis=0).tolist(),
+        "max_width": width.max(axis=0).tolist(),
+        "discrepancy_4": squared,
+        "discrepancy_5": largest.tolist(),
+        "outside_domain": int(ranges.outside(point.normalise_x(steps.x), point.normalise_u(steps.u)).sum()),
+        "eigenvalues": [[v.real, v.imag] for v in model.eigenvalues().tolist()],
+        "seconds": seconds,
+    }
+    return Case(model, verdicts, numbers)
 
 
 def reproduce(
@@ -110,7 +106,7 @@ def reproduce(
     check, noisy_check = simulate(make_run("check")), simulate(make_run("check", noise=NOISE, seed=4))
     paper, both, wide = f"+{SMALL:.0%} (the paper's)", f"±{SMALL:.0%}", f"±{LARGE:.0%}"
     wanted = [
-        (name, transients, recording, criterion, additive)
+        (name, transients, recording, additive, criterion)
         for name, transients, recording, additive in (
             (paper, [up], check, "none"),
             (both, [up, down], check, "none"),
@@ -122,22 +118,21 @@ def reproduce(
         for criterion in ("qp", "lp")
     ]
     cases = []
-    for number_of, (name, transients, recording, criterion, additive) in enumerate(wanted, start=1):
-        step(CountedStep(f"fit {number_of} of {len(wanted)}: {name}", number_of, len(wanted)))
-        cases.append(Case.of(name, transients, recording, criterion, additive))
+    for number_of, case in enumerate(wanted, start=1):
+        step(CountedStep(f"fit {number_of} of {len(wanted)}: {case[0]}", number_of, len(wanted)))
+        cases.append(fit_and_check(*case))
     tell(cases_text(cases))
     tell(width_text(cases))
-    first, chosen = cases[0], next(c for c in cases if c.name == wide)
+    first, chosen = cases[0], next(c for c in cases if c.numbers["identified_from"] == wide)
     tell(eigenvalue_text({f"(10) from {paper}": first.model, f"(10) from {wide}": chosen.model}))
     tell(matrix_text(chosen.model, f"(10) from {wide}"))
-    for case in cases:
-        label = case.name.replace(" (the paper's)", "").replace(", noise 0.0001", "_noise")
-        name = label.replace("±", "both").replace("+", "up").replace("%", "")
-        name = f"{name}_{case.numbers['criterion']}_{case.numbers['additive']}"
-        case.model.save(folder / f"{name}.model.json")
-    for name, case in (("check", chosen), ("check_paper_pulses", first)):
-        save(envelope_figure(case.model, case.verdicts), folder / f"{name}.png")
-        save(utilisation_figure(case.model, case.verdicts), folder / f"{name}_utilisation.png")
+    for model, _, numbers in cases:
+        name = "_".join(_identified(numbers)).replace(" (the paper's)", "").replace(", noise 0.0001", "_noise")
+        name = name.replace("±", "both").replace("+", "up").replace("%", "")
+        model.save(folder / f"{name}.model.json")
+    for name, (model, verdicts, _) in (("check", chosen), ("check_paper_pulses", first)):
+        save(envelope_figure(model, verdicts), folder / f"{name}.png")
+        save(utilisation_figure(model, verdicts), folder / f"{name}_utilisation.png")
     data = {
         "cases": [c.numbers for c in cases],
         "published_eigenvalues": [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()],

@@ -29,15 +29,15 @@ from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, JOINT_STATE, STATE
 from uncertain_lti.plants.turbofan import (
     CONTROL_UNITS,
     CONTROLS,
+    HEALTHY,
     STATE_UNITS,
     STATES,
-    Engine,
+    T_STANDARD,
     GasPath,
     GasPathSolver,
     Health,
     engine,
 )
-from uncertain_lti.plants.turbofan_gas import T_STANDARD
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -72,23 +72,24 @@ def power(pla: float) -> float:
     return (pla - IDLE) / (MAXIMUM - IDLE)
 
 
-def fan_speed(pla: float, plant: Engine) -> float:
+def fan_speed(pla: float) -> float:
     """Scheduled fan speed, rpm: 50 % at idle, flatter towards the maximum (chosen)."""
     share: float = 0.5 + 0.5 * power(pla) ** 0.75
-    return share * plant.design.fan_speed
+    return share * engine().design.fan_speed
 
 
-def nozzle_area(pla: float, plant: Engine) -> float:
+def nozzle_area(pla: float) -> float:
     """Scheduled throat area, m^2: opened by 20 % at idle, to keep thrust low and the fan away from surge (chosen)."""
-    return float(plant.nozzle_area * (1.0 + 0.20 * (1.0 - power(pla)) ** 1.2))
+    return float(engine().nozzle_area * (1.0 + 0.20 * (1.0 - power(pla)) ** 1.2))
 
 
-def vanes(low: float, high: float, plant: Engine) -> tuple[float, float]:
+def vanes(low: float, high: float) -> tuple[float, float]:
     """Scheduled angles, deg, of fan and compressor vanes at spool speeds in rpm.
 
     The compressor's inlet temperature, which its corrected speed needs, is taken from the fan speed, as its rise goes
     nearly with the square of that.
     """
+    plant = engine()
     n = low / plant.design.fan_speed
     share = T_STANDARD / plant.compressor.T_design
     n_high = high / plant.design.compressor_speed / (share + (1.0 - share) * n * n) ** 0.5
@@ -109,42 +110,32 @@ class Trim:
     path: GasPath
 
 
-def trim(pla: float, plant: Engine | None = None, health: Health | None = None) -> Trim:
+def trim(pla: float) -> Trim:
     """Steady state at a lever angle: fan speed, area and vanes by schedule, fuel and compressor speed by balance."""
     from scipy.optimize import root
 
-    plant, health = plant or engine(), health or Health()
-    d, low, area = plant.design, fan_speed(pla, plant), nozzle_area(pla, plant)
-    solver = GasPathSolver(plant)
+    plant, solver = engine(), GasPathSolver(engine())
 
     def at(q: Array) -> tuple[list[float], list[float]]:
-        high = float(q[0]) * d.compressor_speed
-        fan_vane, compressor_vane = vanes(low, high, plant)
-        return [low, high, 0.0, 0.0, 0.0], [float(q[1]) * plant.fuel, area, fan_vane, compressor_vane]
+        low, high = fan_speed(angle), float(q[0]) * plant.design.compressor_speed
+        return [low, high, 0.0, 0.0, 0.0], [float(q[1]) * plant.fuel, nozzle_area(angle), *vanes(low, high)]
 
     def imbalance(q: Array) -> Array:
-        x, u = at(q)
-        path = plant.gas_path(x, u, health, solver)
-        loss = d.mechanical_efficiency
-        return np.array(
-            [
-                path.low_turbine_power * loss / path.fan_power - 1.0,
-                path.high_turbine_power * loss / path.compressor_power - 1.0,
-            ]
-        )
+        path, loss = solver.solve(*at(q), HEALTHY), plant.design.mechanical_efficiency
+        low, high = path.low_turbine_power * loss, path.high_turbine_power * loss
+        return np.array([low / path.fan_power - 1.0, high / path.compressor_power - 1.0])
 
     # from the maximum downwards in small steps: each steady state is the guess for the next
     q = np.ones(2)
     steps = max(1, round((MAXIMUM - pla) / 2.0))
     for k in range(1, steps + 1):
         angle = MAXIMUM + (pla - MAXIMUM) * k / steps
-        low, area = fan_speed(angle, plant), nozzle_area(angle, plant)
         found = root(imbalance, q, tol=1e-13, options={"factor": 0.1})
         q = found.x
         if np.abs(found.fun).max() > 1e-9:
             raise UncertainLTIError(f"turbofan: no steady state at PLA {angle:g} deg: {found.message}")
     x, u = at(q)
-    path = plant.gas_path(x, u, health, solver)
+    path = solver.solve(x, u, HEALTHY)
     x[2:] = [path.P3, path.P5, path.T5]
     return Trim(pla, np.array(x), np.array(u), path)
 
@@ -165,7 +156,7 @@ class Controller:
     integrates the distance to the nearer limit; the cap has no proportional part and stays above the law while no limit
     is near, so that noise is not rectified. Gains are chosen for a response of about a second.
 
-    `plant`: the engine; `start`: the steady state that the controller takes over; `dt`: step, s.
+    `start`: the steady state that the controller takes over.
     """
 
     PROPORTIONAL, INTEGRAL = 2.0, 4.0  # relative fuel over relative speed: 1, 1/s
@@ -177,25 +168,24 @@ class Controller:
     COMPRESSOR_LIMIT = 1.01  # of the design speed
     TEMPERATURE_LIMIT = 1.03  # of the design's
 
-    def __init__(self, plant: Engine, start: Trim, dt: float) -> None:
-        self._plant, self._dt = plant, dt
+    def __init__(self, start: Trim) -> None:
         self._limits = (
-            self.COMPRESSOR_LIMIT * plant.design.compressor_speed,
+            self.COMPRESSOR_LIMIT * engine().design.compressor_speed,
             self.TEMPERATURE_LIMIT * float(operating_point().x_s[4]),
         )
         self._command = start.u.copy()
-        self._offset = start.x[0] - fan_speed(start.pla, plant)  # a steady state is one of the loop, to the last bit
+        self._offset = start.x[0] - fan_speed(start.pla)  # a steady state is one of the loop, to the last bit
         self._correction = 0.0  # of the integral, relative fuel, from the steady state
         self._start = float(start.u[0])
-        self._cap = self._start / plant.fuel + self.CLEARANCE
+        self._cap = self._start / engine().fuel + self.CLEARANCE
 
     def step(self, pla: float, x: Array) -> Array:
         """Commands from the lever and the measured states, once per sample.
 
         `x` (5,): measured states, recorded units; Returns (4,): commands, recorded units.
         """
-        fuel, dt, u = self._plant.fuel, self._dt, self._command.copy()
-        demand = fan_speed(pla, self._plant) + self._offset
+        fuel, dt, u = engine().fuel, DT, self._command.copy()
+        demand = fan_speed(pla) + self._offset
         error = float((demand - x[0]) / demand)
         distance = min(1.0 - float(x[1]) / self._limits[0], 1.0 - float(x[4]) / self._limits[1])
         self._correction += self.INTEGRAL * dt * error
@@ -205,10 +195,9 @@ class Controller:
         u[0] += min(max(limited - u[0], -self.FUEL_RATE * dt), self.FUEL_RATE * dt)
         if u[0] != wanted:  # the integral does not run on while something else holds the fuel
             self._correction -= self.INTEGRAL * dt * error
-        targets = (nozzle_area(pla, self._plant), *vanes(float(x[0]), float(x[1]), self._plant))
-        for j, (target, rate) in enumerate(
-            zip(targets, (self.AREA_RATE, self.VANE_RATE, self.VANE_RATE), strict=True), start=1
-        ):
+        targets = (nozzle_area(pla), *vanes(float(x[0]), float(x[1])))
+        rates = (self.AREA_RATE, self.VANE_RATE, self.VANE_RATE)
+        for j, (target, rate) in enumerate(zip(targets, rates, strict=True), start=1):
             u[j] += min(max(target - u[j], -rate * dt), rate * dt)
         self._command = u
         return u.copy()
@@ -219,16 +208,17 @@ def turbofan_signals() -> SignalMap:
     """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`."""
     point = operating_point()
 
-    def signals(names: tuple[str, ...], units: tuple[str, ...], topic: str, steady: Array, scale: Array,
-                hold: float | None) -> tuple[Signal, ...]:  # fmt: skip
+    def signals(
+        topic: str, names: tuple[str, ...], units: tuple[str, ...], steady: Array, scale: Array, hold: float | None
+    ) -> tuple[Signal, ...]:
+        rows = zip(names, units, steady.tolist(), scale.tolist(), strict=True)
         return tuple(
-            Signal(name, topic, f"position[{name}]", float(s), float(c), unit, JOINT_STATE, hold)
-            for name, unit, s, c in zip(names, units, steady, scale, strict=True)
+            Signal(name, topic, f"position[{name}]", s, c, unit, JOINT_STATE, hold) for name, unit, s, c in rows
         )
 
     return SignalMap(
-        signals(STATES, STATE_UNITS, STATE_TOPIC, _rounded(point.x_s, point.X), point.X, None),
-        signals(CONTROLS, CONTROL_UNITS, CONTROL_TOPIC, point.u_s, point.U, HOLD),
+        signals(STATE_TOPIC, STATES, STATE_UNITS, _rounded(point.x_s, point.X), point.X, None),
+        signals(CONTROL_TOPIC, CONTROLS, CONTROL_UNITS, point.u_s, point.U, HOLD),
         clock=STATE_TOPIC,
         max_gap=2.5 * DT,
         time={STATE_TOPIC: "header", CONTROL_TOPIC: "header"},
@@ -284,7 +274,7 @@ class Fault:
             return Health(compressor=1.0 - self.size * min(WEAR * (t - self.at), WORST_WEAR))
         if self.kind == "fan_damage" and t >= self.at:
             return Health(fan=1.0 - self.size * DAMAGE)
-        return Health()
+        return HEALTHY
 
     def reading(self, t: float, x: Array, X: Array) -> Array:
         """What the sensors read.
@@ -346,17 +336,15 @@ def pulses(t: float, amplitude: float) -> Array:
     return u
 
 
-def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) -> Transient:
+def simulate(run: Run, start_ns: int = START_NS) -> Transient:
     """Run the engine: readings and commands, sample by sample.
 
     Between samples the nonlinear equations are integrated by SciPy's DOP853 to a relative tolerance of 1e-9, with the
     commands held.
     """
-    plant = plant or engine()
     point, rng = operating_point(), np.random.default_rng(run.seed)
-    begin = trim(run.lever[0][1], plant)
-    solver = GasPathSolver(plant)
-    controller = Controller(plant, replace(begin, x=_rounded(begin.x, point.X)), DT)
+    begin, solver = trim(run.lever[0][1]), GasPathSolver(engine())
+    controller = Controller(replace(begin, x=_rounded(begin.x, point.X)))
     x, x_read, u_sent = begin.x.copy(), np.empty((run.samples, 5)), np.empty((run.samples, 4))
     fault = run.fault or Fault("fan_damage", np.inf)
     actual = begin.u.copy()
@@ -376,7 +364,7 @@ def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) ->
         held, actual = actual, u_sent[k].copy()
         if stuck is not None:
             actual[stuck] = held[stuck]
-        x = _advance(plant, solver, x, actual, point.X, fault.health(t))
+        x = _advance(solver, x, actual, point.X, fault.health(t))
     return Transient(
         start_ns + DT_NS * np.arange(run.samples, dtype=np.int64),
         x_read,
@@ -387,9 +375,9 @@ def simulate(run: Run, start_ns: int = START_NS, plant: Engine | None = None) ->
     )
 
 
-def _advance(plant: Engine, solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health) -> Array:
+def _advance(solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health) -> Array:
     """x after one step under u."""
-    controls = u.tolist()
+    plant, controls = engine(), u.tolist()
 
     def rate(_: float, z: Array) -> Array:
         return plant.derivative((z * X).tolist(), controls, health, solver) / X

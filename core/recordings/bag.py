@@ -31,10 +31,10 @@ from uncertain_lti.recordings.bag_files import (
     survey,
 )
 from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages
-from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, normal_name, undefined
+from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, undefined
 from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo, topic_facts
 from uncertain_lti.recordings.unreadable import os_error
-from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
+from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, full_name
 
 __all__ = ["Bag", "group_bags"]
 
@@ -348,7 +348,7 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
     lines = 0
     for key, channel in contents.channels.items():
         schema = contents.schemas.get(channel.schema_id) if channel.schema_id else None
-        type_name = normal_name(schema.name) if schema else ""
+        type_name = full_name(schema.name) if schema else ""
         if channel.message_encoding != "cdr":
             encoding = channel.message_encoding or "no stated encoding"
             definition = undefined(type_name, f"its messages are in {encoding}, and cdr is what can be decoded")

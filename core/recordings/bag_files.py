@@ -44,8 +44,9 @@ from uncertain_lti.recordings.mcap_records import (
     parse,
 )
 from uncertain_lti.recordings.mcap_scan import outline, scan
-from uncertain_lti.recordings.message_types import Definition, define, distribution_text, normal_name, ros2_text
+from uncertain_lti.recordings.message_types import Definition, define, distribution_text, ros2_text
 from uncertain_lti.recordings.unreadable import SUFFIXES, aside, file_names, no_recording, one_line, os_error
+from uncertain_lti.signals.field_path import full_name
 from uncertain_lti.signals.values import compose, construct
 
 _DATABASE = b"SQLite format 3\0"
@@ -380,7 +381,7 @@ def _kinds(contents: Contents) -> set[tuple[str, str]]:
     """(topic, type) of every channel of a file."""
     schemas = contents.schemas
     return {
-        (c.topic, normal_name(schemas[c.schema_id].name) if c.schema_id and c.schema_id in schemas else "")
+        (c.topic, full_name(schemas[c.schema_id].name) if c.schema_id and c.schema_id in schemas else "")
         for c in contents.channels.values()
     }
 

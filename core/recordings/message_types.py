@@ -32,7 +32,7 @@ from rosbags.typesys.store import Typestore
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
 from uncertain_lti.recordings.unreadable import one_line
-from uncertain_lti.signals.field_path import FieldType
+from uncertain_lti.signals.field_path import FieldType, full_name
 
 _LARGEST_SCHEMA = 1 << 20  # bytes
 _LARGEST_PARSED = 1 << 18  # bytes without comments
@@ -186,12 +186,6 @@ def _plain(data: bytes) -> bytes:
     return data
 
 
-def normal_name(name: str) -> str:
-    """`pkg/msg/Type` also for `pkg/Type`."""
-    parts = name.split("/")
-    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
-
-
 @functools.lru_cache(maxsize=1024)
 def define(name: str, encoding: str, text: bytes) -> Definition:
     """Definition from a schema; its reason says what failed.
@@ -199,7 +193,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
     Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise for
     types that a text uses and does not define.
     """
-    type_name = normal_name(name)
+    type_name = full_name(name)
     types: dict[str, Any] = {}
     store = get_typestore(Stores.EMPTY)
     reason = note = ""

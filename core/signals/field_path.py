@@ -39,6 +39,12 @@ TypeFields = Callable[[str], Mapping[str, FieldType]]
 """Type name -> {field name: FieldType}; raises SignalError for an unknown type."""
 
 
+def full_name(type_name: str) -> str:
+    """`pkg/msg/Type` also for `pkg/Type`."""
+    parts = type_name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
+
+
 _STEP = re.compile(
     r"""\.?([A-Za-z_]\w*)|\[\s*(\d{1,18})\s*\]|\[\s*"([^"]+)"\s*\]|\[\s*([^\[\]"\s](?:[^\[\]"]*[^\[\]"\s])?)\s*\]"""
 )
