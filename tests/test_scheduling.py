@@ -26,7 +26,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.cli.options import schedule as _schedule
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.free_run import run_over
-from uncertain_lti.proposal.search import EXCESS, EXCESS_FOR_MUCH, KnotCandidate, best_of, choose_knots, decide
+from uncertain_lti.proposal.search import EXCESS, KnotCandidate, Score, choose_knots, chosen_of
 from uncertain_lti.proposal.tune import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
 
@@ -65,7 +65,9 @@ def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out
     (facts,) = model.fit_summary["schedule"]
     assert facts["chosen"] == 3 == model.schedule.blocks
     rows = {row["knots"]: row for row in facts["candidates"]}
-    assert rows[3]["width"] < 0.3 and rows[3]["excess"] <= EXCESS_FOR_MUCH and rows[1]["width"] == 1
+    assert rows[3]["jumps"] < 0.3 and rows[3]["width"] < 0.3
+    assert rows[3]["excess"] * rows[3]["jumps"] <= EXCESS
+    assert rows[1]["width"] == rows[1]["jumps"] == 1
     inside = []
     for tested in (model, one):
         for steps in (run(seed).transitions() for seed in range(70, 80)):
@@ -94,45 +96,38 @@ def test_where_knots_do_not_pay_one_is_kept_and_the_reason_said(runs):
     assert "does not pay" in facts["reason"] or runs is not LINEAR
 
 
-def test_a_recording_unlike_all_others_excuses_nothing():
-    """One left-out part that no number of knots covers has so large an error that any difference is within it."""
-    judged, one = np.full(10, 2000.0), np.array([900.0, 1, 0, 1, 0, 2, 1, 0, 1, 1])
-    base = KnotCandidate(count=1, judged=judged, outside=one, log_width=np.zeros(10))
-
-    def knots(more, unlike):
-        outside = np.array([unlike, *(one[1:] + more)])
-        return KnotCandidate(count=3, judged=judged, outside=outside, log_width=np.full(10, -0.6))
-
-    assert best_of([base, fine := knots(1.0, 1100.0)]) is fine
-    for worse in (knots(4.0, 860.0), knots(4.0, 600.0)):
-        assert worse.more_outside(base)[0] < worse.more_outside(base)[1]
-        assert best_of([base, worse]) is base
-    assert knots(4.0, 1100.0).worst(base) > EXCESS > knots(0.5, 900.0).worst(base)
-    reason = decide("x1", [base, fine], "recording")[1]["reason"]
-    assert (
-        "94.42% inside, where one knot has 95.46% (99.91% and 99.96% without the 1 of 10 parts that are unlike"
-        in reason
-    )
-
-
-@pytest.mark.parametrize(("outside", "width", "taken"), [(7, 0.5, True), (9, 0.5, False), (9, 0.2, True)])
-def test_at_most_so_many_times_what_one_knot_leaves_outside(outside, width, taken):
-    """Also where that is a small share; not if the bounds are much narrower."""
+@pytest.mark.parametrize(
+    ("figures", "outside", "taken"),
+    [
+        ((1.0, 0.91, 0.5), (3, 3, 3), 3),
+        ((1.0, 0.91, 0.91), (3, 3, 3), 1),  # not clearly smaller
+        ((1.0, 0.51, 0.5), (3, 3, 3), 2),  # the fewest of which no other sees clearly smaller jumps
+        ((1.0, 0.8, 0.5), (3, 3, 104), 2),  # over 1.25 times one knot's, and 0.5 % over the jumps
+        ((1.0, 0.8, 0.5), (3, 3, 103), 3),
+    ],
+)
+def test_coverage_comes_first_and_then_the_fewest_knots_of_the_clearly_smallest_jumps(figures, outside, taken):
     judged = np.full(10, 10_000.0)
-    base = KnotCandidate(count=1, judged=judged, outside=np.full(10, 3.0), log_width=np.zeros(10))
-    knots = KnotCandidate(
-        count=2, judged=judged, outside=np.full(10, float(outside)), log_width=np.full(10, np.log(width))
-    )
-    assert knots.worst(base) < EXCESS
-    assert best_of([base, knots]) is (knots if taken else base)
-    few = [replace(c, judged=10.0 * judged) for c in (base, knots)]
-    assert best_of(few) is few[1]
+
+    def score(figure, count):
+        return Score(judged, np.full(10, float(count)), 1.0, figure)
+
+    found = [KnotCandidate(k + 1, score=score(*of)) for k, of in enumerate(zip(figures, outside, strict=True))]
+    assert chosen_of(found).count == taken
+
+
+def test_a_recording_unlike_all_others_excuses_nothing():
+    """That no number of knots covers one left-out part does not hide what more of them leave outside of the others."""
+    judged, one = np.full(10, 2000.0), np.array([900.0, 1, 0, 1, 0, 2, 1, 0, 1, 1])
+    base, more = Score(judged, one, 1.0, 1.0), Score(judged, np.array([600.0, *(one[1:] + 25)]), 1.0, 0.5)
+    assert more.share < base.share and not more.holds(base)
 
 
 def test_many_recordings_are_left_out_ten_times():
     short = [run(seed, 100) for seed in range(23)]
     chosen, table = choose_knots(short, "x1", **options())
-    assert table["units"] == len(chosen.judged) == 10 and chosen.judged.sum() == 2300
+    assert table["units"] == 10 and table["left_out"] == "10th part of the recordings"
+    assert chosen.score.judged.sum() == 2300
 
 
 def test_groups_are_left_out_together():

@@ -480,7 +480,7 @@ class UncertainLTI(Envelope):
             What the model keeps does not prove the optimum of all recordings: names those to give again. Or the model
             is not plain, keeps nothing, or has other signals.
         """
-        above = import_module("uncertain_lti.validation.monitor_update")  # a model alone needs no solver
+        above = import_module("uncertain_lti.validation.monitor_fit")  # a model alone needs no solver
         updated: UncertainLTI = above.updated(self, transients, progress)
         return updated
 

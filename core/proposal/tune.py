@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +31,7 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.proposal.public_fit import fit
-from uncertain_lti.proposal.search import PAYS, Fold
+from uncertain_lti.proposal.search import PAYS, Score, score_of
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.functions import Memory
@@ -46,8 +47,6 @@ TRANSITIONS = 4000
 """Transitions by which promising signals are found, about; of larger recordings pieces are taken, ..."""
 PIECE = 200
 """... of so many transitions."""
-ALLOWED = 0.02
-"""Share of left-out data that may be outside beyond what is without memories."""
 FOLDS = 5
 """Times that something is left out to choose memories, at most."""
 FEWEST_STEPS, MOST_STEPS = 3, 0.05
@@ -175,49 +174,33 @@ def memory_candidates(transients: Sequence[Transient], additive: Additive = "noi
 
 
 def choose_memories(transients: Sequence[Transient], additive: Additive) -> tuple[tuple[Remembered, ...], float]:
-    """Which lags, rates or differences narrow the envelope of left-out data, and the mean width over that without.
+    """Which lags, rates or differences are worth having on left-out data, and the mean width over that without them.
 
     Of the sets of `memory_candidates` those for the states are tried on about TRANSITIONS transitions, leaving out in
-    turn, then, beside the best of them, those for the controls.
+    turn, then, beside the best of them, those for the controls; one is taken if the jumps seen are smaller by PAYS.
     """
     sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), additive)
     if not sets:
         return (), 1.0
-    base = thinned(transients, TRANSITIONS)
+
+    def scored(memories: tuple[Remembered, ...]) -> Score:
+        runs = thinned(remember(transients, memories), TRANSITIONS)
+        model = fitting.fit(runs, schedule={}, describe_data=False, additive=additive)
+        return score_of(runs, model, None, FOLDS, {"additive": additive})[0]
+
+    chosen: tuple[Remembered, ...] = ()
     try:
-        model = fitting.fit(base, schedule={}, describe_data=False, additive=additive)
-        fold = Fold.of(base, None, model, FOLDS)
-        before = best = _judged(base, model, fold, additive)
+        before = best = scored(())
     except FitError:
         return (), 1.0
-    chosen: tuple[Remembered, ...] = ()
     for names in (transients[0].state_names, transients[0].control_names):
-        beside, widths = chosen, best
+        beside = chosen
         for some in (s for s in sets if s[0].of in names):
-            more = thinned(remember(transients, (*beside, *some)), TRANSITIONS)
-            try:
-                model = fitting.fit(more, schedule={}, describe_data=False, additive=additive)
-                after = _judged(more, model, fold, additive)
-            except FitError:
-                continue
-            ratio = math.exp(float(np.mean(np.log(after[0] / widths[0]))))
-            pays = ratio <= PAYS and after[1] >= before[1] - ALLOWED
-            if pays and np.mean(np.log(after[0] / best[0])) < 0:
-                best, chosen = after, (*beside, *some)
-    return chosen, math.exp(float(np.mean(np.log(best[0] / before[0]))))
-
-
-def _judged(
-    transients: Sequence[Transient], model: UncertainLTI, fold: Fold, additive: Additive
-) -> tuple[Array, float]:
-    """Mean width of each state on left-out data, in recorded units, and the share inside."""
-    left = fold.leave_out(transients, model, {"additive": additive})
-    judged = np.array([part.judged for part in left.parts], dtype=np.float64)
-    if not judged.sum():
-        raise FitError("nothing that was left out can be judged")
-    width = sum(part.judged * part.mean_width for part in left.parts if part.judged) / judged.sum()
-    outside = sum(part.violated for part in left.parts) / judged.sum()
-    return np.maximum(width, 1e-300), float(1.0 - outside)
+            with suppress(FitError):
+                after = scored((*beside, *some))
+                if after.holds(before) and after.figure < PAYS * best.figure:
+                    best, chosen = after, (*beside, *some)
+    return chosen, best.width / before.width
 
 
 def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:

@@ -148,14 +148,19 @@ def schedule_blocks(choice: Mapping[str, Any]) -> list[Block]:
             _chosen(c["knots"], c["knots"] == choice["chosen"]),
             share(c["outside"], 2),
             share(c["excess"]),
-            f"x {c['width']:.3g} ± {c['width_error']:.2g}" if c["knots"] > 1 else "x 1",
+            f"x {c['width']:.3g}",
+            f"x {c['jumps']:.3g}",
             ", ".join(f"{k:.4g}" for k in c["at"]) or "-",
         ]
         for c in tried
     ]
     refused = [f"  {plural(c['knots'], 'knot')}: {c['refused']}" for c in choice["candidates"] if "refused" in c]
     title = f"knots on {choice['signal']}, {_left_out(choice)}:"
-    return [title, *([Table(("knots", "outside", "excess", "mean width", "at"), rows)] if rows else []), *refused]
+    return [
+        title,
+        *([Table(("knots", "outside", "excess", "mean width", "jumps seen", "at"), rows)] if rows else []),
+        *refused,
+    ]
 
 
 def horizon_blocks(choice: Mapping[str, Any]) -> list[Block]:

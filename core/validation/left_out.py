@@ -86,8 +86,8 @@ def leave_out(
 ) -> Validation:
     """Leave out one recording or group at a time, fit to the others, and judge what was left out.
 
-    `folds`: how often at most; several are then left out at a time; `full`: the fit to all, whose schedule, horizons
-    and operating point every fit is given.
+    `folds`: how often at most; several are then left out at a time, and a single recording has so many blocks; `full`:
+    the fit to all, whose schedule, horizons and operating point every fit is given.
     """
     transients = listed_transients(transients)
     if not 0.5 <= confidence < 1.0:
@@ -115,7 +115,7 @@ def leave_out(
     transients = [controls_as(t.scheduled_on(further), full.signals.controls) for t in transients]
     names, grouping = resolve_groups(transients, groups)
     if blocks is None and len(transients) == 1:
-        blocks = BLOCKS
+        blocks = folds or BLOCKS
     if blocks is None and gap is not None:
         raise FitError("gap is given and whole recordings are left out; it goes with blocks")
     cuts = [(t, *span) for t in transients for span in (block_spans(t, blocks) if blocks else [(0, len(t))])]

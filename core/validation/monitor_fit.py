@@ -7,25 +7,26 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""A fit with the monitor that goes with it: fitted, left out, and armed with a panel, once for each way to fit."""
+"""A fit, or an update, with the monitor that goes with it: fitted, left out, and armed with a panel."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import FitError, ModelError
-from uncertain_lti.identification import fit
+from uncertain_lti.identification import fit, update
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.panel import Panel, figure, learn
-from uncertain_lti.validation.part import Part, fitted_parts
+from uncertain_lti.validation.panel import Evidence, Panel, extended, figure, learn
+from uncertain_lti.validation.part import Part, Reach, fitted_parts, judge
 from uncertain_lti.validation.result import Validation
 
 CLEARLY = 0.9
@@ -99,15 +100,7 @@ def fit_monitored(
         seen = _seen(model, transients, _SHOWN)
         return Monitored(*_armed(seen, seen.parts, false_alarms), None, why, centred)
     try:
-        validation = leave_out(
-            transients,
-            full=model,
-            groups=groups,
-            blocks=None if units > 1 else FOLDS,
-            folds=FOLDS,
-            progress=progress,
-            **left,
-        )
+        validation = leave_out(transients, full=model, groups=groups, folds=FOLDS, progress=progress, **left)
         fitted = fitted_parts(model, transients)
         return Monitored(*_armed(validation, fitted, false_alarms), validation, "", centred)
     except (FitError, ModelError) as error:  # too little is left to fit to: the fit itself is valid
@@ -180,3 +173,43 @@ def _medians(transients: Sequence[Transient]) -> OperatingPoint:
         np.nan_to_num(np.nanmedian(np.concatenate([getattr(t, name) for t in transients]), axis=0)) for name in "xus"
     )
     return replace(point_of(transients[0]), x_s=x, u_s=u, s_s=s)
+
+
+NOTE = (
+    "brought up to date: of each recording counts how far it was from the fit that was made without it at the time; a "
+    "fit of all recordings leaves each out of all the others, which moves thresholds a little"
+)
+KEPT = "the alarm is that of before the update, as it is not the panel that the first fit learnt; fit all recordings"
+
+
+def updated(
+    model: UncertainLTI, transients: Iterable[Transient] | Transient, progress: Callable[[str], None] | None = None
+) -> UncertainLTI:
+    """`UncertainLTI.update`."""
+    found, runs = update.updated(model, transients, progress)
+    alarm, kept = model.fit_summary.get("alarm", {}), (model.memory or {}).get("evidence")
+    if "limit_per_hour" not in alarm:  # given by hand, or not learnt
+        return found
+    every = (judge(model, model, run, run.name, reach=_Ranges(model)) for run in runs)
+    parts = [part for part in every if part.judged]
+    panel = None
+    if kept and parts:
+        panel = extended(Evidence.from_dict(kept), model, alarm, parts, fitted_parts(found, runs))
+    if panel is None:
+        alarm = {**alarm, "note": KEPT} if parts else alarm
+    else:
+        found = found.replace(alarm=panel.rules)
+        kept, alarm = panel.evidence.to_dict(), {**alarm, **panel.summary(found), "note": NOTE}
+    memory = found.memory and {**found.memory, "evidence": kept}
+    return found.replace(memory=memory, fit_summary={**found.fit_summary, "alarm": alarm})
+
+
+class _Ranges(Reach):
+    """Beyond what a model was fitted to is what leaves its ranges: all that it keeps of them."""
+
+    def __init__(self, model: UncertainLTI) -> None:
+        self._model = model
+
+    def level(self, steps: Transitions) -> NDArray[np.intp]:
+        """(K,): 0 where a transition begins within the ranges, 1 beyond them."""
+        return self._model.domain.beyond(self._model.normalised_columns(steps)).astype(np.intp)
