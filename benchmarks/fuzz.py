@@ -250,7 +250,7 @@ def compare_with_copy(path: Path) -> None:
         raise WrongError(f"{len(one)} messages were read, and the copy has {len(other)}, or others")
     with open(copy, "rb") as stream:
         number = sum(type(r).__name__ == "Message" for r in StreamReader(stream, validate_crcs=True).records)
-    if number != sum(part.count for part in copied.contents):
+    if number != sum(part.count for part in copied._contents):
         raise WrongError("the mcap library finds another number of messages in the copy")
 
 

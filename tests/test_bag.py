@@ -437,7 +437,8 @@ def test_schema_names_with_and_without_msg(tmp_path: Path) -> None:
     assert bag.topics["/short"].type == "x/msg/Y"
     ((_, _, decoded),) = bag.messages(["/short"])
     assert (decoded.y, decoded.z.i) == (2.5, 4)
-    assert bag.fields("x/msg/Y") == {"y": FieldType("number", "float64"), "z": FieldType("message", "x/msg/Z")}
+    fields = bag.type_fields("/short")
+    assert fields("x/msg/Y") == {"y": FieldType("number", "float64"), "z": FieldType("message", "x/msg/Z")}
 
 
 IDL = """\
@@ -475,13 +476,14 @@ def test_idl_definitions(tmp_path: Path) -> None:
     topic = Topic("/idl", "x/msg/Y", schema=IDL, schema_encoding="ros2idl")
     bag = with_good([topic], [], tmp_path)
     assert bag.topics["/idl"].readable, bag.topics["/idl"].reason
-    assert bag.fields("x/msg/Y") == {
+    fields = bag.type_fields("/idl")
+    assert fields("x/msg/Y") == {
         "y": FieldType("number", "float64"),
         "v": FieldType("number", "float64", 3),
         "w": FieldType("number", "float32", 0),
         "z": FieldType("message", "x/msg/Z"),
     }
-    kinds = {name: field.kind for name, field in bag.fields("x/msg/Z").items()}
+    kinds = {name: field.kind for name, field in fields("x/msg/Z").items()}
     assert kinds == {"i": "number", "b": "bool", "s": "string", "o": "other"}
     payload = b"\x00\x01\x00\x00" + struct.pack("<4dIff", 1, 2, 3, 4, 2, 5, 6) + struct.pack("<i?", 7, True)
     payload += b"\0\0\0" + struct.pack("<I", 2) + b"s\0" + b"\x09"
@@ -779,7 +781,7 @@ def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
     for topic, _, decoded in bag.messages(bag.topics):
         for text in found[topic].fields:
             path = FieldPath(text.replace("[0..", "["))  # the last of each range
-            path.check(topic, bag.topics[topic].type, bag.fields)
+            path.check(topic, bag.topics[topic].type, bag.type_fields(topic))
             assert path.read(decoded) == path.read(decoded)  # a number, not NaN
 
 

@@ -43,9 +43,8 @@ from uncertain_lti.base.errors import SignalError, UncertainLTIError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import Definition, define
 from uncertain_lti.sampling.reading import Stream, read_stream
-from uncertain_lti.signals import functions
-from uncertain_lti.signals.field_path import FieldPath, numeric_paths
-from uncertain_lti.signals.functions import FUNCTIONS, FieldFunction
+from uncertain_lti.signals import field_path
+from uncertain_lti.signals.field_path import FUNCTIONS, FieldFunction, FieldPath, numeric_paths
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 SECOND = 10**9

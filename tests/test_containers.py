@@ -43,7 +43,9 @@ def to_database(source, folder):
         connections = {}
         for raw in Bag(source).raw_messages():
             if raw.topic not in connections:
-                connections[raw.topic] = writer.add_connection(raw.topic, raw.type, typestore=JAZZY)
+                connections[raw.topic] = writer.add_connection(
+                    raw.topic, raw.channel.definition.type_name, typestore=JAZZY
+                )
             writer.write(connections[raw.topic], raw.log_time_ns, raw.data)
     return next(folder.glob("*.db3"))
 
@@ -57,9 +59,12 @@ def to_ros1(source, path, compression=None, chunk=1 << 18):
         connections = {}
         for raw in Bag(source).raw_messages():
             if raw.topic not in connections:
-                connections[raw.topic] = writer.add_connection(raw.topic, raw.type, typestore=NOETIC)
-            whole = bytes(JAZZY.serialize_cdr(raw.channel.definition.decode(raw.data), raw.type))
-            writer.write(connections[raw.topic], raw.log_time_ns, JAZZY.cdr_to_ros1(whole, raw.type))
+                connections[raw.topic] = writer.add_connection(
+                    raw.topic, raw.channel.definition.type_name, typestore=NOETIC
+                )
+            definition = raw.channel.definition
+            whole = bytes(JAZZY.serialize_cdr(definition.decode(raw.data), definition.type_name))
+            writer.write(connections[raw.topic], raw.log_time_ns, JAZZY.cdr_to_ros1(whole, definition.type_name))
     return path
 
 

@@ -74,7 +74,8 @@ def validated(parts_inside, parts, inside):
     facts = {"kind": "transients", "parts": parts, "verdicts": 1000, "parts_inside": parts_inside, "hours": 1.0}
     facts |= {"inside": inside, "inside_interval": [0.9, 1.0], "parts_inside_interval": [0.0, 1.0], "confidence": 0.95}
     states = {name: {**state, "unit": ""} for name in ("x1", "x2")}
-    return {**facts, "states": states, "scenario": {"words": "w"}, "false_alarms": [], "notes": []}
+    facts |= {"condition": "c", "condition_short": "c", "groups": None, "part": [], "false_alarms": [], "notes": []}
+    return {**facts, "states": states, "scenario": {"words": "w"}}
 
 
 def test_bounds_half_as_wide_as_what_a_state_does_are_not_relied_on():

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""A format of recordings is one entry in a table: what implements `Recording` is read, fitted, checked and proposed."""
+"""A format of recordings is one entry in a table: a subclass of `Recording` is read, fitted, checked and proposed."""
 
 import csv
 import math
@@ -25,38 +25,26 @@ from uncertain_lti.identification import fit
 from uncertain_lti.recordings import formats
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import Format, group_recordings, open_recording
-from uncertain_lti.recordings.recording import Columns, TopicFacts, TopicInfo
+from uncertain_lti.recordings.recording import Columns, Recording, TopicFacts, TopicInfo
 from uncertain_lti.signals.field_path import FieldType
 
 ROOT = Path(__file__).resolve().parents[1]
 TOPIC, SECOND = "/table", 10**9
 
 
-class Table:
+class Table(Recording):
     """A log, comma-separated, whose first column is the time in s."""
 
-    indexed = False
-
-    def __init__(self, path, parts=(), indexed=False):
+    def __init__(self, path):
         self.path, self.parts = path, (path,)
         self.size = path.stat().st_size
-        self.warnings = []
+        self._warnings = []
         with open(path, newline="") as stream:
             (_, *self.names), *rows = csv.reader(stream)
         self.rows = [[float(value) for value in row] for row in rows]
         self.times = [round(row[0] * SECOND) for row in self.rows]
         info = TopicInfo(TOPIC, "table", len(rows), "csv", True, "", self.times[0], self.times[-1])
         self.topics = {TOPIC: info}
-
-    @property
-    def reading_notes(self):
-        return list(self.warnings), {}
-
-    def restore_notes(self, warnings, undecoded):
-        self.warnings = list(warnings)
-
-    def walk(self):
-        pass
 
     def type_fields(self, topic):
         if topic != TOPIC:
@@ -79,7 +67,7 @@ class Table:
 
 @pytest.fixture
 def tables(monkeypatch):
-    known = Format("log", lambda path: path.suffix == ".log", Table, lambda paths, indexed: [Table(p) for p in paths])
+    known = Format("log", lambda path: path.suffix == ".log", lambda paths, *_: [Table(p) for p in paths])
     monkeypatch.setattr(formats, "FORMATS", [known, *formats.FORMATS])
 
 

@@ -21,8 +21,7 @@ from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.proposal.tune import Remembered, memory_candidates, remember
 from uncertain_lti.sampling.recall import memory_of, recall, recalled, with_delays, with_memories
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.functions import Memory, parse_memory
+from uncertain_lti.signals.field_path import FieldPath, Memory, parse_memory
 from uncertain_lti.signals.signal_map import Signal
 
 

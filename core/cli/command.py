@@ -89,7 +89,8 @@ def run(options: argparse.Namespace) -> int:
     result: Result = options.run(options)
     if getattr(options, "json", False):
         if result.data is not None:
-            print_json(result.data)
+            json.dump(result.data, sys.stdout, allow_nan=False, indent=1)
+            sys.stdout.write("\n")
     elif result.text:
         print(result.text)
     return int(result.status)
@@ -121,12 +122,6 @@ def complain(command: str, text: str) -> None:
         print(f"uncertain-lti {command}: {printable(text)}".replace(" :", ":"), file=sys.stderr, flush=True)
     except (OSError, AttributeError):
         drop_output(sys.stderr)
-
-
-def print_json(data: Any) -> None:
-    """Print data for a program."""
-    json.dump(data, sys.stdout, allow_nan=False, indent=1)
-    sys.stdout.write("\n")
 
 
 def load_model(name: str) -> UncertainLTI:

@@ -41,7 +41,7 @@ from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.steady_state import codes, too_small
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal
 
 LOOKED_AT, STRETCHES = 20_000, 20

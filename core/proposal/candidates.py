@@ -25,7 +25,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.recording import usual_step
 from uncertain_lti.recordings.table import TYPE
-from uncertain_lti.signals.functions import FUNCTIONS, QUATERNION
+from uncertain_lti.signals.field_path import FUNCTIONS, QUATERNION
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""

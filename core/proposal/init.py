@@ -55,8 +55,7 @@ from uncertain_lti.recordings.recording import Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
 from uncertain_lti.sampling.steady_state import codes
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.field_path import FieldPath, Memory
 from uncertain_lti.signals.values import TableLayout
 
 Iterate = Callable[[Iterable[object], int], Iterable[object]]

@@ -25,7 +25,7 @@ from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, 
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TOPIC
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.signals.functions import FUNCTIONS
+from uncertain_lti.signals.field_path import FUNCTIONS
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.signals.values import CHOICES_TEXT
 

@@ -34,7 +34,7 @@ from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import PAYS, Score, score_of
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.values import Additive
 from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth

@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import natural
-from uncertain_lti.base.text import printable, shortlist
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.bag_arrays import ColumnReader, IndexMismatchError, in_reach
 from uncertain_lti.recordings.bag_files import (
     listed_parts,
@@ -32,9 +32,9 @@ from uncertain_lti.recordings.bag_files import (
 )
 from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages
 from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, undefined
-from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo, topic_facts
+from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo, topic_facts
 from uncertain_lti.recordings.unreadable import os_error
-from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, full_name
+from uncertain_lti.signals.field_path import FieldPath, TypeFields, full_name
 
 __all__ = ["Bag", "group_bags"]
 
@@ -47,7 +47,7 @@ _NEVER = 2**64
 _LEAST_LINES = 50  # that a definition counts for, however short it is
 
 
-class Bag:
+class Bag(Recording):
     """One recording: an MCAP file, a folder, or the parts of a split bag.
 
     A folder's metadata.yaml says which files in which order; without one its files must be the parts `<stem>_<i>.mcap`
@@ -78,6 +78,9 @@ class Bag:
 
     def _take(self, contents: list[Contents]) -> None:
         self._contents = contents
+        self.parts = tuple(part.path for part in contents)
+        self.size = sum(part.size for part in contents)
+        self.indexed = any(part.indexed for part in contents)
         self._folder_warnings = list(self._warnings)
         damage = [warning for part in self._contents for warning in part.warnings]
         self._warnings += damage
@@ -86,7 +89,7 @@ class Bag:
             raise BagError(f"{self.path}: no message can be read ({why}); record or copy it again")
         self._channels = [_channels(part) for part in self._contents]
         self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
-        self.topics: Mapping[str, TopicInfo] = self._topics()
+        self.topics = self._topics()
 
     def walk(self) -> None:
         """Walk every file of which only the index was read."""
@@ -95,17 +98,17 @@ class Bag:
             self._undecoded = {}
             self._take([survey(part.path) if part.indexed else part for part in self._contents])
 
-    def described(self, topics: Iterable[str]) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
-        """Each file, and its channels that count for some topics."""
-        wanted = self._required(topics)
+    def described(
+        self, topics: Iterable[str], readable: bool = True
+    ) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
+        """Each file, and its channels of some topics: those that count and can be decoded, or all."""
+        wanted = set(topics)
+        for topic in sorted(wanted):
+            self._require(topic, readable)
         return [
-            (contents, _of(channels, wanted, counted=True))
+            (contents, {k: c for k, c in channels.items() if c.topic in wanted and (c.counted or not readable)})
             for contents, channels in zip(self._contents, self._channels, strict=True)
         ]
-
-    def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Set `reading_notes`, for example to those of another process that read the same recording."""
-        self._warnings, self._undecoded = list(warnings), dict(undecoded)
 
     def leave_out(self, undecoded: Mapping[str, tuple[int, str]]) -> None:
         """Warn of messages that cannot be decoded: topic -> how many, and why one of them cannot."""
@@ -113,58 +116,20 @@ class Bag:
             of_them = f"{count(number, 'message')} left out that cannot be decoded ({why})"
             self._undecoded[topic] = f"{self.path}: {topic}: {of_them}"
 
-    @property
-    def reading_notes(self) -> tuple[list[str], dict[str, str]]:
-        """Warnings so far, and sentences on messages left out by topic; what `restore_notes` takes."""
-        return list(self._warnings), dict(self._undecoded)
-
-    @property
-    def size(self) -> int:
-        """Bytes of its files."""
-        return sum(part.size for part in self._contents)
-
-    @property
-    def indexed(self) -> bool:
-        """Whether of any file only the index was read."""
-        return any(part.indexed for part in self._contents)
-
     def __reduce__(self) -> tuple[type[Bag], tuple[Path, tuple[Contents, ...]]]:
         """For another process, which need not open the files again."""
-        return Bag, (self.path, self.contents)
-
-    @property
-    def contents(self) -> tuple[Contents, ...]:
-        """What is known of each file; `parts` of another bag may be these."""
-        return tuple(self._contents)
-
-    @property
-    def parts(self) -> tuple[Path, ...]:
-        """Files of the recording in order."""
-        return tuple(part.path for part in self._contents)
-
-    @property
-    def warnings(self) -> list[str]:
-        """What is missing or left out, each one sentence that begins with the file; grows while messages are read."""
-        return [printable(warning) for warning in (*self._warnings, *sorted(self._undecoded.values()))]
-
-    def fields(self, type_name: str) -> Mapping[str, FieldType]:
-        """Fields of a type that a readable topic has or uses."""
-        for channel in self._every_channel():
-            if channel.counted and type_name in channel.definition.types:
-                return channel.definition.fields(type_name)
-        raise SignalError(f"{type_name}: not defined in {self.path}; check the type")
+        return Bag, (self.path, tuple(self._contents))
 
     def type_fields(self, topic: str) -> TypeFields:
-        """`fields` as one topic's own schema defines them."""
+        """Fields of message types as the topic's own definition has them."""
         self._require(topic)
-        channels = (channel for channel in self._every_channel() if channel.topic == topic and channel.counted)
-        return next(channels).definition.fields
+        every = itertools.chain.from_iterable(channels.values() for channels in self._channels)
+        return next(c for c in every if c.topic == topic and c.counted).definition.fields
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Decoded messages in order of log time, ties in file order, over all parts."""
         self.walk()
-        wanted = self._required(topics)
-        return self._decoded([_of(channels, wanted, counted=True) for channels in self._channels])
+        return self._decoded(self.described(topics))
 
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
@@ -196,10 +161,7 @@ class Bag:
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order."""
         self.walk()
-        wanted = set(self.topics if topics is None else topics)
-        for topic in sorted(wanted):
-            self._require(topic, readable=False)
-        return self._sorted([_of(channels, wanted) for channels in self._channels])
+        return self._sorted(self.described(self.topics if topics is None else topics, readable=False))
 
     def _open(self, indexed: bool) -> list[Contents]:
         try:
@@ -230,7 +192,7 @@ class Bag:
         groups: dict[str, dict[tuple[str, str, str], list[tuple[int, int]]]] = {}
         for part, channels in enumerate(self._channels):
             for key, channel in channels.items():
-                kind = (channel.type, channel.encoding, channel.definition.reason)
+                kind = (channel.definition.type_name, channel.encoding, channel.definition.reason)
                 groups.setdefault(channel.topic, {}).setdefault(kind, []).append((part, key))
         return {topic: self._topic(topic, kinds) for topic, kinds in sorted(groups.items())}
 
@@ -267,15 +229,6 @@ class Bag:
             readable, reason = False, f"a message has a log time of {last} ns, which is past the year 2262"
         return TopicInfo(topic, type_name, counts[chosen], encoding, readable, reason, first, last)
 
-    def _every_channel(self) -> Iterator[RecordedChannel]:
-        return itertools.chain.from_iterable(channels.values() for channels in self._channels)
-
-    def _required(self, topics: Iterable[str]) -> set[str]:
-        wanted = set(topics)
-        for topic in sorted(wanted):
-            self._require(topic)
-        return wanted
-
     def _require(self, topic: str, readable: bool = True) -> None:
         info = self.topics.get(topic)
         if info is None:
@@ -286,9 +239,9 @@ class Bag:
         if readable and not info.readable:
             raise BagError(f"{self.path}: topic {topic} cannot be decoded: {info.reason}; choose another topic")
 
-    def _decoded(self, channels: list[dict[int, RecordedChannel]]) -> Iterator[tuple[str, int, Any]]:
+    def _decoded(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[tuple[str, int, Any]]:
         undecoded: dict[str, tuple[int, str]] = {}
-        for raw in self._sorted(channels):
+        for raw in self._sorted(parts):
             channel = raw.channel
             try:
                 message = channel.definition.decode(raw.data)
@@ -299,26 +252,26 @@ class Bag:
                 continue
             yield channel.topic, raw.log_time_ns, message
 
-    def _sorted(self, channels: list[dict[int, RecordedChannel]]) -> Iterator[RawMessage]:
-        """Messages of these channels (by part and channel id) in order of log time, ties in file order.
+    def _sorted(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[RawMessage]:
+        """Messages of these channels of each file in order of log time, ties in file order.
 
         Blocks are read in order of their smallest log time; what is earlier than every block still to be read
         is final.
         """
         blocks: list[tuple[int, int, int, Block]] = []
-        for part, wanted in enumerate(channels):
-            for number, block in enumerate(self._contents[part].blocks):
+        for part, (contents, wanted) in enumerate(parts):
+            for number, block in enumerate(contents.blocks):
                 if not block.channels.isdisjoint(wanted):
                     blocks.append((block.start, part, number, block))
         blocks.sort(key=lambda entry: entry[:3])
         pending: list[tuple[int, int, int, int, RawMessage]] = []  # a heap; no two have the same place
         held = 0
         for position, (_, part, number, block) in enumerate(blocks):
-            wanted = channels[part]
-            records = self._contents[part].records(block, wanted)
-            for key, log_time, publish_time, begin, end in messages(records):
+            contents, wanted = parts[part]
+            records = contents.records(block, wanted)
+            for key, log_time, begin, end in messages(records):
                 if channel := wanted.get(key):
-                    raw = RawMessage(log_time, publish_time, records[begin:end], channel)
+                    raw = RawMessage(log_time, records[begin:end], channel)
                     heapq.heappush(pending, (log_time, part, number, begin, raw))
                     held += end - begin + _SIZE_OF_AN_ENTRY
             following = blocks[position + 1][0] if position + 1 < len(blocks) else _NEVER
@@ -331,14 +284,6 @@ class Bag:
                     f"{self.path}: its messages are so far out of order that more than {_MOST_HELD >> 20} MiB of them "
                     f"have to wait; put them in order with `mcap sort`"
                 )
-
-
-def _of(channels: Mapping[int, RecordedChannel], topics: set[str], counted: bool = False) -> dict[int, RecordedChannel]:
-    return {
-        key: channel
-        for key, channel in channels.items()
-        if channel.topic in topics and (channel.counted or not counted)
-    }
 
 
 def _channels(contents: Contents) -> dict[int, RecordedChannel]:
@@ -362,9 +307,7 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
                 definition = undefined(type_name, "the definitions of the file are too long together")
             else:
                 definition = define(schema.name, schema.encoding, schema.data)
-        channels[key] = RecordedChannel(
-            channel.topic, type_name, channel.message_encoding, schema, channel.metadata, definition
-        )
+        channels[key] = RecordedChannel(channel.topic, channel.message_encoding, channel.metadata, definition)
     return channels
 
 

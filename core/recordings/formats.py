@@ -29,30 +29,23 @@ from uncertain_lti.signals.values import TableLayout
 class Format:
     """One kind of recording.
 
-    `name`: what it is called; `recognises`: takes a path, and returns whether this format reads it; `open`: takes the
-    path of one recording, its files in order where they are known (else none), and whether an index may be believed
-    until messages are read; returns the `Recording`; `group`: takes paths that a user named together, and the same
-    flag; returns the recordings they are, in order; `laid_out`: takes a path, and what a signals file says of the
-    columns of tables; returns the recordings in the file. None for a format in which a file says that itself.
+    `name`: what it is called; `recognises`: takes a path, and returns whether this format reads it; `group`: takes
+    paths that a user named together, whether an index may be believed until messages are read, and what a signals file
+    says of the columns of tables; returns the recordings they are, in order.
     """
 
     name: str
     recognises: Callable[[Path], bool]
-    open: Callable[[Path, Sequence[Path], bool], Recording]
-    group: Callable[[Sequence[Path], bool], Sequence[Recording]]
-    laid_out: Callable[[Path, TableLayout], Sequence[Recording]] | None = None
+    group: Callable[[Sequence[Path], bool, TableLayout | None], Sequence[Recording]]
 
 
 FORMATS: list[Format] = [
-    Format("table", is_table, Table, lambda paths, indexed: [Table(path) for path in paths], Table.every_run),
-    Format("ROS recording", lambda path: True, Bag, group_bags),
+    Format(
+        "table", is_table, lambda paths, _, layout: [run for path in paths for run in Table.every_run(path, layout)]
+    ),
+    Format("ROS recording", lambda path: True, lambda paths, indexed, _: group_bags(paths, indexed)),
 ]
 """Every format; the first that recognises a path reads it. Bags are last: their errors say what another file is."""
-
-
-def format_of(path: Path) -> Format:
-    """Find the format that reads a file or folder."""
-    return next(format for format in FORMATS if format.recognises(path))
 
 
 def open_recording(
@@ -61,15 +54,14 @@ def open_recording(
     indexed: bool = False,
     layout: TableLayout | None = None,
 ) -> Recording:
-    """Open one recording."""
-    format = format_of(Path(path))
-    if layout is not None and format.laid_out is not None:
-        recordings = format.laid_out(Path(path), layout)
-        if len(recordings) != 1:
-            names = shortlist([recording.path.name for recording in recordings], 6)
-            raise BagError(f"{path}: holds {len(recordings)} recordings; name one of them, {names}")
-        return recordings[0]
-    return format.open(Path(path), [Path(part) for part in parts], indexed)
+    """Open one recording; `parts`: its files in order, if they are known to be those of a split bag."""
+    if len(parts) > 1:
+        return Bag(path, parts, indexed)
+    recordings = group_recordings([path], indexed, layout)
+    if len(recordings) != 1:
+        names = shortlist([recording.path.name for recording in recordings], 6)
+        raise BagError(f"{path}: holds {len(recordings)} recordings; name one of them, {names}")
+    return recordings[0]
 
 
 def group_recordings(
@@ -81,11 +73,10 @@ def group_recordings(
     with a column that tells the runs in it apart.
     """
     recordings: list[Recording] = []
-    for format, run in itertools.groupby(map(Path, paths), format_of):
-        if layout is not None and format.laid_out is not None:
-            recordings += itertools.chain.from_iterable(format.laid_out(path, layout) for path in run)
-        else:
-            recordings += format.group(list(run), indexed)
+    for format, some in itertools.groupby(
+        map(Path, paths), lambda path: next(f for f in FORMATS if f.recognises(path))
+    ):
+        recordings += format.group(list(some), indexed, layout)
     seen: set[Path] = set()
     named = (r.parts if r.path.exists() else (r.path,) for r in recordings)  # a run of a table is no file
     for part in itertools.chain.from_iterable(named):

@@ -62,8 +62,7 @@ class Block(NamedTuple):
     `offset`: first byte; `size`: bytes in the file; `compression`: empty where the bytes are records as they are;
     `length`: bytes of the records; `start`: smallest log time, ns; `end`: largest log time, ns; `channels`: those that
     have a message here; `unchecked`: of a chunk that was found in an index (`mcap_scan.outline`), bytes in front of
-    its records, which are still to be compared with the block, and the records with their checksum; 0 otherwise; `cut`:
-    the file ends within it.
+    its records, which are still to be compared with the block, and the records with their checksum; 0 otherwise.
     """
 
     offset: int
@@ -74,7 +73,6 @@ class Block(NamedTuple):
     end: int
     channels: frozenset[int]
     unchecked: int = 0
-    cut: bool = False
 
 
 @dataclass(slots=True)
@@ -120,27 +118,18 @@ class Contents:
         return sum(entry.count for entry in self.tally.values())
 
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
-        """Records of one block, not compressed."""
-        return read_block(self.path, block)
-
-
-def stored_bytes(path: Path, block: Block) -> bytes:
-    """Bytes of a block as they are in the file."""
-    try:
-        with open(path, "rb", buffering=0) as stream:
-            stream.seek(block.offset)
-            return stream.read(block.size)
-    except OSError as error:
-        raise os_error(path, error) from None
-
-
-def read_block(path: Path, block: Block) -> bytes:
-    """Records of a block that `scan` found."""
-    assert not block.unchecked
-    records, _ = inflate(block.compression, memoryview(stored_bytes(path, block)), block.length)
-    if len(records) < block.length:
-        raise BagError(f"{path}: the file changed while it was read; read it again when it is written")
-    return bytes(records[: block.length])
+        """Records of one block that `scan` found, not compressed."""
+        assert not block.unchecked
+        try:
+            with open(self.path, "rb", buffering=0) as stream:
+                stream.seek(block.offset)
+                stored = stream.read(block.size)
+        except OSError as error:
+            raise os_error(self.path, error) from None
+        records, _ = inflate(block.compression, memoryview(stored), block.length)
+        if len(records) < block.length:
+            raise BagError(f"{self.path}: the file changed while it was read; read it again when it is written")
+        return bytes(records[: block.length])
 
 
 def message_record(channel: int, sequence: int, log_time: int, publish_time: int, data: bytes | memoryview) -> bytes:
@@ -149,11 +138,10 @@ def message_record(channel: int, sequence: int, log_time: int, publish_time: int
     return b"".join((head, data))
 
 
-def messages(records: bytes) -> Iterator[tuple[int, int, int, int, int]]:
-    """Messages among some records; the data of each is `records[begin:end]`."""
+def messages(records: bytes) -> Iterator[tuple[int, int, int, int]]:
+    """Channel and log time of messages among some records; the data of each is `records[begin:end]`."""
     found = walk_records(records, 0, len(records), len(records))
-    for channel, log_time, begin, end in zip(*(column.tolist() for column in found[:4]), strict=True):
-        yield channel, log_time, int.from_bytes(records[begin - 8 : begin], "little"), begin, end
+    return zip(*(column.tolist() for column in found[:4]), strict=True)
 
 
 def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:

@@ -279,7 +279,7 @@ class _Scanner:
         self._take(records, found)
         self.odd_records += found.stop < len(records) and not cut
         if len(found.channel):
-            self._block(begin + data_begin, len(data), compression, found.stop, _tally(found), cut)
+            self._block(begin + data_begin, len(data), compression, found.stop, _tally(found))
 
     def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
         if not cut:  # what little a cut leaves of a chunk's beginning is reported with the cut
@@ -288,23 +288,15 @@ class _Scanner:
                 path = self.found.path
                 self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
 
-    def _block(
-        self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally], cut: bool = False
-    ) -> None:
-        self.found.blocks.append(
-            Block(
-                offset,
-                size,
-                compression,
-                length,
-                start=min(entry.first for entry in tally.values()),
-                end=max(entry.last for entry in tally.values()),
-                channels=frozenset(tally),
-                cut=cut,
-            )
-        )
-        for channel, entry in tally.items():
-            _add(self.found.tally, channel, entry)
+    def _block(self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally]) -> None:
+        start, end = min(entry.first for entry in tally.values()), max(entry.last for entry in tally.values())
+        self.found.blocks.append(Block(offset, size, compression, length, start, end, frozenset(tally)))
+        for channel, more in tally.items():
+            if total := self.found.tally.get(channel):
+                total.count += more.count
+                total.first, total.last = min(total.first, more.first), max(total.last, more.last)
+            else:
+                self.found.tally[channel] = more
 
     def _definition(self, opcode: int, content: bytes | memoryview) -> None:
         record = None
@@ -348,14 +340,6 @@ class _Scanner:
             return b""
         self.stream.seek(offset)
         return self.stream.read(min(size, self.found.size - offset))
-
-
-def _add(tally: dict[int, Tally], channel: int, more: Tally) -> None:
-    if total := tally.get(channel):
-        total.count += more.count
-        total.first, total.last = min(total.first, more.first), max(total.last, more.last)
-    else:
-        tally[channel] = more
 
 
 def _tally(found: Records) -> dict[int, Tally]:

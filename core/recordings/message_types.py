@@ -23,7 +23,6 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import zstandard
-from mcap.records import Schema
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.base import normalize_fieldname
@@ -362,32 +361,24 @@ def _one_line(error: Exception) -> str:
 
 @dataclass(frozen=True, eq=False)
 class RecordedChannel:
-    """A channel as the file describes it: everything needed to write its messages again.
+    """A channel as the file describes it.
 
-    `topic`: name of its topic; `type`: message type, `pkg/msg/Type`; `encoding`: of its messages; `schema`: its record
-    in the file; None without one; `metadata`: what the recorder stored of the channel, QoS for example; `definition`:
-    how its messages are decoded; `counted`: whether its messages are those of its topic (see `Bag` on topics with
-    several types).
+    `topic`: name of its topic; `encoding`: of its messages; `metadata`: what the recorder stored of it, such as QoS;
+    `definition`: how its messages are decoded; `counted`: whether its messages are those of its topic (see
+    `Bag` on topics with several types).
     """
 
     topic: str
-    type: str
     encoding: str
-    schema: Schema | None
     metadata: Mapping[str, str]
     definition: Definition
     counted: bool = False
 
 
 class RawMessage(NamedTuple):
-    """One message as recorded.
-
-    `log_time_ns`: log time, ns; `publish_time_ns`: publish time, ns; `data`: serialised message; `channel`: what it was
-    recorded on.
-    """
+    """One message as recorded: its log time, ns, its bytes, and what it was recorded on."""
 
     log_time_ns: int
-    publish_time_ns: int
     data: bytes
     channel: RecordedChannel
 
@@ -395,13 +386,3 @@ class RawMessage(NamedTuple):
     def topic(self) -> str:
         """Topic it was published on."""
         return self.channel.topic
-
-    @property
-    def type(self) -> str:
-        """Message type, `pkg/msg/Type`."""
-        return self.channel.type
-
-    @property
-    def encoding(self) -> str:
-        """Encoding of `data`; `cdr` is what can be decoded."""
-        return self.channel.encoding

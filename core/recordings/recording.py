@@ -12,17 +12,20 @@
 from __future__ import annotations
 
 import itertools
+from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal, Protocol
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import FieldPath, TypeFields, signal_paths
 
@@ -87,58 +90,57 @@ Progress = Callable[[Iterable[object], int], Iterable[object]]
 """Wraps what goes through messages, given their number, and may draw how far it has come."""
 
 
-class Recording(Protocol):
-    """One recording of a machine, whatever the format of its files (`formats`).
+class Recording(ABC):
+    """One recording of a machine, whatever the format of its files (`formats`): a format is a subclass.
 
     Everything that is read of a recording goes through this. Topics, types and log times are those of ROS 2 or stand
     in their place: a format without topics gives its data one, with fields that `FieldPath` reads.
+
+    `path`: file or folder, as errors and reports call the recording; `parts`: its files, in order; `size`: bytes of
+    these; `topics`: by name; `indexed`: whether anything known of it comes from an index that reading may prove wrong.
     """
 
-    @property
-    def path(self) -> Path:
-        """File or folder, as errors and reports call the recording."""
-
-    @property
-    def parts(self) -> tuple[Path, ...]:
-        """Files of the recording, in order."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of these files."""
-
-    @property
-    def topics(self) -> Mapping[str, TopicInfo]:
-        """Topics by name."""
+    path: Path
+    parts: tuple[Path, ...]
+    size: int
+    topics: Mapping[str, TopicInfo]
+    indexed = False
+    _warnings: list[str]  # what is missing or left out
+    _undecoded: Mapping[str, str] = MappingProxyType({})  # likewise, of messages left out by topic
 
     @property
     def warnings(self) -> list[str]:
         """What is missing or left out, each one sentence that begins with the file; grows while messages are read."""
-
-    @property
-    def indexed(self) -> bool:
-        """Whether anything known of the recording comes from an index that reading may prove wrong."""
+        return [printable(warning) for warning in (*self._warnings, *sorted(self._undecoded.values()))]
 
     @property
     def reading_notes(self) -> tuple[list[str], dict[str, str]]:
         """Warnings so far, and sentences on messages left out by topic; what `restore_notes` takes."""
+        return list(self._warnings), dict(self._undecoded)
 
     def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
         """Set `reading_notes`, for example to those of another process that read the same recording."""
+        self._warnings, self._undecoded = list(warnings), dict(undecoded)
 
     def walk(self) -> None:
         """Read what an index stated from the files themselves."""
+        assert not self.indexed, "a format with an index reads them"
 
+    @abstractmethod
     def type_fields(self, topic: str) -> TypeFields:
         """Fields of message types as the topic's own definition has them."""
 
+    @abstractmethod
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Decoded messages in order of log time."""
 
+    @abstractmethod
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
         """Numbers at some paths of each topic as arrays: what `FieldPath.read` gives for each of `messages`."""
 
+    @abstractmethod
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Rates, gaps, stamps and fields of every topic, for a person who looks for signals."""
 

@@ -24,9 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.base.text import meant, plural, printable, shortlist
+from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
-from uncertain_lti.recordings.recording import Columns, Progress, TopicFacts, TopicInfo
+from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import YEARS as _YEARS
 from uncertain_lti.recordings.table_files import Column, RawTable, read_table
 from uncertain_lti.recordings.unreadable import TABLES, missing
@@ -283,22 +283,17 @@ def is_table(path: Path) -> bool:
     return _file_and_run(path)[0].suffix.lower() in TABLES and not path.is_dir()
 
 
-class Table:
+class Table(Recording):
     """One run of a table.
 
     Rows are taken in the order of the file: where the time steps back, another run may begin, and the rules of sampling
     decide. Rows without a time are left out. A column is a field of the topic `/table`, by its name with everything but
     letters, digits and underscores replaced; a matrix is an array.
 
-    `path`: file; with `[run]` behind it, one run in it; `parts`: its file, where that is known; `indexed`: as for every
-    format; a table has no index; `layout`: which columns are time and run.
+    `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run.
     """
 
-    indexed = False
-
-    def __init__(
-        self, path: Path, parts: Sequence[Path] = (), indexed: bool = False, layout: TableLayout | None = None
-    ) -> None:
+    def __init__(self, path: Path, layout: TableLayout | None = None) -> None:
         layout = layout or TableLayout()
         file, run = _file_and_run(path)
         if run is not None and layout.runs is None:
@@ -316,7 +311,7 @@ class Table:
         layout = layout or TableLayout()
         file, run = _file_and_run(path)
         if run is not None or layout.runs is None:
-            return [cls(path, layout=layout)]
+            return [cls(path, layout)]
         raw = _read(file)
         column, times, words = instants(file, raw, layout)
         tables = []
@@ -363,30 +358,11 @@ class Table:
         readable, reason = bool(self.columns_by_field), ""
         if not readable:
             reason = f"there is no column but the time, '{time}'"
-        self.topics: Mapping[str, TopicInfo] = {
-            TOPIC: TopicInfo(TOPIC, TYPE, len(kept), file.suffix[1:].lower(), readable, reason, first, last)
-        }
+        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), file.suffix[1:].lower(), readable, reason, first, last)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""
-        return Table, (self.path, (), False, self.layout)
-
-    @property
-    def warnings(self) -> list[str]:
-        """What is missing or left out, each one sentence that begins with the file."""
-        return [printable(warning) for warning in self._warnings]
-
-    @property
-    def reading_notes(self) -> tuple[list[str], dict[str, str]]:
-        """Warnings; nothing is left out later."""
-        return list(self._warnings), {}
-
-    def restore_notes(self, warnings: Sequence[str], undecoded: Mapping[str, str]) -> None:
-        """Set `reading_notes`."""
-        self._warnings = list(warnings)
-
-    def walk(self) -> None:
-        """Do nothing: there is no index."""
+        return Table, (self.path, self.layout)
 
     def type_fields(self, topic: str) -> TypeFields:
         """Columns as fields."""

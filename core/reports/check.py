@@ -99,7 +99,13 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "horizons": _horizons(model, verdicts),
         "alarm": bool(verdicts.alarm.any()),
         "alarms": [
-            {**_span(transient, start, stop), "raised": [_why(reason) for reason in verdicts.raised(start)]}
+            {
+                **_span(transient, start, stop),
+                "raised": [
+                    {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
+                    for r in verdicts.raised(start)
+                ],
+            }
             for start, stop in runs(verdicts.alarm)
         ],
         "episodes": [_episode(model, verdicts, rows) for rows in islice(_episodes(verdicts), MOST_EPISODES)],
@@ -332,11 +338,6 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     return ""
 
 
-def _why(raised: Any) -> dict[str, Any]:
-    facts = {key: getattr(raised, key) for key in ("state", "horizon", "value", "words")}
-    return {"rule": raised.label, **facts}
-
-
 def _inside(bad: int, count: int) -> float | None:
     return 1.0 - bad / count if count else None
 
@@ -455,16 +456,29 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     left = f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""
     samples = f"{plural(data['samples'], 'sample')}, {plural(data['verdicts'], 'verdict')}"
     blocks.append(f"{data['recording']}: {samples}, {inside}{left}")
-    rows = [_state_row(*item) for item in data["states"].items()]
+    rows = []
+    for name, s in data["states"].items():
+        counts = [str(s["violations"]), share(s["inside"]), number(s["mean_width"]), share(s["width_to_range"], 2)]
+        worst = beyond(s["worst"]["utilisation"]) if s["violations"] else "-"
+        when = "-" if s["first_violation"] is None else f"{s['first_violation']['t']:.4f} s"
+        rows.append([named(name, s["unit"]), *counts, when, worst])
     header: Sequence[str] = ("state", "violations", "inside", "mean width", "width/range", "first", "worst")
     blocks.append(Table(header, rows, most=200))
     if data["horizons"]:
-        rows = [_horizon_row(h) for h in data["horizons"]]
+        rows = []
+        for h in data["horizons"]:
+            gone = [(s["first"]["t"], name) for name, s in h["states"].items() if s["first"] is not None]
+            first, where = (f"{min(gone)[0]:.4f} s", min(gone)[1]) if gone else ("-", "-")
+            rows.append([str(h["steps"]), str(h["windows"]), share(h["inside"]), first, where])
         blocks.append(Table(("steps", "windows", "inside", "first outside", "state"), rows))
     visited = [r for r in data["regimes"] if r["verdicts"]]
     if visited and len(data["regimes"]) > 1:
         header = ("regime", "verdicts", "inside", "unknown", *(f"{name}: mean width" for name in data["states"]))
-        blocks.append(Table(header, [_regime_row(r) for r in visited]))
+        rows = []
+        for r in visited:
+            widths = [number(state["mean_width"]) for state in r["states"].values()]
+            rows.append([r["regime"], str(r["verdicts"]), share(r["inside"]), str(r["unknown_regime"]), *widths])
+        blocks.append(Table(header, rows))
     if data["verdicts"]:
         blocks.append(f"outside the fitted domain: {data['outside_domain_share']:.2%} of the verdicts")
         if data["unknown_regime"]:
@@ -504,28 +518,3 @@ def episodes_table(data: Mapping[str, Any]) -> Table:
 def _first(lines: list[str], word: str) -> list[str]:
     more = len(lines) - MOST_SHOWN
     return lines[:MOST_SHOWN] + [f"  and {plural(more, f'more {word}')}; --json has all"] * (more > 0)
-
-
-def _state_row(name: str, state: Mapping[str, Any]) -> list[str]:
-    first = state["first_violation"]
-    return [
-        named(name, state["unit"]),
-        str(state["violations"]),
-        share(state["inside"]),
-        number(state["mean_width"]),
-        share(state["width_to_range"], 2),
-        "-" if first is None else f"{first['t']:.4f} s",
-        beyond(state["worst"]["utilisation"]) if state["violations"] else "-",
-    ]
-
-
-def _horizon_row(horizon: Mapping[str, Any]) -> list[str]:
-    left = [(state["first"]["t"], name) for name, state in horizon["states"].items() if state["first"] is not None]
-    when, name = min(left, default=(None, "-"))
-    first = "-" if when is None else f"{when:.4f} s"
-    return [str(horizon["steps"]), str(horizon["windows"]), share(horizon["inside"]), first, name]
-
-
-def _regime_row(regime: Mapping[str, Any]) -> list[str]:
-    counts = [regime["regime"], str(regime["verdicts"]), share(regime["inside"]), str(regime["unknown_regime"])]
-    return [*counts, *(number(state["mean_width"]) for state in regime["states"].values())]

@@ -157,10 +157,8 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         count, first = recording["episode_count"], recording["episodes"][0]["first"]["t"]
         text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first:.8g} s; "
         text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}"
-    if recording["alarm"]:
-        text += (
-            f". The alarm was raised {times(len(recording['alarms']))}, first at {recording['alarms'][0]['t']:.8g} s"
-        )
+    if alarms := recording["alarms"]:
+        text += f". The alarm was raised {times(len(alarms))}, first at {alarms[0]['t']:.8g} s"
     elif bad:
         text += ". The alarm was not raised"
     if judged and state == "unknown":
@@ -177,21 +175,21 @@ def _sees(model: UncertainLTI, file: str, validation: Mapping[str, Any] | None) 
     if faults is not None and not faults.get("refused"):
         answer = f"within {number(faults['within'])} s, from these sizes on"
         return {"answer": answer, "texts": detectable_words(faults)}
-    if faults is None and (jumps := [text for text in _promises(model) if _is_jump(text)]):
-        return {
-            "answer": "jumps of these sizes",
-            "texts": [*jumps, f"of drifts, noise, stuck sensors and more: {validate}"],
-        }
+    if faults is None and (jumps := _promises(model, True)):
+        texts = [*jumps, f"of drifts, noise, stuck sensors and more: {validate}"]
+        return {"answer": "jumps of these sizes", "texts": texts}
     return {"answer": "unknown", "texts": [faults["refused"] if faults else validate]}
 
 
-def _promises(model: UncertainLTI) -> list[str]:
+def _alarm(model: UncertainLTI) -> Mapping[str, Any]:
+    """What the fit says of the alarm; anything may be written in a file."""
     alarm = model.fit_summary.get("alarm")
-    return [str(text) for text in list_of(alarm.get("promises"))] if isinstance(alarm, Mapping) else []
+    return alarm if isinstance(alarm, Mapping) else {}
 
 
-def _is_jump(promise: str) -> bool:
-    return promise.startswith("sees within")
+def _promises(model: UncertainLTI, of_jumps: bool) -> list[str]:
+    texts = map(str, list_of(_alarm(model).get("promises")))
+    return [text for text in texts if text.startswith("sees within") == of_jumps]
 
 
 # --- reasons for and against relying on a model ------------------------------------------------------------------
@@ -229,14 +227,10 @@ def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]
 
 
 def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | None) -> Reasons:
-    alarm = model.fit_summary.get("alarm")
-    if isinstance(alarm, Mapping) and alarm.get("headline"):
+    alarm = _alarm(model)
+    if alarm.get("headline"):
         weight = {"good": YES, "some": CARE}.get(str(alarm.get("worth")), NO)
-        yield (
-            weight,
-            "alarm",
-            "; ".join([str(alarm["headline"]), *(text for text in _promises(model) if not _is_jump(text))]),
-        )
+        yield weight, "alarm", "; ".join([str(alarm["headline"]), *_promises(model, False)])
     elif validation is None or validation["inside"] is None:
         how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"
         why = f" ({why})" if (why := model.validation.get("not_done")) else ""
@@ -251,12 +245,8 @@ def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | Non
         what, but = "recordings", ""
         if validation["kind"] != "transients":
             what, but = "blocks", "; they are of the same run, so another day may differ"
-        yield (
-            weight,
-            "validation",
-            f"of {plural(validation['verdicts'], 'verdict')} on {what} that were left out of the fit "
-            f"{_percent(inside)} lay inside ({whole} of {parts} whole {what}){but}",
-        )
+        judged = f"of {plural(validation['verdicts'], 'verdict')} on {what} that were left out of the fit"
+        yield weight, "validation", f"{judged} {_percent(inside)} lay inside ({whole} of {parts} whole {what}){but}"
     if validation is not None and validation.get("hint"):
         yield CARE, "validation", str(validation["hint"])
 
@@ -278,8 +268,9 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     worst = max(wide, key=lambda name: wide[name])
     useless = [f"{shortened(name)} ({wide[name]:.0%})" for name in model.state_names if wide.get(name, 0.0) > TOO_WIDE]
     if useless:
-        armed = isinstance(model.fit_summary.get("alarm"), Mapping)  # a window sees less than what a width says
-        weight = NO if 2 * len(useless) >= model.n and not armed else CARE
+        weight = (
+            NO if 2 * len(useless) >= model.n and not _alarm(model) else CARE
+        )  # a window sees less than a width says
         wider = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range {where} say next to nothing"
         yield weight, "tightness", f"{wider}: {shortlist(useless, 6)}"
     elif wide[worst] > 0.0:

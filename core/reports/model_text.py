@@ -79,11 +79,7 @@ def model_blocks(model: UncertainLTI) -> list[Block]:
         )
     rows = [
         [f"{kind} {x.name}", x.topic or "-", x.field, number(float(x.steady)), number(float(x.scale)), x.unit or "-"]
-        for kind, group in (
-            ("state", model.signals.states),
-            ("control", model.signals.controls),
-            ("scheduling", model.signals.scheduling),
-        )
+        for kind, group in (("state", s.states), ("control", s.controls), ("scheduling", s.scheduling))
         for x in group
     ]
     blocks.append(Table(("signal", "topic", "field", "steady", "scale", "unit"), rows, left=(1, 2), most=300))
@@ -142,19 +138,14 @@ def next_text(model: UncertainLTI, file: str) -> str:
 
 def schedule_blocks(choice: Mapping[str, Any]) -> list[Block]:
     """How the number of knots of one signal was chosen."""
-    tried = [c for c in choice["candidates"] if "refused" not in c]
-    rows = [
-        [
-            _chosen(c["knots"], c["knots"] == choice["chosen"]),
-            share(c["outside"], 2),
-            share(c["excess"]),
-            f"x {c['width']:.3g}",
-            f"x {c['jumps']:.3g}",
-            ", ".join(f"{k:.4g}" for k in c["at"]) or "-",
-        ]
-        for c in tried
-    ]
-    refused = [f"  {plural(c['knots'], 'knot')}: {c['refused']}" for c in choice["candidates"] if "refused" in c]
+    rows, refused = [], []
+    for c in choice["candidates"]:
+        if "refused" in c:
+            refused.append(f"  {plural(c['knots'], 'knot')}: {c['refused']}")
+            continue
+        sizes = [share(c["outside"], 2), share(c["excess"]), f"x {c['width']:.3g}", f"x {c['jumps']:.3g}"]
+        at = ", ".join(f"{k:.4g}" for k in c["at"]) or "-"
+        rows.append([_chosen(c["knots"], c["knots"] == choice["chosen"]), *sizes, at])
     title = f"knots on {choice['signal']}, {_left_out(choice)}:"
     return [
         title,
@@ -165,17 +156,10 @@ def schedule_blocks(choice: Mapping[str, Any]) -> list[Block]:
 
 def horizon_blocks(choice: Mapping[str, Any]) -> list[Block]:
     """How the horizons and their half-widths were chosen."""
-    rows = [
-        [
-            _chosen(c["steps"], c["taken"]),
-            c["widths"],
-            share(c["outside"], 2),
-            f"x {c['width']:.3g}",
-            f"x {c['per_step']:.3g}",
-            c["why"],
-        ]
-        for c in choice["candidates"]
-    ]
+    rows = []
+    for c in choice["candidates"]:
+        widths = [share(c["outside"], 2), f"x {c['width']:.3g}", f"x {c['per_step']:.3g}"]
+        rows.append([_chosen(c["steps"], c["taken"]), c["widths"], *widths, c["why"]])
     if not rows:
         return [f"horizons: {choice['reason']}"]
     header = ("steps", "half-widths", "outside", "width", "per step", "")
@@ -224,13 +208,10 @@ def blocks_in_words(model: UncertainLTI) -> list[str]:
     """What a reader should know of the blocks of a scheduled model."""
     if model.schedule is None:
         return []
-    found, of = [], model.schedule.blocks
-    unknown, tied = [], []
-    for r, data in enumerate(model.block_data):
-        if not data.known:
-            unknown.append(model.block_name(r))
-        elif data.tied_to is not None:
-            tied.append(f"{model.block_name(r)} (as {model.block_name(data.tied_to)})")
+    found, of, name = [], model.schedule.blocks, model.block_name
+    data = list(enumerate(model.block_data))
+    unknown = [name(r) for r, d in data if not d.known]
+    tied = [f"{name(r)} (as {name(d.tied_to)})" for r, d in data if d.known and d.tied_to is not None]
     if unknown:
         found.append(
             f"no recording visited {plural(len(unknown), 'regime')} of {of}, and no bound there can be trusted: "
@@ -240,7 +221,7 @@ def blocks_in_words(model: UncertainLTI) -> list[str]:
         whose = "its" if len(tied) == 1 else "their"
         few = f"{plural(len(tied), 'regime')} of {of} had too little data for elements of {whose} own"
         found.append(f"{few}: {shortlist(tied, 6)}")
-    if any(data.transitions is None for data in model.block_data):
+    if any(d.transitions is None for _, d in data):
         found.append("the model file does not say how much data each regime had")
     return found
 
@@ -275,20 +256,15 @@ def readable_validation(data: Mapping[str, Any]) -> Mapping[str, Any] | None:
 
 def validation_blocks(data: Mapping[str, Any]) -> list[Block]:
     """How the model does on what was left out, its false alarms, and the faults that it sees."""
-    what, states = _part(data), data["states"].items()
+    what = _part(data)
     gap = f", {number(data['gap'])} s on both sides not fitted either" if data["kind"] == "blocks" else ""
-    under = f", {short}" if (short := data.get("condition_short")) else ""  # older files have none
+    under = f", {data['condition_short']}"
     percent = f"{data['confidence']:.0%}"
-    rows = [
-        [
-            named(name, s["unit"]),
-            share(s["inside"]),
-            f"{s['parts_inside']:d}/{data['parts']:d}",
-            number(s["mean_width_left_out"]),
-            number(s["mean_width_full"]),
-        ]
-        for name, s in states
-    ]
+    rows = []
+    for name, s in data["states"].items():
+        widths = [number(s["mean_width_left_out"]), number(s["mean_width_full"])]
+        whole = f"{s['parts_inside']:d}/{data['parts']:d}"
+        rows.append([named(name, s["unit"]), share(s["inside"]), whole, *widths])
     blocks: list[Block] = [
         f"left out one {_unit(data)} at a time ({_how_many(data)}{gap}): {plural(data['verdicts'], 'verdict')}, "
         f"{number(data['hours'])} h",
@@ -305,27 +281,21 @@ def validation_blocks(data: Mapping[str, Any]) -> list[Block]:
             f"whole {what}s inside all bounds: {data['parts_inside']:d} of {data['parts']:d} "
             f"({percent} interval {low:.1%} to {high:.1%}{under})"
         )
-        if groups := data.get("groups"):
+        if groups := data["groups"]:
             blocks.append(f"whole groups inside all bounds: {groups['inside']} of {groups['count']}")
         rows = [_alarm_row(alarm) for alarm in data["false_alarms"]]
         blocks.append(Table(("alarm rule", "alarms", "per hour", f"{percent} interval{under}", "time in alarm"), rows))
-    if parts := [p for p in data.get("part", []) if "alarms" in p]:  # older files did not count them
-        worst = sorted(parts, key=lambda p: (-p["alarms"], -p["violated"] / max(p["verdicts"], 1)))
-        header = (what, "verdicts", "inside", "outside domain", "alarms", "time in alarm", "farthest, in half-widths")
-        blocks.append(Table(header, [_part_row(p) for p in worst], most=MOST_PARTS))
-    if "condition" in data:
-        blocks.append(data["condition"])
-    blocks.append(data["scenario"]["words"])
+    worst = sorted(data["part"], key=lambda p: (-p["alarms"], -p["violated"] / max(p["verdicts"], 1)))
+    header = (what, "verdicts", "inside", "outside domain", "alarms", "time in alarm", "farthest, in half-widths")
+    blocks.append(Table(header, [_part_row(p) for p in worst], most=MOST_PARTS))
+    blocks += [data["condition"], data["scenario"]["words"]]
     if (faults := detectable_data(data)) is not None:
         blocks += detectable_blocks(faults)
     return [*blocks, *data.get("promises", []), *(f"note: {note}" for note in data["notes"])]
 
 
 def _alarm_row(alarm: Mapping[str, Any]) -> list[str]:
-    if "rule" not in alarm:  # an older file
-        rule = f"{alarm['violations']} of {alarm['window']}, margin {number(alarm['margin'])}"
-    else:
-        rule = "the model's" if "; or " in alarm["rule"] else str(alarm["rule"])
+    rule = "the model's" if "; or " in alarm["rule"] else str(alarm["rule"])
     low, high = alarm["interval"]
     least = "unknown" if high is None else f"{number(low if low > 1e-4 * high else 0.0)} to {number(high)}"
     return [rule, f"{alarm['alarms']:d}", number(alarm["per_hour"]), least, share(alarm.get("raised_share"))]
@@ -333,15 +303,11 @@ def _alarm_row(alarm: Mapping[str, Any]) -> list[str]:
 
 def _part_row(part: Mapping[str, Any]) -> list[str]:
     judged = part["verdicts"]
-    return [
-        part["name"],
-        str(judged),
-        share(1 - part["violated"] / judged if judged else None),
-        share(part["outside_domain"] / judged if judged else None, 2),
-        str(part["alarms"]),
-        share(part["alarm_share"]),
-        "-" if part["farthest"] is None else f"{part['farthest_state']}, {part['farthest']:.3g} x",
-    ]
+    inside = share(1 - part["violated"] / judged if judged else None)
+    outside_domain = share(part["outside_domain"] / judged if judged else None, 2)
+    farthest = "-" if part["farthest"] is None else f"{part['farthest_state']}, {part['farthest']:.3g} x"
+    alarms = [str(part["alarms"]), share(part["alarm_share"])]
+    return [part["name"], str(judged), inside, outside_domain, *alarms, farthest]
 
 
 def left_out_text(data: Mapping[str, Any]) -> str:
@@ -364,12 +330,12 @@ def _part(data: Mapping[str, Any]) -> str:
 
 def _unit(data: Mapping[str, Any]) -> str:
     """What was left out at a time."""
-    return "group" if data.get("groups") else _part(data)
+    return "group" if data["groups"] else _part(data)
 
 
 def _how_many(data: Mapping[str, Any]) -> str:
     """How many there are of it."""
-    parts, groups = plural(data["parts"], _part(data)), data.get("groups")
+    parts, groups = plural(data["parts"], _part(data)), data["groups"]
     return f"{parts} in {plural(groups['count'], 'group')}, by {groups['key']}" if groups else parts
 
 

@@ -30,9 +30,8 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment
 from markupsafe import Markup, escape
-from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, written
 from uncertain_lti.base.text import Block, Table, number, plural, share
@@ -56,8 +55,6 @@ HOLDS = {".html": b"<html", ".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"
 _TONE = {YES: "good", CARE: "care", UNKNOWN: "care", NO: "bad"}
 
 Placed = tuple[Columns, Panel]
-Section = tuple[str, str, list[Any]]
-"""Anchor, title, and blocks; a tuple of one among them is a heading."""
 
 
 def page_target(output: str | os.PathLike[str], model_file: str, bags: Sequence[Recording]) -> Path:
@@ -84,16 +81,9 @@ def interactive_page(title: str, recordings: Sequence[Plotted], every: int = 0, 
     allowed = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     views = list(dict.fromkeys(view for recording in recordings for view, _ in recording.views))
     style = Markup(f"{_asset('uPlot.min.css')}\n{_asset('page.css')}")
-    marked = [Markup(script) for script in scripts]
-    values = {
-        "title": title,
-        "every": every,
-        "views": views,
-        "allowed": allowed,
-        "style": style,
-        "data": Markup(packed),
-    }
-    return environment().from_string(_asset("page.html")).render(values, scripts=marked, **more)
+    marked = {"style": style, "data": Markup(packed), "scripts": [Markup(script) for script in scripts]}
+    page = environment().from_string(_asset("page.html"))
+    return page.render(marked, title=title, every=every, views=views, allowed=allowed, **more)
 
 
 def packed_data(recordings: Sequence[Plotted], every: int = 0) -> str:
@@ -137,17 +127,22 @@ def html_report(
     going: Any = drawn if progress is None else progress(drawn, len(drawn))
     plotted = [plotted_check(model, checked[i], len(drawn)) for i in going]
     conditions = f", {facts['rule']['conditions']}" if facts["rule"]["conditions"] else ""
+    trust: list[Block] = ["The model has not been validated."]
+    if facts["validation"] is not None:
+        trust = validation_blocks(facts["validation"])
+    reasons = [[r["weight"], r["text"]] for r in facts["rely"]["reasons"]]
+    sections = [  # anchor, title, and blocks; a tuple of one among them is a heading
+        ("recordings", "What happened", _what_happened(recordings, drawn)),
+        ("model", "The model", model_blocks(model)),
+        ("trust", "How far to trust it", [*trust, Table(("weight", "reason"), reasons, left=(1,))]),
+        ("origin", "Where it comes from", _where_from(facts)),
+    ]
     return interactive_page(
         charts.base_name(facts["model"]["file"] or "model"),
         plotted,
         about=f"Alarm: {facts['rule']['words']}{conditions}.",
         cards=list(_cards(facts)),
-        sections=[
-            _what_happened(facts, drawn),
-            ("model", "The model", model_blocks(model)),
-            _how_far_to_trust(facts),
-            _where_from(facts),
-        ],
+        sections=sections,
         version=facts["version"],
     )
 
@@ -187,8 +182,8 @@ def _headline(facts: Mapping[str, Any]) -> tuple[str, str]:
     return "Nothing left its bounds", "good"
 
 
-def _what_happened(facts: Mapping[str, Any], drawn: Sequence[int]) -> Section:
-    recordings, blocks = facts["recordings"], list[Any]()
+def _what_happened(recordings: Sequence[Mapping[str, Any]], drawn: Sequence[int]) -> list[Any]:
+    blocks: list[Any] = []
     for r in (recordings[i] for i in drawn):
         blocks += [(charts.base_name(r["recording"]),), *check_blocks(r), *r["notes"][:5]]
         if r["episodes"]:
@@ -201,25 +196,16 @@ def _what_happened(facts: Mapping[str, Any], drawn: Sequence[int]) -> Section:
             rows.append([charts.base_name(r["recording"]), *counts, share(r["inside"]), r["outcome"]])
         header = ("recording", "verdicts", "violated", "episodes", "inside", "outcome")
         blocks += [("All recordings",), Table(header, rows, most=200)]
-    return "recordings", "What happened", blocks
+    return blocks
 
 
-def _how_far_to_trust(facts: Mapping[str, Any]) -> Section:
-    blocks: list[Block] = ["The model has not been validated."]
-    if facts["validation"] is not None:
-        blocks = validation_blocks(facts["validation"])
-    rows = [[r["weight"], r["text"]] for r in facts["rely"]["reasons"]]
-    return "trust", "How far to trust it", [*blocks, Table(("weight", "reason"), rows, left=(1,))]
-
-
-def _where_from(facts: Mapping[str, Any]) -> Section:
+def _where_from(facts: Mapping[str, Any]) -> list[Block]:
     model = facts["model"]
     rows = [["model checked with", model["file"], model["sha256"] or "none"]]
     rows += [["fitted to", source["file"], source["sha256"]] for source in model["sources"]]
     rows += [["checked", f["file"], f["sha256"]] for r in facts["recordings"] for f in r["files"]]
     fit = [[key, number(v) if isinstance(v, float) else str(v)] for key, v in model["fit"].items()]
-    tables = [Table(("what", "file", "sha256"), rows, left=(1, 2), most=300), Table(("fit", ""), fit, left=(1,))]
-    return "origin", "Where it comes from", tables
+    return [Table(("what", "file", "sha256"), rows, left=(1, 2), most=300), Table(("fit", ""), fit, left=(1,))]
 
 
 def _cut(text: str) -> str:
@@ -297,7 +283,7 @@ def plotted_live(
     states: Sequence[str],
     t: Array,
     flags: Array,
-    alarm: NDArray[np.bool_],
+    alarm: Mask,
     utilisation: Array,
     statistics: Mapping[str, Array],
     note: str,

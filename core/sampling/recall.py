@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.base.text import meant
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 
 Values = Array

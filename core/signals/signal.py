@@ -23,8 +23,7 @@ from typing import Any, Literal
 from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import shortlist
-from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti.signals.functions import LONGEST_DELAY, Memory, parse_memory
+from uncertain_lti.signals.field_path import LONGEST_DELAY, FieldPath, Memory, parse_memory
 from uncertain_lti.signals.values import (
     CHOICES,
     CHOICES_TEXT,

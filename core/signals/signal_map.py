@@ -20,8 +20,7 @@ from typing import Any, Literal, NoReturn
 from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.base.errors import SignalError, refuse_other
 from uncertain_lti.base.text import html_table, named, number_text
-from uncertain_lti.signals.field_path import FieldPath, TypeFields
-from uncertain_lti.signals.functions import Memory
+from uncertain_lti.signals.field_path import FieldPath, Memory, TypeFields
 from uncertain_lti.signals.signal import LISTS, STEP_CHOICES, map_arguments
 from uncertain_lti.signals.signal import Recalled as Recalled
 from uncertain_lti.signals.signal import ScheduleRule as ScheduleRule
