@@ -34,7 +34,7 @@ import numpy as np
 from coil import coil_runs
 from detectors import DETECTORS, WINDOWS, Array, Learn, averaged, least_squares, table
 from shared_recordings import airborne, crazypad_labels
-from turbofan_fleet import lever_moves, simulate_fleet
+from turbofan_fleet import Ramped, first_sample, lever_moves, simulate_fleet
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
@@ -216,16 +216,16 @@ def turbofan(quick: bool) -> Iterator[Case]:
 
         def run(seed: int, fault: Fault | None = None, noise: float = noise) -> Run:
             samples = round(SECONDS / DT) + 1
-            return Run(samples, lever=lever(seed), ramps=True, noise=noise, seed=seed, fault=fault)
+            return Ramped(samples, lever=lever(seed), noise=noise, seed=seed, fault=fault)
 
         pulses = simulated([make_run("pulses", a, noise, seed) for a, seed in ((LARGE, 1), (-LARGE, 2))])
         moves = [from_whole_angle(lever_moves(40, 100 + i)) for i in range(12)]
-        long = [Run(1601, lever=m, ramps=True, noise=noise, seed=300 + i) for i, m in enumerate(moves)]
+        long = [Ramped(1601, lever=m, noise=noise, seed=300 + i) for i, m in enumerate(moves)]
         faults = [run(30000 + i, Fault(kind, ONSET, size)) for kind, size in FAULTS for i in range(seeds)]
         made = simulated([*faults, *(run(seed) for seed in range(20000, 20000 + count))])
         faulty = {
             kind.replace("_", " ") + ("" if kind.endswith("stuck") else f" × {size:g}"): (
-                made[seeds * i : seeds * (i + 1)], Fault(kind, ONSET).first_sample(DT),
+                made[seeds * i : seeds * (i + 1)], first_sample(Fault(kind, ONSET)),
             )
             for i, (kind, size) in enumerate(FAULTS)
         }  # fmt: skip

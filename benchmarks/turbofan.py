@@ -18,6 +18,7 @@ shares of violations are compared pair by pair.
 import sys
 
 import numpy as np
+from turbofan_fleet import first_sample
 
 from uncertain_lti import EnvelopeMonitor
 from uncertain_lti.identification import fit
@@ -62,7 +63,7 @@ def faults():
         before = [int(m.check(healthy).violated[:onset].sum()) for m in monitors]
         print(f"| false before, of {onset - 1} | " + " | ".join(str(b) for b in before) + " |")
         for kind, run in runs.items():
-            first = Fault(kind, AT).first_sample(DT)
+            first = first_sample(Fault(kind, AT))
             print(f"| {kind} | " + " | ".join(seen(m, run, first, healthy) for m in monitors) + " |", flush=True)
 
 
@@ -85,7 +86,7 @@ def excitation():
                 verdicts, long = monitor.check(check), monitor.check(healthy)
                 inside = [1.0 - v.violated[v.judged].mean() for v in (verdicts, long)]
                 width = (verdicts.upper - verdicts.lower)[verdicts.judged] / monitor.model.operating_point.X
-                first = Fault("fan_damage", AT).first_sample(DT)
+                first = first_sample(Fault("fan_damage", AT))
                 print(
                     f"| {name}{size:.0%} | {inside[0]:.0%} | {inside[1]:.1%} | "
                     f"{verdicts.outside_domain[verdicts.judged].mean():.0%} | {1e4 * width.mean():.3g} | "

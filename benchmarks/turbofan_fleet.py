@@ -40,7 +40,6 @@ from uncertain_lti.plants.turbofan_runs import (
     Controller,
     Fault,
     Run,
-    _lever,
     _rounded,
     operating_point,
     pulses,
@@ -88,6 +87,25 @@ def _again(name: str) -> ModuleType:
     return module
 
 
+class Ramped(Run):
+    """A run whose lever moves evenly from corner to corner of `lever`; two corners at one instant are a jump."""
+
+    def angle(self, t: float) -> float:
+        last = max(i for i, (since, _) in enumerate(self.lever) if since <= t + 1e-9)
+        since, pla = self.lever[last]
+        if last + 1 == len(self.lever):
+            return pla
+        until, target = self.lever[last + 1]
+        low, high = sorted((pla, target))
+        return min(max(pla + (target - pla) * (t - since) / (until - since), low), high)
+
+
+def first_sample(fault: Fault) -> int:
+    """The first sample that can show a fault: a sensor's at the onset, anything else one step later."""
+    onset = int(np.ceil(fault.at / DT - 1e-9))
+    return onset if fault.kind.startswith("sensor") else onset + 1
+
+
 def lever_moves(
     seconds: float,
     seed: int,
@@ -96,7 +114,7 @@ def lever_moves(
     hold: tuple[float, float] = (0.5, 5.0),
     low: float = 60.0,
 ) -> tuple[tuple[float, float], ...]:
-    """Moves of the lever at random, as corners for a `Run` with `ramps`: each move jumps or ramps, and then it rests.
+    """Moves of the lever at random, as corners for a `Ramped` run: each move jumps or ramps, and then it rests.
 
     Angles are uniform, but about one in five is the smallest and one in five the largest: what a machine does from end
     to end has to be in recordings that shall represent it.
@@ -196,7 +214,7 @@ def simulate_fleet(runs: Sequence[Run], controls: Array | None = None) -> list[T
             if controls is not None:
                 u_sent[r, k] = controls[r, k]
             elif run.amplitude is None:
-                u_sent[r, k] = controllers[r].step(_lever(run, t), x_read[r, k])
+                u_sent[r, k] = controllers[r].step(run.angle(t), x_read[r, k])
             else:
                 u_sent[r, k] = begin[r].u + point.U * pulses(t, run.amplitude)
         if k + 1 == samples:
@@ -232,7 +250,7 @@ def main() -> None:
     moves = [((0.0, 64.0), (m[1][0], 64.0), *m[2:]) for m in moves]
     for noise in (0.0, 1e-4):
         runs = [
-            Run(401, lever=m, ramps=True, noise=noise, seed=i, fault=Fault(kind, 4.0) if kind else None)
+            Ramped(401, lever=m, noise=noise, seed=i, fault=Fault(kind, 4.0) if kind else None)
             for i, (m, kind) in enumerate(zip(moves, kinds, strict=True))
         ]
         X = operating_point().X

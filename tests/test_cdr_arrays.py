@@ -312,7 +312,7 @@ def test_a_function_added_to_the_table_is_read_and_offered(tmp_path, monkeypatch
         norm2 = x * x + y * y + z * z + w * w
         return (norm2 - 2.0 * (x * x + y * y), norm2), norm2
 
-    tilt = FieldFunction(functions.QUATERNION, terms, lambda up, norm2: math.acos(up / norm2), unit="rad")
+    tilt = FieldFunction(field_path.QUATERNION, terms, lambda up, norm2: math.acos(up / norm2), unit="rad")
     monkeypatch.setitem(FUNCTIONS, "tilt", tilt)
     turns = [0.0, 0.5, 1.0, -2.0]
     quaternions = [(math.sin(a / 2), 0.0, 0.0, math.cos(a / 2)) for a in turns] + [(0.0,) * 4]

@@ -16,7 +16,7 @@ import pytest
 
 pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
 
-from turbofan_fleet import simulate_fleet
+from turbofan_fleet import Ramped, first_sample, simulate_fleet
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
@@ -225,7 +225,7 @@ def test_a_fault_shows_from_its_onset_and_not_before(kind):
     fault = Fault(kind, 1.0)
     lever = ((0.0, 68.0), (1.5, 62.0))
     healthy, faulty = simulate(Run(121, lever=lever)), simulate(Run(121, lever=lever, fault=fault))
-    onset = fault.first_sample(DT)
+    onset = first_sample(fault)
     assert np.array_equal(healthy.x[:onset], faulty.x[:onset])
     assert np.array_equal(healthy.u[:onset], faulty.u[:onset])
     last = np.abs((faulty.x[-1] - healthy.x[-1]) / operating_point().X).max()
@@ -237,7 +237,7 @@ def test_a_fault_shows_from_its_onset_and_not_before(kind):
 def test_many_runs_at_once_are_the_runs_one_by_one():
     kinds = (None, *(Fault(kind, 0.25) for kind in KINDS))
     lever = ((0.0, 68.0), (0.2, 68.0), (0.2, 66.0), (0.4, 64.0))
-    runs = [Run(25, lever=lever, ramps=True, noise=1e-4, seed=i, fault=fault) for i, fault in enumerate(kinds)]
+    runs = [Ramped(25, lever=lever, noise=1e-4, seed=i, fault=fault) for i, fault in enumerate(kinds)]
     for run, found in zip(runs, simulate_fleet(runs), strict=True):
         one = simulate(run)
         assert np.abs((found.x - one.x) / operating_point().X).max() < 1e-6, run.fault

@@ -263,11 +263,6 @@ class Fault:
                 f"turbofan: {self.kind} of size {self.size:g}; what is stuck has no size, leave it 1"
             )
 
-    def first_sample(self, dt: float) -> int:
-        """The first sample that can show it: a sensor's at the onset, anything else one step later."""
-        onset = int(np.ceil(self.at / dt - 1e-9))
-        return onset if self.kind.startswith("sensor") else onset + 1
-
     def health(self, t: float) -> Health:
         """Efficiency factors at one instant."""
         if self.kind == "compressor_wear" and t > self.at:
@@ -301,9 +296,8 @@ class Run:
 
     `samples`: number of samples, at least 2; `amplitude`: height of the pulses of an open-loop run, see `pulses`,
     negative downwards, around the steady state at the first angle of `lever`; None for a closed-loop run along `lever`;
-    `lever`: (instant s, angle deg) of each jump of the lever; with `ramps`, of each corner of its path; `noise`:
-    standard deviation of every reading, over its scale; `seed`: seed of the noise; `fault`: what goes wrong; None for a
-    healthy run; `ramps`: the lever moves evenly from corner to corner; two corners at one instant are a jump.
+    `lever`: (instant s, angle deg) of each jump of the lever; `noise`: standard deviation of every reading, over its
+    scale; `seed`: seed of the noise; `fault`: what goes wrong; None for a healthy run.
     """
 
     samples: int
@@ -312,13 +306,16 @@ class Run:
     noise: float = 0.0
     seed: int = 0
     fault: Fault | None = None
-    ramps: bool = False
 
     def __post_init__(self) -> None:
         if self.samples < 2:
             raise UncertainLTIError(f"turbofan: a run of {plural(self.samples, 'sample')}; it must have at least 2")
         if self.noise < 0:
             raise UncertainLTIError(f"turbofan: noise is {self.noise:g}; it must be 0 or more")
+
+    def angle(self, t: float) -> float:
+        """Angle of the lever at one instant, deg."""
+        return next(pla for since, pla in reversed(self.lever) if since <= t + 1e-9)
 
 
 def pulses(t: float, amplitude: float) -> Array:
@@ -355,7 +352,7 @@ def simulate(run: Run, start_ns: int = START_NS) -> Transient:
             reading = reading + run.noise * point.X * rng.standard_normal(5)
         x_read[k] = _rounded(reading, point.X)
         if run.amplitude is None:
-            u_sent[k] = controller.step(_lever(run, t), x_read[k])
+            u_sent[k] = controller.step(run.angle(t), x_read[k])
         else:
             u_sent[k] = begin.u + point.U * pulses(t, run.amplitude)
         if k + 1 == run.samples:
@@ -394,17 +391,6 @@ def _advance(solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health
 def _rounded(x: Array, X: Array) -> Array:
     step: Array = np.round(x / X / RESOLUTION) * RESOLUTION * X
     return step
-
-
-def _lever(run: Run, t: float) -> float:
-    """Angle at one instant, deg."""
-    last = max(i for i, (since, _) in enumerate(run.lever) if since <= t + 1e-9)
-    since, pla = run.lever[last]
-    if not run.ramps or last + 1 == len(run.lever):
-        return pla
-    until, target = run.lever[last + 1]
-    low, high = sorted((pla, target))
-    return min(max(pla + (target - pla) * (t - since) / (until - since), low), high)
 
 
 def make_run(

@@ -119,7 +119,9 @@ class _Scanner:
         ended = self._data_section()
         found.schemas = self.summary.schemas | found.schemas
         found.channels = self.summary.channels | found.channels
-        lost = self._orphans()
+        # messages whose channel has no record, for example because its chunk is damaged, are no topic's
+        orphans = [channel for channel in found.tally if channel not in found.channels]
+        lost = sum(found.tally.pop(channel).count for channel in orphans)
         if ended and not self.closed:
             found.warnings.append(
                 f"{path}: no footer at its end; all its {count(found.count, 'message')} could be read"
@@ -174,7 +176,12 @@ class _Scanner:
                 self.stream.seek(position)
                 continue
             if ends:
-                self._data_end(parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None)
+                record = parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None
+                if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
+                    self.found.warnings.append(
+                        f"{self.found.path}: the checksum of the file is wrong, so a number in it may be; copy it "
+                        f"again if you can"
+                    )
                 return True
             if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
                 position = self._bare(position, end, following)
@@ -193,13 +200,6 @@ class _Scanner:
                     self.sums = crc32(piece, self.sums)
                     left -= len(piece)
             position = end
-
-    def _data_end(self, record: DataEnd | None) -> None:
-        if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
-            self.found.warnings.append(
-                f"{self.found.path}: the checksum of the file is wrong, so a number in it may be; "
-                f"copy it again if you can"
-            )
 
     def _damage(self, position: int, following: int) -> None:
         self.damaged = True
@@ -317,11 +317,6 @@ class _Scanner:
             self.found.warnings.append(
                 f"{self.found.path}: {what} {record.id} is defined twice, differently; the first one counts"
             )
-
-    def _orphans(self) -> int:
-        """Messages whose channel has no record, for example because its chunk is damaged, are no topic's."""
-        lost = [channel for channel in self.found.tally if channel not in self.found.channels]
-        return sum(self.found.tally.pop(channel).count for channel in lost)
 
     def _summary(self) -> None:
         """What the summary of a closed file states, and where chunks begin that it knows, if its checksum holds."""

@@ -28,7 +28,7 @@ from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import YEARS as _YEARS
-from uncertain_lti.recordings.table_files import Column, RawTable, read_table
+from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
 from uncertain_lti.recordings.unreadable import TABLES, missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import UNITS, TableLayout
@@ -345,15 +345,11 @@ class Table(Recording):
             self._warnings.append(f"{path}: {plural(number, 'row')} without a time left out")
             kept = kept[known]
         self.times = times[kept]
-        self.columns_by_field: dict[str, Column] = {}
-        repeats: dict[str, int] = {}
-        for name, column in raw.columns.items():
-            field = plain = field_name(name)
-            while field in self.columns_by_field:
-                repeats[plain] = repeats.get(plain, 1) + 1
-                field = f"{plain}_{repeats[plain]}"
-            if name not in apart:
-                self.columns_by_field[field] = column if len(kept) == len(column) else column[kept]
+        names = [name for name in raw.columns if name not in apart]
+        self.columns_by_field: dict[str, Column] = {
+            field: raw.columns[name] if len(kept) == len(times) else raw.columns[name][kept]
+            for field, name in zip(once(map(field_name, names), "_"), names, strict=True)
+        }
         first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
         readable, reason = bool(self.columns_by_field), ""
         if not readable:

@@ -17,6 +17,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def _read_csv(path: Path) -> RawTable:
     lines = re.split(r"\r\n|\r|\n", head.decode(encoding, errors="replace"))[:_LOOK_LINES]
     shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
     names = _unique(shape.names)
-    exact = _Texts(path, encoding, shape, names)
+    exact = partial(_texts, path, encoding, shape, names)
     try:
         with open(path, encoding=encoding, errors="replace", newline="") as text:
             values = np.loadtxt(
@@ -108,15 +109,10 @@ def _units(shape: _Shape, names: Sequence[str]) -> dict[str, str]:
     return {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
 
 
-class _Texts:
+def _texts(path: Path, encoding: str, shape: _Shape, names: Sequence[str], name: str) -> Sequence[str]:
     """The cells of one column as they stand, read when they are asked for."""
-
-    def __init__(self, path: Path, encoding: str, shape: _Shape, names: Sequence[str]) -> None:
-        self.path, self.encoding, self.shape, self.names = path, encoding, shape, tuple(names)
-
-    def __call__(self, name: str) -> Sequence[str]:
-        where = self.names.index(name)
-        return [cells[where].strip() for _, cells in _rows(self.path, self.encoding, self.shape) if len(cells) > where]
+    where = names.index(name)
+    return [cells[where].strip() for _, cells in _rows(path, encoding, shape) if len(cells) > where]
 
 
 def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[str]]]:
@@ -216,14 +212,19 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
 
 
 def _unique(names: Iterable[str]) -> list[str]:
+    """Names of columns as they are called, each once."""
+    return once([" ".join(n.replace("\ufffd", "").split()) or f"column {i}" for i, n in enumerate(names, start=1)], " ")
+
+
+def once(names: Iterable[str], between: str) -> list[str]:
     """Names of which none is there twice; the second gets a number."""
     found: dict[str, None] = {}
     repeats: dict[str, int] = {}
-    for number, name in enumerate(names, start=1):
-        chosen = text = " ".join(name.replace("\ufffd", "").split()) or f"column {number}"
+    for name in names:
+        chosen = name
         while chosen in found:
-            repeats[text] = repeats.get(text, 1) + 1
-            chosen = f"{text} {repeats[text]}"
+            repeats[name] = repeats.get(name, 1) + 1
+            chosen = f"{name}{between}{repeats[name]}"
         found[chosen] = None
     return list(found)
 
@@ -310,7 +311,8 @@ def _read_arrow(path: Path) -> RawTable:
         raise BagError(f"{path}: is damaged or no {path.suffix} file ({one_line(error)}); copy it again") from None
     found: dict[str, Any] = {}
     notes = []
-    for name, column in zip(_unique(map(str, table.column_names)), table.columns, strict=True):
+    columns = dict(zip(_unique(map(str, table.column_names)), table.columns, strict=True))
+    for name, column in columns.items():
         kind = column.type
         if pa.types.is_dictionary(kind):
             column, kind = column.cast(kind.value_type), kind.value_type
@@ -325,8 +327,7 @@ def _read_arrow(path: Path) -> RawTable:
         else:
             notes.append(f"column '{name}' left out, it is of type {kind}")
     read = _of_one_length(path, found, notes)
-    texts = {name: column for name, column in zip(_unique(map(str, table.column_names)), table.columns, strict=True)}
-    read.exact = lambda name: [str(value) for value in texts[name].to_pylist()]  # integers with gaps
+    read.exact = lambda name: [str(value) for value in columns[name].to_pylist()]  # integers with gaps
     return read
 
 

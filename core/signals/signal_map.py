@@ -124,9 +124,7 @@ class SignalMap:
             for signal in signals:
                 refuse_other(signal, Signal, f"{self.source}: one of {kind}", "give a Signal", SignalError)
             object.__setattr__(self, kind, tuple(signals))
-        self._place_memories()
-        self._place_arrivals()
-        self._place_judged()
+        self._place()
         if not self.states:
             self._refuse("'states' is empty; list at least one state")
         seen: set[str] = set()
@@ -191,46 +189,38 @@ class SignalMap:
         if not 0 <= self.min_step <= LONGEST_S:
             self._refuse(f"min_step is {self.min_step}; it must be 0 s or more, up to {LONGEST_S:g}")
 
-    def _place_memories(self) -> None:
-        """Put memories among the states after the controls; what is valid of a listed field is so of its memories."""
-        memories = tuple(s for s in self.states if s.recalls)
-        if memories:
-            object.__setattr__(self, "states", tuple(s for s in self.states if not s.recalls))
-            object.__setattr__(self, "controls", (*self.controls, *memories))
-            if not self.states:
-                self._refuse(
-                    "every state is a lag, diff or rate, which has no row of its own; list the field itself as a state,"
-                    " too"
-                )
-        known = {(s.topic, s.field): s for s in reversed(self.signals)}
-        for group in ("controls", "scheduling"):
-            signals = list(getattr(self, group))
-            for i, signal in enumerate(signals):
-                listed = known.get((signal.topic, signal.inner)) if signal.recalls else None
-                if listed is not None and signal.valid is None and not signal.ignore:
-                    signals[i] = replace(signal, valid=listed.valid, ignore=listed.ignore)
-            object.__setattr__(self, group, tuple(signals))
+    def _place(self) -> None:
+        """Put memories among the states behind the controls, both ends of a control, and judged controls to the states.
 
-    def _place_arrivals(self) -> None:
-        """Make two controls of each that is at both ends of a step."""
-        both = [s.name for s in self.controls if s.at == "both"]
-        if both:
-            ends: list[Signal] = []
-            for signal in self.controls:
-                if signal.at == "both":
-                    ends.append(replace(signal, at="departure"))
-                    signal = replace(signal, name=signal.name + ARRIVAL, at="arrival")
-                ends.append(signal)
-            object.__setattr__(self, "controls", tuple(ends))
-            structure = with_rules(self.structure, {name + ARRIVAL: name for name in both})
-            object.__setattr__(self, "structure", structure)
+        What is valid of a listed field is so of its memories.
+        """
+        states = [s for s in self.states if not s.recalls]
+        controls = [*self.controls, *(s for s in self.states if s.recalls)]
+        if self.states and not states:
+            self._refuse(
+                "every state is a lag, diff or rate, which has no row of its own; list the field itself as a state, too"
+            )
+        known = {(s.topic, s.field): s for s in reversed((*states, *controls, *self.scheduling))}
 
-    def _place_judged(self) -> None:
-        """Put controls that are judged behind the states: a row of their own, from the states and controls before."""
-        judged = tuple(s for s in self.controls if s.judged and not (s.delay or s.recalls or s.at != "departure"))
-        if judged:
-            object.__setattr__(self, "states", (*self.states, *judged))
-            object.__setattr__(self, "controls", tuple(s for s in self.controls if s not in judged))
+        def as_listed(signal: Signal) -> Signal:
+            listed = known.get((signal.topic, signal.inner)) if signal.recalls else None
+            if listed is None or signal.valid is not None or signal.ignore:
+                return signal
+            return replace(signal, valid=listed.valid, ignore=listed.ignore)
+
+        ends: list[Signal] = []
+        arrivals: dict[str, str] = {}
+        for signal in map(as_listed, controls):
+            if signal.at == "both":
+                ends.append(replace(signal, at="departure"))
+                arrivals[signal.name + ARRIVAL] = signal.name
+                signal = replace(signal, name=signal.name + ARRIVAL, at="arrival")
+            ends.append(signal)
+        judged = [s for s in ends if s.judged and not (s.delay or s.recalls or s.at != "departure")]
+        object.__setattr__(self, "states", (*states, *judged))
+        object.__setattr__(self, "controls", tuple(s for s in ends if s not in judged))
+        object.__setattr__(self, "scheduling", tuple(map(as_listed, self.scheduling)))
+        object.__setattr__(self, "structure", with_rules(self.structure, arrivals))
 
     def __len__(self) -> int:
         return len(self.signals)
