@@ -47,12 +47,14 @@ def session_for(model: UncertainLTI, bag: Bag, rule: Rule, now: float) -> Sessio
     """
     definitions = {raw.topic: raw.channel.definition for raw in bag.raw_messages(model.signals.topics)}
     decoders = {definition.type_name: definition.decode for definition in definitions.values()}
-    types = topic_types(model, "the model", bag.fields)
+
+    def fields(type_name):
+        return next(d for d in definitions.values() if type_name in d.types).fields(type_name)
 
     def make_reader(type_name, paths):
-        return MessageReader(type_name, paths, bag.fields, decoders[type_name])
+        return MessageReader(type_name, paths, fields, decoders[type_name])
 
-    return Session(model, rule, types, bag.fields, make_reader, now)
+    return Session(model, rule, topic_types(model, "the model", fields), fields, make_reader, now)
 
 
 def main() -> None:

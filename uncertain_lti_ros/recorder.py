@@ -17,11 +17,13 @@ import os
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from enum import Enum
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import yaml
 from mcap.writer import CompressionType, Writer
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
@@ -215,26 +217,21 @@ class _File:
             raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
 
 
+_QOS = (
+    "history", "depth", "reliability", "durability", "deadline", "lifespan", "liveliness", "liveliness_lease_duration",
+    "avoid_ros_namespace_conventions",
+)  # fmt: skip
+
+
 def _qos_text(profiles: list[QoSProfile]) -> str:
     """As rosbag2 writes it since version 9 of its metadata."""
 
-    def duration(value: Any) -> dict[str, int]:
-        return dict(zip(("sec", "nsec"), divmod(value.nanoseconds, 10**9), strict=True))
+    def plain(value: Any) -> Any:
+        if isinstance(value, Duration):
+            return dict(zip(("sec", "nsec"), divmod(value.nanoseconds, 10**9), strict=True))
+        return value.name.lower() if isinstance(value, Enum) else value
 
-    listed = [
-        {
-            "history": profile.history.name.lower(),
-            "depth": profile.depth,
-            "reliability": profile.reliability.name.lower(),
-            "durability": profile.durability.name.lower(),
-            "deadline": duration(profile.deadline),
-            "lifespan": duration(profile.lifespan),
-            "liveliness": profile.liveliness.name.lower(),
-            "liveliness_lease_duration": duration(profile.liveliness_lease_duration),
-            "avoid_ros_namespace_conventions": profile.avoid_ros_namespace_conventions,
-        }
-        for profile in profiles
-    ]
+    listed = [{name: plain(getattr(profile, name)) for name in _QOS} for profile in profiles]
     return str(yaml.safe_dump(listed, sort_keys=False)) if listed else ""
 
 

@@ -101,23 +101,16 @@ class Snapshots:
 
     def _scene(self, session: Session, why: str) -> Scene:
         assert self.recent is not None
-        rule = session.monitor.rule
-        return Scene(
-            self.recent.entries(),
-            session.model.state_names,
-            session.types,
-            {output.name: self._node.resolve_topic_name(f"~/{output.name}") for output in RECORDED},
-            {
-                "node": self._node.get_fully_qualified_name(),
-                "why": why,
-                "model": str(self._settings.value("model")),
-                "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
-            },
-            definition,
-            session.model.steps,
-            session.monitor.alarms.names,
-            session.reasons.fresh(),
-        )
+        node, model, monitor = self._node, session.model, session.monitor
+        about = {
+            "node": node.get_fully_qualified_name(),
+            "why": why,
+            "model": str(self._settings.value("model")),
+            "alarm": f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}",
+        }
+        topics = {output.name: node.resolve_topic_name(f"~/{output.name}") for output in RECORDED}
+        of = self.recent.entries(), model.state_names, session.types, topics, about, definition
+        return Scene(*of, model.steps, monitor.alarms.names, session.reasons.fresh())
 
     @property
     def last(self) -> str:

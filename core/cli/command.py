@@ -138,17 +138,23 @@ def load_model(name: str) -> UncertainLTI:
     return UncertainLTI.load(name)
 
 
+def read_fitted(options: argparse.Namespace, bags: Iterable[str], signals: SignalMap) -> Iterator[Transient]:
+    """Read recordings as a model has its signals."""
+    from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.sampling.reading import read_as_fitted
+
+    for bag in group_recordings(bags, layout=signals.table):
+        transient = read_as_fitted(bag, signals, options.progress.iterate("reading"))
+        options.progress.note(*transient.notes)
+        yield transient
+
+
 def read_labelled(
     options: argparse.Namespace, pairs: Iterable[tuple[str, str]], signals: SignalMap
 ) -> Iterator[tuple[str, Transient]]:
     """Read recordings of known faults as a model has its signals."""
-    from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.sampling.reading import read_as_fitted
-
     for label, name in pairs:
-        for bag in group_recordings([name], layout=signals.table):
-            transient = read_as_fitted(bag, signals, options.progress.iterate("reading"))
-            options.progress.note(*transient.notes)
+        for transient in read_fitted(options, [name], signals):
             yield label, transient
 
 

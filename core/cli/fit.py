@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, FitError, ModelError
-from uncertain_lti.cli.command import Command, Result, load_model, model_target, read_labelled
+from uncertain_lti.cli.command import Command, Result, load_model, model_target, read_fitted, read_labelled
 from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
 
 if TYPE_CHECKING:
@@ -243,9 +243,7 @@ TUNE = Command(
 def run_validate(options: argparse.Namespace) -> Result:
     """Validate the model and write it with the result, if an output is named."""
     from uncertain_lti import UncertainLTI
-    from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.model_text import validation_text
-    from uncertain_lti.sampling.reading import read_as_fitted
     from uncertain_lti.validation.detectable import check_within, detectable
     from uncertain_lti.validation.left_out import validate
     from uncertain_lti.validation.panel import learn, promises
@@ -260,12 +258,7 @@ def run_validate(options: argparse.Namespace) -> Result:
     if options.output is not None:
         own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
         model_target(options.output, options.force or own, bags)
-    reading = options.progress.iterate("reading")
-    transients = [
-        read_as_fitted(bag, model.signals, reading) for bag in group_recordings(bags, layout=model.signals.table)
-    ]
-    for transient in transients:
-        options.progress.note(*transient.notes)
+    transients = list(read_fitted(options, bags, model.signals))
     with options.progress.stage("validating") as step:
         given = {name: getattr(options, name) for name in ("blocks", "gap", "confidence")}
         validation = validate(model, transients, **given, groups=options.group, progress=step)

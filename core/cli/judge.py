@@ -262,10 +262,10 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
 
 
 def _write_page(title: str, bags: Sequence[Recording], plotted: list[Plotted], output: Path) -> None:
+    from uncertain_lti.reports.charts import base_name
     from uncertain_lti.reports.pages import interactive_page, write_page
 
-    names = [os.path.basename(bag.path) or str(bag.path) for bag in bags]
-    write_page(output, interactive_page(f"{title}: {shortlist(names, 1)}", plotted))
+    write_page(output, interactive_page(f"{title}: {shortlist([base_name(bag.path) for bag in bags], 1)}", plotted))
 
 
 CHECK = Command(

@@ -224,24 +224,22 @@ def declare(writer: McapWriter, contents: Contents) -> NDArray[np.uint16]:
     return numbers
 
 
-def copy(
-    writer: McapWriter, contents: Contents, numbers: NDArray[np.uint16], notes: list[str]
-) -> Iterator[tuple[int, int, int]]:
+def copy(writer: McapWriter, contents: Contents, numbers: NDArray[np.uint16], notes: list[str]) -> Iterator[int]:
     """Copy a file block by block.
 
-    Yields of each the messages in it, those that were copied, and the last log time; what could not be copied besides
-    is noted, each in one sentence that begins with the file.
+    Yields of each how many messages in it could not be copied; what else could not be is noted, each in one sentence
+    that begins with the file.
     """
     blocks = ((block.offset, block) for block in contents.blocks)
     others = ((place, None) for place in contents.others)
     for place, block in heapq.merge(blocks, others, key=itemgetter(0)):
         if block is not None:
-            yield *_block(writer, contents, block, numbers), block.end
+            yield _block(writer, contents, block, numbers)
         elif problem := _record(writer, contents, place):
             notes.append(f"{contents.path}: {problem}; it is left out")
 
 
-def _block(writer: McapWriter, contents: Contents, block: Block, numbers: NDArray[np.uint16]) -> tuple[int, int]:
+def _block(writer: McapWriter, contents: Contents, block: Block, numbers: NDArray[np.uint16]) -> int:
     records = bytearray(contents.records(block))
     found = walk_records(records, 0, len(records), len(records))
     channel = numbers[found.channel]
@@ -257,7 +255,7 @@ def _block(writer: McapWriter, contents: Contents, block: Block, numbers: NDArra
         view = memoryview(records)
         whole = b"".join(view[a:b] for a, b in zip(begin.tolist(), end.tolist(), strict=True))
         writer.chunk(whole, index, (int(times.min()), int(times.max())))
-    return int(known.sum()), len(channel)
+    return int(known.sum()) - len(channel)
 
 
 def _record(writer: McapWriter, contents: Contents, place: int) -> str:

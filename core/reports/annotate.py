@@ -126,6 +126,17 @@ def annotate(
     compression = next((b.compression for part in contents if not part.converted for b in part.blocks), "zstd")
     base = _base({c.topic for part in contents for c in part.channels.values()})
     left_out, notes = Counter[Path](), list[str]()
+    rule = rule or model.alarm_rule
+    about = {
+        "recording": json.dumps([part.path.name for part in contents]),
+        "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
+        "topics": base,
+        "states": json.dumps([{"name": s.name, "unit": s.unit} for s in model.signals.states]),
+    }
+    if model_file:
+        about["model"] = os.path.basename(model_file)
+        if os.path.isfile(model_file):
+            about["model_sha256"] = sha256(model_file)
     try:
         with whole_file(output) as stream:
             writer = McapWriter(stream, f"uncertain-lti {__version__}", compression)
@@ -136,12 +147,12 @@ def annotate(
                 for output in RECORDED
                 if there[output.of]
             }
-            writer.metadata(METADATA, _about(contents, base, model, model_file, rule))
+            writer.metadata(METADATA, about)
 
             def copied() -> Iterator[tuple[Path, int]]:
                 for part, renumbered in zip(contents, numbers, strict=True):
-                    for found, kept, _ in copy(writer, part, renumbered, notes):
-                        yield part.path, found - kept
+                    for lost in copy(writer, part, renumbered, notes):
+                        yield part.path, lost
 
             blocks: Iterable[Any] = copied()
             if progress is not None:
@@ -216,24 +227,3 @@ def _schema(writer: McapWriter, contents: Sequence[Contents], type_name: str) ->
 def _fields(types: object) -> str:
     assert isinstance(types, dict)
     return repr(sorted((name, fields) for name, (_, fields) in types.items()))
-
-
-def _about(
-    contents: Sequence[Contents],
-    base: str,
-    model: UncertainLTI,
-    model_file: str | os.PathLike[str],
-    rule: AlarmRule | None,
-) -> dict[str, str]:
-    rule = rule or model.alarm_rule
-    about = {
-        "recording": json.dumps([part.path.name for part in contents]),
-        "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
-        "topics": base,
-        "states": json.dumps([{"name": s.name, "unit": s.unit} for s in model.signals.states]),
-    }
-    if model_file:
-        about["model"] = os.path.basename(model_file)
-        if os.path.isfile(model_file):
-            about["model_sha256"] = sha256(model_file)
-    return about

@@ -365,6 +365,11 @@ def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any
         bad, violated = (verdicts.flags[rows] == 1.0).sum(axis=0), int(verdicts.violated[rows].sum())
         own = (~np.isnan(verdicts.flags[rows])).sum(axis=0)  # without those withheld as a state is frozen
         total = np.nansum((verdicts.upper - verdicts.lower)[rows], axis=0)
+        states = {}
+        for i, name in enumerate(model.state_names):
+            count, violations = int(own[i]), int(bad[i])
+            inside, width = _inside(violations, count), float(total[i] / own[i]) if count else None
+            states[name] = {"verdicts": count, "violations": violations, "inside": inside, "mean_width": width}
         found.append(
             {
                 "regime": model.block_name(r),
@@ -372,15 +377,7 @@ def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any
                 "violated": violated,
                 "inside": _inside(violated, len(rows)),
                 "unknown_regime": int(verdicts.unknown_regime[rows].sum()),
-                "states": {
-                    name: {
-                        "verdicts": int(own[i]),
-                        "violations": int(bad[i]),
-                        "inside": _inside(int(bad[i]), int(own[i])),
-                        "mean_width": float(total[i] / own[i]) if own[i] else None,
-                    }
-                    for i, name in enumerate(model.state_names)
-                },
+                "states": states,
             }
         )
     return found

@@ -410,22 +410,13 @@ class SignalMap:
 
     def _repr_html_(self) -> str:
         """Where each signal is read, and its operating point; below, how samples are cut."""
-        groups = (("state", self.states), ("control", self.controls), ("scheduling", self.scheduling))
-        rows = [
-            [
-                named(signal.name, signal.unit),
-                kind,
-                signal.topic,
-                signal.field,
-                signal.steady if signal.steady == "auto" else number_text(signal.steady),
-                signal.scale if signal.scale == "auto" else number_text(signal.scale),
-                "" if signal.max_hold is None else f"{number_text(signal.max_hold)} s",
-                str(signal.delay or ""),
-                "" if signal.at == "departure" else signal.at,
-            ]
-            for kind, group in groups
-            for signal in group
-        ]
+        rows = []
+        for kind, group in (("state", self.states), ("control", self.controls), ("scheduling", self.scheduling)):
+            for s in group:
+                point = [value if isinstance(value, str) else number_text(value) for value in (s.steady, s.scale)]
+                hold = "" if s.max_hold is None else f"{number_text(s.max_hold)} s"
+                at = "" if s.at == "departure" else s.at
+                rows.append([named(s.name, s.unit), kind, s.topic, s.field, *point, hold, str(s.delay or ""), at])
         header = ("signal", "", "topic", "field", "steady", "scale", "max_hold", "delay", "at")
         below = [
             f"{name}: {value}"
