@@ -26,8 +26,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.model.repeats import Repeats, repeats_in, together
-from uncertain_lti.monitor.frozen import needs, repeat_words
+from uncertain_lti.model.repeats import Repeats, needs, repeat_words, repeats_in, together
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check import check_data, check_text

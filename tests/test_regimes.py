@@ -27,7 +27,7 @@ from test_schedule import scheduled as by_hand
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.domain import Sampling
-from uncertain_lti.model.overview import block_facts
+from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.reports.check import check_regimes, unknown_in_words
 from uncertain_lti.reports.findings import CARE, UNKNOWN

@@ -34,7 +34,7 @@ from uncertain_lti.cli.options import PUBLISHED, helped
 def run_info(options: argparse.Namespace) -> Result:
     """Print the model."""
     from uncertain_lti.base.text import finite_data
-    from uncertain_lti.model.overview import block_facts
+    from uncertain_lti.model.interchange import block_facts
     from uncertain_lti.reports.model_text import model_text
 
     model = load_model(options.model)

@@ -41,7 +41,7 @@ class Term:
     `nominal`: name of the nominal elements; empty if there are none; `half`: name of their half-widths, all >= 0;
     `regressor`: what the elements multiply: the state, the control, or 1. The half-widths multiply its absolute value;
     `times_dt`: whether the term is a rate (1/s), which the step multiplies; `required`: whether a model must state it;
-    otherwise it is 0 by default; `meaning`: in words; `word`: what rules of a signals file and reports call an additive
+    otherwise it is 0 by default; `word`: what rules of a signals file and reports call an additive
     term; empty for the others.
     """
 
@@ -50,7 +50,6 @@ class Term:
     regressor: Literal["x", "u", "1"]
     times_dt: bool
     required: bool
-    meaning: str
     word: str = ""
 
     @property
@@ -64,10 +63,10 @@ class Term:
 
 
 TERMS = (
-    Term("A", "dA", "x", True, True, "state matrix"),
-    Term("B", "dB", "u", True, True, "control matrix"),
-    Term("c", "dc", "1", True, False, "disturbance", "disturbance"),
-    Term("", "v", "1", False, False, "measurement noise", "noise"),
+    Term("A", "dA", "x", True, True),
+    Term("B", "dB", "u", True, True),
+    Term("c", "dc", "1", True, False, "disturbance"),
+    Term("", "v", "1", False, False, "noise"),
 )
 """Every term, in the order in which the bounds sum their columns."""
 

@@ -27,7 +27,7 @@ from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
 from uncertain_lti.model import free_run as nominal
-from uncertain_lti.model import interchange, overview
+from uncertain_lti.model import interchange
 from uncertain_lti.model.alarm_rule import (
     JOINT,
     AlarmRule,
@@ -490,7 +490,7 @@ class UncertainLTI(Envelope):
     from_control = classmethod(interchange.from_control)
     save_mat = interchange.save_mat
     load_mat = classmethod(interchange.load_mat)
-    _repr_html_ = overview.overview
+    _repr_html_ = interchange.overview
 
     # --- the file ---
 

@@ -43,10 +43,9 @@ from uncertain_lti.kernel.arithmetic import (
 )
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
-from uncertain_lti.model.repeats import walk
+from uncertain_lti.model.repeats import Bounds, FrozenWatch, Partly, needs, walk
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
-from uncertain_lti.monitor.frozen import Bounds, FrozenWatch, Partly, needs
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step, all_finite

@@ -22,11 +22,11 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.signature import Signature, closeness
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.verdict import Verdicts
 
 MATCH, AHEAD = 0.8, 0.05
 """A signature is named from this match on, if it is so far ahead of every other."""
@@ -212,28 +212,16 @@ class Explainer:
         return None if self.pattern is None else likeness(self._model, self.pattern, self._first)
 
 
-def over_recording(
-    model: UncertainLTI,
-    judged: NDArray[np.bool_],
-    alarm: NDArray[np.bool_],
-    table: Array,
-    lower: Array,
-    upper: Array,
-    outside: NDArray[np.bool_],
-) -> Iterable[tuple[int, int, Explainer]]:
-    """`Explainer` over the verdicts of a recording.
-
-    `judged, alarm` (N+1,): as in `Verdicts`; `table` (N+1, H, n): utilisation; `lower, upper` (N+1, n): bounds of one
-    step, recorded units; `outside` (N+1,): outside the fitted domain.
-    """
+def over_recording(model: UncertainLTI, verdicts: Verdicts) -> Iterable[tuple[int, int, Explainer]]:
+    """`Explainer` over the verdicts of a recording: of each alarm the first and last sample, and what it looks like."""
     explainer, begin, last, before = Explainer(model), -1, -1, 0
-    count = np.cumsum(judged)
-    for k in np.flatnonzero(judged & alarm).tolist():
+    count, table = np.cumsum(verdicts.judged), verdicts.horizon_utilisation
+    for k in np.flatnonzero(verdicts.judged & verdicts.alarm).tolist():
         quiet = int(count[k]) - before - 1
         if begin >= 0 and quiet > APART:
             yield begin, last, explainer
             explainer, begin = Explainer(model), -1
-        explainer.push(table[k], lower[k], upper[k], quiet, bool(outside[k]))
+        explainer.push(table[k], verdicts.lower[k], verdicts.upper[k], quiet, bool(verdicts.outside_domain[k]))
         begin, last, before = (k if begin < 0 else begin), k, int(count[k])
     if begin >= 0:
         yield begin, last, explainer

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import time
 import traceback
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -22,13 +22,12 @@ from typing import Any
 
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
-from uncertain_lti.model.repeats import Moved
+from uncertain_lti.model.repeats import Moved, frozen_words, repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.drift import Days
-from uncertain_lti.monitor.frozen import frozen_words, repeat_words
 from uncertain_lti.monitor.likeness import Likeness
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.monitor.reason import WHY
@@ -314,7 +313,7 @@ class EventLog:
 
     def __init__(self, log: Callable[[int, str], None]) -> None:
         self._log = log
-        self._matters: dict[str, _Matter] = {}
+        self._matters = defaultdict[str, _Matter](lambda: _Matter(None))
         self._alarm, self._alarm_since = False, 0.0
         self._named = False  # whether the start of this alarm was logged
         self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
@@ -330,11 +329,7 @@ class EventLog:
         self._ceased, self._judged = now, False
         self._cause = ("", now)
         self._matters.clear()
-
-    def _matter(self, name: str) -> _Matter:
-        if name not in self._matters:
-            self._matters[name] = _Matter(True if name == "arming" else None)
-        return self._matters[name]
+        self._matters["arming"] = _Matter(True)
 
     def turned(self, session: Session, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
         """Log the alarm if it has changed: its start with the states that left their bounds, its end if the start was.
@@ -357,7 +352,7 @@ class EventLog:
                 line = f"alarm, frozen: {'; '.join(session.frozen_text(moved) for moved in frozen[:SHOWN])}"
             line += "; it lasts until ~/reset" if session.rule.latch else ""
             self._alarm_since = now
-            self._named = self._matter("alarm").may(now)
+            self._named = self._matters["alarm"].may(now)
             if self._named:
                 self._log(WARN, f"{line}{self._left_out(self._unnamed)}")
             else:
@@ -373,7 +368,7 @@ class EventLog:
 
     def _catch_up(self, now: float) -> None:
         """Name the last of the alarms that were left out, as soon as a line may be logged."""
-        if self._unnamed and self._matter("alarm").may(now):
+        if self._unnamed and self._matters["alarm"].may(now):
             over = "" if self._alarm else "; it is over"
             self._log(WARN, f"{self._latest}{over}{self._left_out(self._unnamed - 1)}")
             self._named = self._alarm
@@ -385,34 +380,26 @@ class EventLog:
         self.turned(session, (), now)
         self._catch_up(now)
         if session.monitor.alarm and self._named:
-            self._look_at_likeness(session, now)
-        matter = self._matter("problems")
-        new = [problem for problem in problems if problem not in (matter.logged or ())]
-        if matter.becomes(tuple(problems) or None, now):
-            for problem in new[:SHOWN]:
-                self._log(OK, problem)
-        if self._matter("arming").becomes(session.arming.on, now):
-            condition = session.arming.condition or "there is no condition any more"
-            self._log(OK, session.arming.why_off() or f"alarms count from now on: {condition}")
-        if (drift := session.days.words) and self._matter("drift").becomes(drift, now):
-            for text in drift:
-                self._log(OK, text)
-        if session.caught_up and self._matter("catching up").becomes((session.reordered, session.caught_up), now):
-            self._log(OK, session.caught_up)
-        if (lags := session.lags) and self._matter("lags").becomes(tuple(lags), now):
-            clock = session.sampler.clock
-            for topic, lag in lags.items():
-                self._log(OK, f"stamps on {topic} lag those on {clock} by {lag:.3g} s, more than a step")
+            like = session.likeness()
+            if like and like.words and self._matters["likeness"].becomes((self._alarm_since, like.label), now):
+                self._log(OK, f"the alarm {like.words}")
+        known, clock, lags = self._matters["problems"].logged or (), session.sampler.clock, session.lags
+        condition = session.arming.condition or "there is no condition any more"
+        lag = [f"stamps on {topic} lag those on {clock} by {s:.3g} s, more than a step" for topic, s in lags.items()]
+        for name, value, lines in (
+            ("problems", tuple(problems) or None, [problem for problem in problems if problem not in known][:SHOWN]),
+            ("arming", session.arming.on, [session.arming.why_off() or f"alarms count from now on: {condition}"]),
+            ("drift", session.days.words, session.days.words),
+            ("catching up", (session.reordered, session.caught_up), [session.caught_up] * bool(session.caught_up)),
+            ("lags", tuple(lags), lag),
+        ):
+            if (lines or name == "problems") and self._matters[name].becomes(value, now):
+                for line in lines:
+                    self._log(OK, line)
         for topic in session.types:
-            if topic != session.sampler.clock:
+            if topic != clock:
                 self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))
         self._look_at_verdicts(session, now, timeout)
-
-    def _look_at_likeness(self, session: Session, now: float) -> None:
-        """Log what the alarm looks like, once there are verdicts enough, and when another fault is named."""
-        like = session.likeness()
-        if like is not None and like.words and self._matter("likeness").becomes((self._alarm_since, like.label), now):
-            self._log(OK, f"the alarm {like.words}")
 
     def _look_at_topic(self, session: Session, topic: str, now: float, timeout: float, publishers: int) -> None:
         heard = session.heard(topic)
@@ -421,17 +408,19 @@ class EventLog:
         held = session.held(topic)
         age = now - heard
         silent = age > max(timeout, held) or (age > timeout and math.isinf(held) and not publishers)
-        if self._matter(f"silence {topic}").becomes(silent or None, now):
+        if self._matters[f"silence {topic}"].becomes(silent or None, now):
             held_on = " and no publisher any more; its last values are held" if math.isinf(held) else ""
             self._log(OK, f"no message on {topic} for {age:.1f} s{held_on}" if silent else f"messages on {topic} again")
 
     def _look_at_verdicts(self, session: Session, now: float, timeout: float) -> None:
         without = session.without_verdict(now)
-        matter = self._matter("verdicts")
+        matter = self._matters["verdicts"]
         if session.verdicts and without <= timeout:
             if matter.becomes("", now):
+                masked = f"; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else ""
+                first = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}{masked}"
                 again = f"judging again, after {now - without - self._ceased:.1f} s without a verdict"
-                self._log(OK, again if self._judged else self._judging(session))
+                self._log(OK, again if self._judged else first)
                 self._judged = True
             self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
             self._ceased = now - without
@@ -444,10 +433,6 @@ class EventLog:
             if lasting and matter.becomes(why, now):
                 self._log(OK, f"no verdict {f'for {without:.1f} s' if session.verdicts else 'yet'}: {why}")
 
-    def _judging(self, session: Session) -> str:
-        text = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}"
-        return f"{text}; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else text
-
     def _why(self, session: Session, now: float, timeout: float) -> str:
         """Why there are no verdicts, without numbers that change from one call to the next; or nothing."""
         never = [topic for topic in session.types if session.heard(topic) is None]
@@ -459,15 +444,9 @@ class EventLog:
         if lacking := session.lacking(self._counters):
             found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")
             found += session.absent(lacking)
-        for status, name in (
-            (Status.GAP, "gaps"),
-            (Status.RESET, "resets"),
-            (Status.STEP, Status.STEP.value),
-            (Status.MODE, Status.MODE.value),
-            (Status.FROZEN, Status.FROZEN.value),
-        ):
-            if since[name]:
-                found.append(WHY[status])
+        counted = {Status.GAP: "gaps", Status.RESET: "resets"}
+        kinds = Status.GAP, Status.RESET, Status.STEP, Status.MODE, Status.FROZEN
+        found += [WHY[kind] for kind in kinds if since[counted.get(kind, kind.value)]]
         dropped = [status.value for status in Status if status.dropped and since[status.value]]
         if dropped:
             found.append(f"messages on {clock} are dropped ({', '.join(dropped)})")

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.text import html_table, named, number_text, plural, times
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
+from uncertain_lti.model.repeats import Looked
 from uncertain_lti.monitor.alarm import Alarm, Raised
-from uncertain_lti.monitor.frozen import Looked
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.transient import Transient

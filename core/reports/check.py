@@ -36,8 +36,8 @@ from uncertain_lti.base.text import (
 )
 from uncertain_lti.model.domain import jump_words, jumps
 from uncertain_lti.model.operating_point import recorded
+from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.frozen import repeat_words
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
@@ -238,7 +238,7 @@ def _explained(model: UncertainLTI, verdicts: Verdicts) -> Iterator[dict[str, An
     if not verdicts.alarm.any():
         return
     v = verdicts
-    patterns = over_recording(model, v.judged, v.alarm, v.horizon_utilisation, v.lower, v.upper, v.outside_domain)
+    patterns = over_recording(model, v)
     for start, stop, explainer in patterns:
         like = explainer.likeness()
         if like is not None and like.verdicts >= LEAST:

@@ -21,7 +21,7 @@ from uncertain_lti import __version__
 from uncertain_lti.base.files import sha256
 from uncertain_lti.base.text import finite_data, list_of, number, numbers_of, plural, shortened, shortlist, times
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
-from uncertain_lti.model.overview import block_facts
+from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.drift import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts

@@ -20,7 +20,7 @@ import numpy as np
 from uncertain_lti.base.text import Block, Table, list_of, named, number, numbers_of, plural, share, shortlist, text_of
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
-from uncertain_lti.model.overview import blocks_table, elements_table
+from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient

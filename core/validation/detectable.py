@@ -228,7 +228,10 @@ def detectable(
             else f"nothing that was left out lasts {within:g} s without a gap; record longer runs, or ask for less time"
         )
         return Detectable(within, confidence, count, left_out, refused=why)
-    growth = _growth(model, within)
+    growth = 1.0
+    if model.sampling.dt_median is not None:  # by how much the nominal model multiplies a deviation within the time
+        steps = within / model.sampling.dt_median
+        growth = math.exp(min(steps * math.log(max(model.spectral_radius(), 1e-9)), 700.0))
     runs_away = f"the nominal model runs away ({growth:.3g} times within {within:g} s), so its response says nothing"
     searches: list[_Search] = []
     found: dict[tuple[str, str], Seen] = {}
@@ -243,8 +246,11 @@ def detectable(
         if progress is not None:
             progress(CountedStep("faults of each kind", number + 1, ROUNDS + 2))
         going = [s for s in searches if number == 0 or s.reached.any()]
-        delays = every.delays([s.states(model, every, number) for s in going])
-        for search, delay in zip(going, delays, strict=True):
+        recalled = model.signals.recalled
+        faults = [
+            faulty(every.windows, s.kind, s.i, s.signs * s.sizes(number), every.noise, recalled, model) for s in going
+        ]
+        for search, delay in zip(going, every.delays(faults), strict=True):
             search.learn(delay, number)
     found |= {(s.kind, s.name): s.seen(model, every.unit, confidence) for s in searches}
     return Detectable(within, confidence, count, left_out, tuple(found[kind, name] for kind, _, name in pairs))
@@ -256,31 +262,24 @@ class _Search:
     def __init__(self, kind: str, i: int, name: str, largest: float, cases: _Cases, seed: int) -> None:
         self.kind, self.i, self.name, self.largest = kind, i, name, largest
         total = len(cases.t_ns)
-        self._signs = np.ones(total)
+        self.signs = np.ones(total)
         if KINDS[kind].both:
-            self._signs[np.random.default_rng([seed, 1]).permutation(total)[: total // 2]] = -1.0
+            self.signs[np.random.default_rng([seed, 1]).permutation(total)[: total // 2]] = -1.0
         least = min(0.5 * cases.step, 0.5 * largest) if KINDS[kind].unit == "s" else largest * FINEST
         self._low, self._high = np.full(total, math.log(least)), np.full(total, math.log(largest))
         self._delay = np.full(total, np.inf)
         self.reached = np.zeros(total, dtype=bool)
 
-    @property
-    def _thresholds(self) -> Array:
-        """Smallest size that was seen in each case, (cases,); inf where even the largest was not."""
-        return np.where(self.reached, np.exp(self._high), np.inf)
+    def _smallest(self) -> tuple[Array, float]:
+        """Smallest size that was seen in each case, in order (inf where the largest was not), and in SHARE of them."""
+        order = np.sort(np.where(self.reached, np.exp(self._high), np.inf))
+        return order, float(order[math.ceil(SHARE * len(order) - 1e-9) - 1])
 
-    @property
-    def _size(self) -> float:
-        """Seen in SHARE of the cases."""
-        thresholds = np.sort(self._thresholds)
-        return float(thresholds[math.ceil(SHARE * len(thresholds) - 1e-9) - 1])
-
-    def states(self, model: UncertainLTI, cases: _Cases, number: int) -> tuple[Array, Array]:
+    def sizes(self, number: int) -> Array:
         """What is tried in round `number`: the largest size, bisections, and at last the size that is reported."""
-        size = np.asarray(min(self._size, self.largest))
         if 0 < number <= ROUNDS:
-            size = np.exp(0.5 * (self._low + self._high))
-        return faulty(cases.windows, self.kind, self.i, self._signs * size, cases.noise, model.signals.recalled, model)
+            return np.asarray(np.exp(0.5 * (self._low + self._high)))
+        return np.asarray(min(self._smallest()[1], self.largest))
 
     def learn(self, delay: Array, number: int) -> None:
         """Take what was seen of it."""
@@ -293,8 +292,8 @@ class _Search:
 
     def seen(self, model: UncertainLTI, units: NDArray[np.intp], confidence: float) -> Seen:
         """The result."""
-        thresholds, size, what = self._thresholds, self._size, KINDS[self.kind]
-        order, total = np.sort(thresholds), len(thresholds)
+        thresholds, what = np.where(self.reached, np.exp(self._high), np.inf), KINDS[self.kind]
+        (order, size), total = self._smallest(), len(thresholds)
 
         def interval(largest: float, share: float | None = None) -> tuple[float, tuple[float, float]]:
             return quantile_share_interval(units, thresholds <= min(largest, self.largest), confidence, share)
@@ -346,13 +345,6 @@ def _memory(model: UncertainLTI, step: float) -> int:
             own = math.ceil(rule.window_s / step * (DECAYED if rule.kind in FADING else 1))
         found = max(found, own + rule.horizon)
     return min(found, LONGEST_MEMORY)
-
-
-def _growth(model: UncertainLTI, within: float) -> float:
-    """By how much the nominal model multiplies a deviation within the time."""
-    if model.sampling.dt_median is None:
-        return 1.0
-    return math.exp(min(within / model.sampling.dt_median * math.log(max(model.spectral_radius(), 1e-9)), 700.0))
 
 
 def _cases(model: UncertainLTI, parts: Sequence[Part], within: float, cases: int, seed: int) -> _Cases | None:

@@ -25,7 +25,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.panel import Evidence, Panel, extended, figure, learn
+from uncertain_lti.validation.panel import Evidence, Panel, extended, learn
 from uncertain_lti.validation.part import Part, Reach, fitted_parts, judge
 from uncertain_lti.validation.result import Validation
 
@@ -142,13 +142,18 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
         return first
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
-    best, least = ways[0], figure(_seen(first.model, transients, _COMPARED))
+
+    def figure(model: UncertainLTI) -> float:
+        seen = _seen(model, transients, _COMPARED)
+        return learn(seen, seen.parts).figure
+
+    best, least = ways[0], figure(first.model)
     for way in ways[1:]:
         asked = {**shared, **way}
         if asked.pop("centred", False):
             asked["operating_point"] = _medians(transients)
         try:
-            size = figure(_seen(fit(transients, describe_data=False, **asked), transients, _COMPARED))
+            size = figure(fit(transients, describe_data=False, **asked))
         except (FitError, ModelError):
             continue
         if size < CLEARLY * least:

@@ -132,8 +132,12 @@ class Evidence:
 
     def learnt(self, rules: Sequence[StatisticRule], what: str) -> tuple[StatisticRule, ...]:
         """These rules with their thresholds."""
-        thresholds = (self.factor * t for t in self.thresholds(rules, self.widths.shape[1], what))
-        return tuple(_with_threshold(rule, t) for rule, t in zip(rules, thresholds, strict=True))
+        found = []
+        for rule, sizes in zip(rules, self.thresholds(rules, self.widths.shape[1], what), strict=True):
+            sizes = self.factor * sizes
+            values = tuple((sizes if rule.kind == "mean" else sizes**2).tolist())
+            found.append(replace(rule, threshold=values[0] if rule.kind in JOINT else values))
+        return tuple(found)
 
     def with_alarms(self, rules: Sequence[StatisticRule], what: str, shown: Sequence[tuple[Part, Array]]) -> Evidence:
         """With the alarms on these parts, of the sizes (K, S) given."""
@@ -181,11 +185,12 @@ class Panel:
     ) -> Panel:
         """That of these rules; `what`: of `Validation.what`."""
         thresholds = evidence.thresholds(rules, evidence.widths.shape[1], what)
-        at = max(i for i, rule in enumerate(rules) if _of_jumps(rule))
+        at = max(i for i, rule in enumerate(rules) if (rule.kind, rule.horizon) == ("energy", 1))  # what jumps show in
         usual, median = evidence.widths / 2.0 * (evidence.factor * thresholds[at])
         return cls(
             evidence.learnt(rules, what), _limit(evidence, len(rules)), int(evidence.counts.sum()), evidence.hours,
-            len(evidence.peaks), what, usual, max(rules[at].window_s, evidence.dt), _mean(median), evidence,
+            len(evidence.peaks), what, usual, max(rules[at].window_s, evidence.dt),
+            float(np.exp(np.log(np.maximum(median, 1e-300)).mean())), evidence,
             tuple(unlike), asked,
         )  # fmt: skip
 
@@ -261,7 +266,12 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     """
     if rate is not None and not (math.isfinite(rate) and rate > 0):
         raise FitError(f"false_alarms is {rate}; give a positive number per hour")
-    parts, rules, dt = _judged(validation)
+    parts = [part for part in validation.parts if part.judged]
+    if not parts:
+        raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
+    dt = float(np.median(np.concatenate([part.dt for part in parts])))
+    lengths = sorted(part.judged for part in parts)
+    rules = rules_for(validation.model, lengths[len(lengths) // 10], dt)
     evidence, shown, unlike = _gathered(rules, parts, fitted, dt)
     found = evidence.with_alarms(rules, validation.what, shown)
     while rate is not None and _limit(found, len(rules)) <= rate and found.factor > _LEAST:
@@ -294,7 +304,7 @@ def _gathered(
 ) -> tuple[Evidence, list[tuple[Part, Array]], list[str]]:
     """Evidence but for alarms; of what was left out the parts within what the others cover with their sizes (K, S);
     names of those that are not."""
-    left, unlike = [], []
+    left, unlike, judged = [], [], [part.judged for part in parts]
     for part in parts:
         far = part.extrapolated == 2
         if (part.extrapolated > 0).mean() > UNLIKE:
@@ -309,47 +319,12 @@ def _gathered(
         every.max(axis=0),
         np.median(every, axis=0),
         len(every),
-        np.array([_widths(parts, name) for name in ("usual_width", "median_width")]),
-        sum(part.judged for part in parts),
+        np.average([(p.usual_width, p.median_width) for p in parts], axis=0, weights=judged),
+        sum(judged),
         sum(part.hours for part, _ in shown),
         dt,
     )
     return found, shown, unlike
-
-
-def figure(seen: Validation) -> float:
-    """`Panel.figure` of `learn(seen, seen.parts)`, where nothing was left out. Raises FitError as that does."""
-    parts, rules, dt = _judged(seen)
-    rule = [rule for rule in rules if _of_jumps(rule)][-1]
-    sizes = [sizes_of([rule], part)[0] for part in parts]
-    every, n, block = np.concatenate(sizes), seen.model.n, seen.what == "block"
-    facts = _peaks(unit_numbers(parts), sizes), every.max(axis=0), np.median(every, axis=0), 2 * len(every)
-    return _mean(_widths(parts, "median_width") / 2.0 * _threshold(rule, n, block, dt, *facts))
-
-
-def _judged(validation: Validation) -> tuple[list[Part], list[StatisticRule], float]:
-    """Parts with a verdict, the rules for such parts, and their typical step, s."""
-    parts = [part for part in validation.parts if part.judged]
-    if not parts:
-        raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
-    dt = float(np.median(np.concatenate([part.dt for part in parts])))
-    lengths = sorted(part.judged for part in parts)
-    return parts, rules_for(validation.model, lengths[len(lengths) // 10], dt), dt
-
-
-def _of_jumps(rule: StatisticRule) -> bool:
-    """Whether jumps are promised by this rule, if it is the last such: the energy over the longest window, one step."""
-    return rule.kind == "energy" and rule.horizon == 1
-
-
-def _widths(parts: Sequence[Part], name: str) -> Array:
-    """The usual, or the median, width (n,) of the bounds on some parts."""
-    weights = [part.judged for part in parts]
-    return np.asarray(np.average([getattr(part, name) for part in parts], axis=0, weights=weights))
-
-
-def _mean(jumps: Array) -> float:
-    return float(np.exp(np.log(np.maximum(jumps, 1e-300)).mean()))
 
 
 def _threshold(
@@ -362,19 +337,12 @@ def _threshold(
         typical = np.exp(np.log(peaks).mean(axis=0))
         found = np.maximum(found, typical * (top / typical).max())
     if len(peaks) >= TELLING and not (blocks and windows < FEW):
-        found = np.maximum(found, _of_next(peaks, ALIKE if blocks else CONFIDENCE))
+        from scipy.special import stdtrit
+
+        logs, count = np.log(peaks), len(peaks)
+        far = stdtrit(count - 1, ALIKE if blocks else CONFIDENCE) * math.sqrt(1.0 + 1.0 / count)
+        found = np.maximum(found, np.exp(logs.mean(axis=0) + far * math.sqrt(logs.var(axis=0, ddof=1).mean())))
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
-
-
-def _of_next(peaks: Array, confidence: float) -> Array:
-    """Limit of the largest size in one more recording, group or block, (n,) or (1,)."""
-    from scipy.special import stdtrit
-
-    logs, count = np.log(peaks), len(peaks)
-    spread = math.sqrt(logs.var(axis=0, ddof=1).mean())
-    return np.asarray(
-        np.exp(logs.mean(axis=0) + stdtrit(count - 1, confidence) * math.sqrt(1.0 + 1.0 / count) * spread)
-    )
 
 
 def _peaks(units: NDArray[np.intp], values: Sequence[Array]) -> Array:
@@ -398,12 +366,6 @@ def _limit(evidence: Evidence, rules: int) -> float:
     return float(rate_interval(counted, evidence.hours, CONFIDENCE, size, one_sided=True)[1])
 
 
-def _with_threshold(rule: StatisticRule, sizes: Array) -> StatisticRule:
-    """The rule with the thresholds of these sizes."""
-    values = tuple((sizes if rule.kind == "mean" else sizes**2).tolist())
-    return replace(rule, threshold=values[0] if rule.kind in JOINT else values)
-
-
 def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     """What the model is worth, in a word (`good`, `some` or `none`), and in one line that begins with it."""
     span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
@@ -415,8 +377,9 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         return "none", "not worth having: nothing that is judged moves in the recordings; record the machine in use"
     if len(still) + len(blind) == model.n:
         least = float(share[share < np.inf].min(initial=np.inf))
+        of_range = f"{least:.0%} of" if least < _FAR else "over ten times"
         return "none", (
-            f"not worth having: the smallest jump that it sees is {_of_range(least)} the recorded range of a state; "
+            f"not worth having: the smallest jump that it sees is {of_range} the recorded range of a state; "
             f"what moves the states may be missing among the controls, or record more"
         )
     if still or blind:
@@ -442,10 +405,6 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"on one that was not fitted; {sees}"
         )
     return "good", f"worth having: {sees}"
-
-
-def _of_range(share: float) -> str:
-    return f"{share:.0%} of" if share < _FAR else "over ten times"
 
 
 def promises(model: UncertainLTI, panel: Panel) -> list[str]:

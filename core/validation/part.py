@@ -21,7 +21,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.text import plural
-from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -139,11 +138,6 @@ class Part:
     def hours(self) -> float:
         """Time under verdict, h."""
         return float(self.dt.sum()) / 3600.0
-
-    @property
-    def severity(self) -> Array:
-        """(K,): the largest |utilisation| of the states; a verdict is violated where it exceeds the margin."""
-        return np.asarray(np.abs(settled(self.utilisation, ~self.outside)).max(axis=1))
 
     @property
     def spans(self) -> list[tuple[int, int]]:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.text import html_table, named, number_text, plural
+from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.terms import ADDITIVE
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -34,7 +35,7 @@ def raised_on(rules: Sequence[Rule], part: Part) -> NDArray[np.bool_]:
     model = part.judged_by
     one_step = containment(rules)
     margin = 1.0 if one_step is None else one_step.margin
-    violated = ~(np.nan_to_num(part.severity) <= margin)
+    violated = ~(np.nan_to_num(np.abs(settled(part.utilisation, ~part.outside)).max(axis=1)) <= margin)
     found = np.zeros(part.judged, dtype=bool)
     for start, stop in part.spans:
         span = slice(start, stop)
@@ -198,6 +199,10 @@ class Validation:
             }
         units = by_unit(parts, violated)
         low, high = rate_interval(units, judged, v.confidence) if judged else (0.0, math.inf)
+        whole = list(share_interval(inside, len(parts), v.confidence))
+        if v.grouping:  # by clusters
+            least, most = rate_interval(by_unit(parts, [n > 0 for n in violated]), len(parts), v.confidence)
+            whole = [max(0.0, 1.0 - most), 1.0 - least]
         groups = {
             "key": v.grouping,
             "count": v.units,
@@ -217,7 +222,7 @@ class Validation:
             "inside_interval": [max(0.0, 1.0 - high), 1.0 - low],
             "parts_inside": inside,
             "parts_inside_share": inside / len(parts),
-            "parts_inside_interval": _whole_interval(v),
+            "parts_inside_interval": whole,
             "groups": groups if v.grouping else None,
             "condition": condition(v),
             "condition_short": f"if the {v.what}s are independent and show all that happens",
@@ -268,16 +273,6 @@ def condition(validation: Validation) -> str:
         f"event that none of them shows; one that comes in less than {unseen:.0%} of the {v.what}s may be in none of "
         f"them"
     )
-
-
-def _whole_interval(validation: Validation) -> list[float]:
-    """For the share of whole parts inside all bounds: exact of independent parts, by clusters of groups."""
-    v, parts = validation, validation.parts
-    left = [p.violated > 0 for p in parts]
-    if not v.grouping:
-        return list(share_interval(len(parts) - sum(left), len(parts), v.confidence))
-    low, high = rate_interval(by_unit(parts, left), len(parts), v.confidence)
-    return [max(0.0, 1.0 - high), 1.0 - low]
 
 
 def _average(parts: Sequence[Part], values: Sequence[Array]) -> Array:
