@@ -22,16 +22,34 @@ import sys
 from pathlib import Path
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, STATE_TOPIC
-from uncertain_lti.plants.turbofan_runs import KINDS, RECORDINGS, make_run
+from uncertain_lti.plants.turbofan_runs import KINDS, LARGE, NOISE, SMALL, make_run
 from uncertain_lti.recordings.bag import Bag
 
 LEIBOV = {
     "leibov_fit": {"steps": 6000, "seed": 1, "fault_at": -1},
     "leibov_check": {"steps": 2400, "seed": 2, "fault_at": 1200},
 }
+TURBOFAN = {
+    "turbofan_pulses_up": {"manoeuvre": "pulses", "amplitude": SMALL},
+    "turbofan_pulses_down": {"manoeuvre": "pulses", "amplitude": -SMALL},
+    "turbofan_pulses_up_large": {"manoeuvre": "pulses", "amplitude": LARGE},
+    "turbofan_pulses_down_large": {"manoeuvre": "pulses", "amplitude": -LARGE},
+    "turbofan_check": {"manoeuvre": "check"},
+    "turbofan_levels": {"manoeuvre": "levels"},
+    "turbofan_pulses_up_large_noise": {"manoeuvre": "pulses", "amplitude": LARGE, "noise": NOISE, "seed": 1},
+    "turbofan_pulses_down_large_noise": {"manoeuvre": "pulses", "amplitude": -LARGE, "noise": NOISE, "seed": 2},
+    "turbofan_levels_noise": {"manoeuvre": "levels", "noise": NOISE, "seed": 3},
+    **{
+        f"turbofan_{kind}": {
+            "manoeuvre": "levels", "noise": NOISE, "seed": 10 + i, "fault": kind, "fault_at": 24.0, "samples": 1401,
+        }
+        for i, kind in enumerate(KINDS)
+    },
+}  # fmt: skip
+"""Name of each recording of the nonlinear engine, and the arguments of `make_run` that it is made with."""
 BAGS = {
     **{name: ("plant", "leibov2006", parameters) for name, parameters in LEIBOV.items()},
-    **{name: ("turbofan", "turbofan", parameters) for name, parameters in RECORDINGS.items()},
+    **{name: ("turbofan", "turbofan", parameters) for name, parameters in TURBOFAN.items()},
 }
 
 

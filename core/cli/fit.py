@@ -27,7 +27,7 @@ from uncertain_lti.cli.command import Command, Result, load_model, model_target,
 from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
 
 if TYPE_CHECKING:
-    from uncertain_lti import Transient, UncertainLTI
+    from uncertain_lti import SignalMap, Transient, UncertainLTI
 
 # --- fit -------------------------------------------------------------------------------------------------------------
 
@@ -53,16 +53,11 @@ def run_fit(options: argparse.Namespace) -> Result:
 
 
 def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
-    from uncertain_lti import fit, read_transients
-    from uncertain_lti.reports.model_text import recording_text
+    from uncertain_lti import fit
     from uncertain_lti.validation.groups import resolve_groups
 
     schedule = _asked(options)
-    transients = read_transients(options.bags, options.signals, options.progress.iterate("reading"), processes=None)
-    for transient in transients:
-        if not options.json:
-            options.progress.note(*transient.notes)
-        options.say(recording_text(transient))
+    transients = _read(options, options.signals)
     resolve_groups(transients, options.group)  # what is wrong with the key is found before the fit
     asked = ("additive", "horizons", "widths", "alarm", "false_alarms", "discard", "count")
     given = {name: getattr(options, name) for name in asked} | {"schedule": schedule, "groups": options.group}
@@ -71,21 +66,27 @@ def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
     return _with_sources(model, _files(transients), options.group)
 
 
-def _updated(options: argparse.Namespace) -> UncertainLTI:
+def _read(options: argparse.Namespace, signals: str | SignalMap) -> list[Transient]:
+    """The recordings that are named, each with a line that says what was read."""
     from uncertain_lti import read_transients
     from uncertain_lti.reports.model_text import recording_text
 
+    transients = read_transients(options.bags, signals, options.progress.iterate("reading"), processes=None)
+    for transient in transients:
+        if not options.json:
+            options.progress.note(*transient.notes)
+        options.say(recording_text(transient))
+    return transients
+
+
+def _updated(options: argparse.Namespace) -> UncertainLTI:
     known = {"bags", "update", "output", "force", "json"}
     for name in (option if isinstance(option, str) else option[0] for option in FIT.options):
         word = name.removeprefix("--").replace("-", "_")
         if word not in known and getattr(options, word) not in (None, OPTIONS[name].get("default")):
             raise FitError(f"{name} is given, and an update keeps what the model was fitted with; leave it out")
     model = load_model(options.update)
-    transients = read_transients(options.bags, model.signals, options.progress.iterate("reading"), processes=None)
-    for transient in transients:
-        if not options.json:
-            options.progress.note(*transient.notes)
-        options.say(recording_text(transient))
+    transients = _read(options, model.signals)
     with options.progress.stage("fitting") as step:
         updated = model.update(transients, step)
     there = model.fit_summary["sources"]

@@ -420,21 +420,3 @@ def make_run(
 SMALL, LARGE = 0.05, 0.30
 """Amplitudes: of the paper's transient (it gives none; this is chosen), and larger than the check's excursion."""
 NOISE = 1e-4
-RECORDINGS: dict[str, dict[str, str | float | int]] = {
-    "turbofan_pulses_up": {"manoeuvre": "pulses", "amplitude": SMALL},
-    "turbofan_pulses_down": {"manoeuvre": "pulses", "amplitude": -SMALL},
-    "turbofan_pulses_up_large": {"manoeuvre": "pulses", "amplitude": LARGE},
-    "turbofan_pulses_down_large": {"manoeuvre": "pulses", "amplitude": -LARGE},
-    "turbofan_check": {"manoeuvre": "check"},
-    "turbofan_levels": {"manoeuvre": "levels"},
-    "turbofan_pulses_up_large_noise": {"manoeuvre": "pulses", "amplitude": LARGE, "noise": NOISE, "seed": 1},
-    "turbofan_pulses_down_large_noise": {"manoeuvre": "pulses", "amplitude": -LARGE, "noise": NOISE, "seed": 2},
-    "turbofan_levels_noise": {"manoeuvre": "levels", "noise": NOISE, "seed": 3},
-    **{
-        f"turbofan_{kind}": {
-            "manoeuvre": "levels", "noise": NOISE, "seed": 10 + i, "fault": kind, "fault_at": 24.0, "samples": 1401,
-        }
-        for i, kind in enumerate(KINDS)
-    },
-}  # fmt: skip
-"""Name of each shipped recording, and the arguments of `make_run` that it was made with."""
