@@ -221,7 +221,7 @@ def test_what_may_be_destroyed_has_no_handlers_in_the_executor(world: World) -> 
     node = Node("listener", context=world.node.context)
     before = set(node.waitables)
     try:
-        subscription = MatchedSubscription(node, STATE, "sensor_msgs/msg/JointState", JointState, lambda *_: None)
+        subscription = MatchedSubscription(node, STATE, "sensor_msgs/msg/JointState", lambda *_: None)
         assert set(node.waitables) == before
         publisher = world.publisher(JointState, STATE, 10)
         until(lambda: subscription.poll() or subscription.look_soon, "the poll to see the publisher come")

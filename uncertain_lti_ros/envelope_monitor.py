@@ -36,7 +36,7 @@ from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
-from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, input_values, message_class
+from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, input_values
 
 NAME = "envelope_monitor"
 _SUMMARY = (
@@ -317,8 +317,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         for topic, type_name in types.items():
             if topic not in self.inputs:
                 self.inputs[topic] = MatchedSubscription(
-                    self, self._there(topic), type_name, message_class(type_name), partial(self.intake.message, topic),
-                    self.settings.requested_qos(), raw=True,
+                    self, self._there(topic), type_name, partial(self.intake.message, topic),
+                    self.settings.requested_qos(),
                 )  # fmt: skip
 
     def _there(self, topic: str) -> str:

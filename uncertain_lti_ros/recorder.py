@@ -30,7 +30,7 @@ from rclpy.qos import QoSProfile
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.command import Result
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
-from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition, message_class
+from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
@@ -116,10 +116,9 @@ def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable
 
 def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSubscription:
     clock = node.get_clock()
-    kind = message_class(type_name)
     channel = file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
     return MatchedSubscription(
-        node, topic, type_name, kind, lambda data, _: file.write(channel, clock.now().nanoseconds, data), raw=True
+        node, topic, type_name, lambda data, _: file.write(channel, clock.now().nanoseconds, data)
     )
 
 

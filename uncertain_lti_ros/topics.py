@@ -258,10 +258,9 @@ class MatchedSubscription:
     """Subscription to one topic whose QoS `look` compares with the graph.
 
     `node`: the node; `topic`: as in the model or on the command line; expanded and remapped by the node; `type_name`:
-    `pkg/msg/Type`; `message_class`: class of the type; `callback`: takes the message, or its bytes when raw, and
-    when it was published, ns by its publisher; `requested`: what the user requests; `raw`: whether the callback takes
-    bytes; `received, lost, late`: messages received, those lost on the way or in the queue, and deadlines missed by
-    publishers; `publishers`: publishers of this type that the graph knows; `qos`: what
+    `pkg/msg/Type`; `callback`: takes the bytes of a message, and when it was published, ns by its publisher;
+    `requested`: what the user requests; `received, lost, late`: messages received, those lost on the way or in the
+    queue, and deadlines missed by publishers; `publishers`: publishers of this type that the graph knows; `qos`: what
     is asked of them now; `problems`: publishers that cannot be heard and why, one sentence each.
 
     The middleware reports what its writer gives up, and not what full queues of this reader push out; the numbers that
@@ -273,13 +272,11 @@ class MatchedSubscription:
         node: Node,
         topic: str,
         type_name: str,
-        message_class: Any,
         callback: Callable[[Any, int], None],
         requested: RequestedQos = RequestedQos(),
-        raw: bool = False,
     ) -> None:
         self._node, self._asked_topic, self.type_name = node, topic, full_name(type_name)
-        self._class, self._callback, self._requested, self._raw = message_class, callback, requested, raw
+        self._class, self._callback, self._requested = message_class(type_name), callback, requested
         self.topic: str = node.resolve_topic_name(topic)
         self.received = self.late = self.publishers = 0
         self._reported_lost = self._skipped = 0  # as the middleware has it, and by the numbers of the messages
@@ -352,7 +349,7 @@ class MatchedSubscription:
         )
         self._number = None
         self._subscription = subscription = self._node.create_subscription(
-            self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=self._raw
+            self._class, self._asked_topic, self._take, qos, event_callbacks=events, raw=True
         )
         handle, subscription.__class__ = subscription.handle, _Plain
         vars(subscription).update(handle=handle, callback=self._take, _callback_type=_WITH_INFO)

@@ -105,9 +105,9 @@ def no_recording(folder: Path, inside: list[Path]) -> BagError:
     return BagError(f"{folder}: there is no {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file in it; check the path")
 
 
-def file_names(paths: list[Path], limit: int = 12) -> str:
+def file_names(paths: list[Path]) -> str:
     """Names of files in one sentence."""
-    return shortlist([path.name for path in paths], limit)
+    return shortlist([path.name for path in paths], 12)
 
 
 _START = "import sys; sys.path[:] = sys.argv[4:]; from uncertain_lti.recordings.unreadable import _main; _main()"

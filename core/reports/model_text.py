@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -237,7 +237,6 @@ COLUMNS: Mapping[str, tuple[tuple[str, str], ...]] = {
 }  # fmt: skip
 """Kinds of faults that share a table, and heads of their columns."""
 _SHARES = ("scale", "loss", "time_constant", "gain")
-_UNREADABLE = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
 def validation_text(data: Mapping[str, Any]) -> str:
@@ -246,12 +245,18 @@ def validation_text(data: Mapping[str, Any]) -> str:
 
 
 def readable_validation(data: Mapping[str, Any]) -> Mapping[str, Any] | None:
-    """A model's section on validation where it says what `validate` writes; anything may be written in a file."""
+    """A model's section on validation where it says what `validate` writes."""
+    return _readable(data, validation_blocks)
+
+
+def _readable(data: Any, *showing: Callable[[Any], object]) -> Mapping[str, Any] | None:
+    """A part of a model file if all of these can show it; anything may be written in a file."""
     try:
-        validation_blocks(data)
-    except _UNREADABLE:
+        for show in showing:
+            show(data)
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError):
         return None
-    return data
+    return data  # type: ignore[no-any-return]
 
 
 def validation_blocks(data: Mapping[str, Any]) -> list[Block]:
@@ -344,13 +349,7 @@ def _how_many(data: Mapping[str, Any]) -> str:
 
 def detectable_data(validation: Mapping[str, Any]) -> Mapping[str, Any] | None:
     """The section on detectable faults of a model's validation, if it is one."""
-    try:
-        data: Mapping[str, Any] = validation["detectable"]
-        detectable_blocks(data)
-        detectable_words(data)
-    except _UNREADABLE:
-        return None
-    return data
+    return _readable(validation.get("detectable"), detectable_blocks, detectable_words)
 
 
 def condition_text(data: Mapping[str, Any]) -> str:
