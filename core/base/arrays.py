@@ -7,11 +7,16 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Arrays of numbers: their types, what becomes one of real numbers, and the largest numbers that a file may state."""
+"""Arrays of numbers: their types, the largest numbers that a file may state, and work on them on all cores."""
 
 from __future__ import annotations
 
-from typing import Any
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from functools import cache
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,3 +42,43 @@ LONGEST_S = 9e9
 """s; 2^63 ns are 9.2e9 s."""
 LARGEST = 1e50
 """Magnitude of a number in recorded units or in 1/s, and of a scale or its inverse: squares of ratios stay finite."""
+
+T = TypeVar("T")
+WORTH_THREADS = 20_000
+"""Transitions, or verdicts, from about which on what is done with all of them takes longer than to begin a thread."""
+
+
+def core_count() -> int:
+    """How many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def on_cores(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]], worth_threads: bool = True) -> list[T]:
+    """function(*arguments) for each, in their order, by threads where what each does takes longer than to begin one."""
+    if not worth_threads:
+        return [function(*some) for some in arguments]
+    return list(one_by_one(function, arguments))
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """BLAS keeps to the thread that calls it: on small arrays, from several threads, its own only wait for another."""
+    with _libraries().limit(limits=1, user_api="blas"):
+        yield
+
+
+@cache
+def _libraries() -> Any:
+    import scipy.linalg  # noqa: F401  # brings a BLAS of its own
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+def one_by_one(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterator[T]:
+    """As `on_cores`, each as soon as it and those before it are done; an error ends what has not begun."""
+    if len(arguments) < 2 or core_count() < 2:
+        yield from (function(*some) for some in arguments)
+        return
+    with ThreadPoolExecutor(min(core_count(), len(arguments))) as pool:
+        yield from pool.map(lambda some: function(*some), arguments)

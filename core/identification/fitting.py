@@ -21,8 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import LARGEST, Array
-from uncertain_lti.base.cores import WORTH_THREADS, on_cores, one_thread_each
+from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, on_cores, one_thread_each
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.assembly import assemble, median_step

@@ -18,8 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import core_count
+from uncertain_lti.base.arrays import Array, core_count
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.columns import Columns

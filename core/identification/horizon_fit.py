@@ -21,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import LARGEST, Array
-from uncertain_lti.base.cores import one_thread_each
+from uncertain_lti.base.arrays import LARGEST, Array, one_thread_each
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.columns import Columns, Regimes

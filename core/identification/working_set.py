@@ -19,8 +19,7 @@ from time import perf_counter
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import on_cores, one_by_one
+from uncertain_lti.base.arrays import Array, on_cores, one_by_one
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.base.text import plural

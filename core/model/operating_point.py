@@ -18,8 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.cores import on_cores
+from uncertain_lti.base.arrays import Array, on_cores, real
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.kernel.arithmetic import normalised_columns
 from uncertain_lti.signals.signal_map import Signal

@@ -24,8 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import WORTH_THREADS, on_cores
+from uncertain_lti.base.arrays import WORTH_THREADS, Array, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, labels

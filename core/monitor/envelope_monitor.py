@@ -21,8 +21,7 @@ import cython
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.cores import on_cores
+from uncertain_lti.base.arrays import Array, on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import (

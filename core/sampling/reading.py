@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.cores import core_count
+from uncertain_lti.base.arrays import core_count
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
