@@ -241,23 +241,18 @@ def _walk(found: Foreign, reader: Any) -> str:
     most = min(max(_BLOCK, found.size >> 4), _LARGEST_BLOCK)
     rows: list[tuple[int, int]] = []  # channel and time
     size, trouble = 0, ""
-    messages = iter(reader.messages(reader.connections)) if reader.connections else iter(())
-    while True:
-        try:
-            connection, time, data = next(messages)
-        except StopIteration:
-            break
-        except Exception as error:  # a library raises whatever the bytes lead it to
-            trouble = one_line(error)
-            rows = [row for row in rows if row[1] != rows[-1][1]]  # the next one may be of that time
-            break
-        if not _usable(time, data):
-            continue
-        if size > most and time > rows[-1][1]:
-            _close(found, rows, size)
-            rows, size = [], 0
-        rows.append((found.numbers[connection.id], time))
-        size += len(data)
+    try:
+        for connection, time, data in reader.messages(reader.connections) if reader.connections else ():
+            if not _usable(time, data):
+                continue
+            if size > most and time > rows[-1][1]:
+                _close(found, rows, size)
+                rows, size = [], 0
+            rows.append((found.numbers[connection.id], time))
+            size += len(data)
+    except Exception as error:  # a library raises whatever the bytes lead it to
+        trouble = one_line(error)
+        rows = [row for row in rows if row[1] != rows[-1][1]]  # the next one may be of that time
     if rows:
         _close(found, rows, size)
     return trouble
