@@ -52,7 +52,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION, VerdictMessages
+from uncertain_lti.monitor.outputs import OUTPUTS, RECORDED, VIOLATION, VerdictMessages, names_of
 
 STATE, CONTROL = "/bench/state", "/bench/control"
 TYPE = "sensor_msgs/msg/JointState"
@@ -305,7 +305,7 @@ def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any
     verdicts = EnvelopeMonitor(model).check(transient)
     vectors = [output for output in RECORDED if output.position]
     channels = {output.name: i for i, output in enumerate(vectors)}
-    records = VerdictRecords(model.state_names, channels, model.steps, verdicts.statistic_names)
+    records = VerdictRecords(names_of(model.state_names, model.steps, verdicts.statistic_names), channels)
     sums: list[array[int]] = [array("L") for _ in vectors]
     names = {name for output in vectors for name in (output.position, output.velocity) if name}
     for begin in range(0, len(stamps), 5000):
@@ -384,7 +384,7 @@ class Child:
 
 
 TOPICS = [output.name for output in OUTPUTS]
-PUBLISHED = [VIOLATION.name, *VerdictMessages(["x0"]).outputs]  # for each sample, of a model without horizons
+PUBLISHED = [VIOLATION.name, *VerdictMessages(names_of(["x0"])).outputs]  # for each sample, of a model without horizons
 SUBJECTS = {
     "bare, default executor": ("take", "default", []),
     "bare, events executor": ("take", "events", []),

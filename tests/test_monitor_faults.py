@@ -31,7 +31,7 @@ from uncertain_lti import UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.monitor.intake import Sender
-from uncertain_lti.monitor.outputs import TRUE
+from uncertain_lti.monitor.outputs import TRUE, names_of
 from uncertain_lti.monitor.verdict import Verdict
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
@@ -599,8 +599,8 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
     def scene(size: int) -> Scene:
         entries = [Entry(0.0, k, "/t", rng.bytes(size // 10), (), False) for k in range(10)]
         return Scene(
-            entries, ["a"], {"/t": "std_msgs/msg/UInt8"}, {"flags": "/n/flags", "violation": "/n/violation"}, {},
-            definition,
+            entries, names_of(["a"]), {"/t": "std_msgs/msg/UInt8"},
+            {"flags": "/n/flags", "violation": "/n/violation"}, {}, definition,
         )  # fmt: skip
 
     limit = 100_000

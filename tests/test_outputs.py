@@ -87,9 +87,10 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     verdicts = [monitor.judge(step) for step in steps]
     assert [v.judged for v in verdicts] == [True, True, False] and verdicts[1].outside_domain
     statistics = statistics_of(model)
-    messages = VerdictMessages(names, steps=model.steps, statistics=statistics)
+    every = names_of(names, model.steps, statistics)
+    messages = VerdictMessages(every)
     encode = {name: messages.encoder([name]) for name in messages.outputs}
-    outputs = [o for o in RECORDED if not o.position or names_of(names, model.steps, statistics)[o.of]]
+    outputs = [o for o in RECORDED if not o.position or every[o.of]]
     outputs.remove(REASON)
     assert ("horizon_utilisation" in encode) == bool(model.horizons)
     assert ("statistics" in encode) == bool(statistics) == (len(outputs) == len(RECORDED) - 1)
@@ -99,7 +100,7 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
             own = verdict.packed_statistics() if name == "statistics" else verdict.packed()[place(name, model.n)]
             assert own == np.array(verdict.numbers(name)).tobytes()
     numbers |= {o.velocity: np.array([getattr(v, o.velocity) for v in verdicts]) for o in RECORDED if o.velocity}
-    records = VerdictRecords(names, {output.name: i for i, output in enumerate(outputs)}, model.steps, statistics)
+    records = VerdictRecords(every, {output.name: i for i, output in enumerate(outputs)})
     times = np.arange(3)
     data, _ = records.encode(
         times,

@@ -17,7 +17,7 @@ import time
 from rclpy.node import Node
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.outputs import RECORDED
+from uncertain_lti.monitor.outputs import RECORDED, names_of
 from uncertain_lti.monitor.session import Session
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.parameters import Settings
@@ -109,8 +109,8 @@ class Snapshots:
             "alarm": f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}",
         }
         topics = {output.name: node.resolve_topic_name(f"~/{output.name}") for output in RECORDED}
-        of = self.recent.entries(), model.state_names, session.types, topics, about, definition
-        return Scene(*of, model.steps, monitor.alarms.names, session.reasons.fresh())
+        names = names_of(model.state_names, model.steps, monitor.alarms.names)
+        return Scene(self.recent.entries(), names, session.types, topics, about, definition, session.reasons.fresh())
 
     @property
     def last(self) -> str:

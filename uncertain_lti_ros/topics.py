@@ -40,7 +40,7 @@ from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.monitor.catch_up import MOST
 from uncertain_lti.monitor.intake import Sender
-from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION, NamedVector, VerdictMessages
+from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION, NamedVector, VerdictMessages, names_of
 from uncertain_lti.monitor.session import Report, Session
 from uncertain_lti.signals.field_path import FieldType, full_name
 
@@ -447,7 +447,8 @@ class Outputs:
     def prepare(self, session: Session) -> None:
         """Lay out the messages of a model and its alarm."""
         model = session.model
-        self.sender.prepare(VerdictMessages(model.state_names, sendable, model.steps, session.monitor.alarms.names))
+        names = names_of(model.state_names, model.steps, session.monitor.alarms.names)
+        self.sender.prepare(VerdictMessages(names, sendable))
 
     def poll(self) -> None:
         """Update the numbers of listeners."""

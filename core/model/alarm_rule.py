@@ -39,6 +39,7 @@ _WORDS = {
 }
 KINDS = tuple(_WORDS)
 """Kinds of `StatisticRule`."""
+_ONE_OF = f"one of {', '.join((CONTAINMENT, *KINDS))}"
 JOINT = ("chi2", "mewma")
 """Kinds that look at the utilisation of all states together; the others look at that of each state."""
 FADING = ("ewma", "cusum", "mewma")
@@ -66,10 +67,7 @@ class AlarmRule:
                 f"1 <= violations <= window <= {LONGEST_WINDOW}"
             )
         if not (_number(self.margin) and 1 / LARGEST <= self.margin <= LARGEST):
-            raise ModelError(
-                f"alarm: margin is {reprlib.repr(self.margin)}; it must be a positive number, {1 / LARGEST:g} to "
-                f"{LARGEST:g}"
-            )
+            raise _wrong("margin", self.margin, f"a positive number, {1 / LARGEST:g} to {LARGEST:g}")
         object.__setattr__(self, "margin", float(self.margin))
         _check_horizon(self.horizon)
 
@@ -127,23 +125,15 @@ class StatisticRule:
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
-            raise ModelError(
-                f"alarm: kind is {reprlib.repr(self.kind)}; it must be one of {', '.join((CONTAINMENT, *KINDS))}"
-            )
-        if not (
-            _number(self.window_s) and 0.0 <= self.window_s <= LONGEST_S and (self.window_s or self.kind != "cusum")
-        ):
-            least = "a positive number of seconds" if self.kind == "cusum" else "a number of seconds, 0 for one verdict"
-            raise ModelError(
-                f"alarm: window_s of {self.kind} is {reprlib.repr(self.window_s)}; it must be {least}, at most "
-                f"{LONGEST_S:g}"
-            )
+            raise _wrong("kind", self.kind, _ONE_OF)
+        sums = self.kind == "cusum"
+        if not (_number(self.window_s) and 0.0 <= self.window_s <= LONGEST_S and (self.window_s or not sums)):
+            least = "a positive number of seconds" if sums else "a number of seconds, 0 for one verdict"
+            raise _wrong(f"window_s of {self.kind}", self.window_s, f"{least}, at most {LONGEST_S:g}")
         each = self.threshold if isinstance(self.threshold, (list, tuple)) else (self.threshold,)
         if not each or not all(_number(t) and 1 / LARGEST <= t <= LARGEST for t in each):
-            raise ModelError(
-                f"alarm: threshold of {self.kind} is {reprlib.repr(self.threshold)}; it must be a positive number, or "
-                f"one for each state, {1 / LARGEST:g} to {LARGEST:g}"
-            )
+            must = f"a positive number, or one for each state, {1 / LARGEST:g} to {LARGEST:g}"
+            raise _wrong(f"threshold of {self.kind}", self.threshold, must)
         if isinstance(self.threshold, (list, tuple)):
             if self.kind in JOINT:
                 raise ModelError(
@@ -152,10 +142,8 @@ class StatisticRule:
             object.__setattr__(self, "threshold", tuple(map(float, self.threshold)))
         _check_horizon(self.horizon)
         if not (_number(self.allowance) and 0.0 <= self.allowance <= LARGEST):
-            raise ModelError(
-                f"alarm: allowance is {reprlib.repr(self.allowance)}; it must be a number, 0 to {LARGEST:g}"
-            )
-        if self.allowance and self.kind != "cusum":
+            raise _wrong("allowance", self.allowance, f"a number, 0 to {LARGEST:g}")
+        if self.allowance and not sums:
             raise ModelError(f"alarm: allowance goes with cusum; leave it out of {self.kind}")
 
     def thresholds(self, n: int) -> tuple[float, ...]:
@@ -232,9 +220,7 @@ def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
     data = object_of(data, name)
     kind = data.get("kind")
     if kind not in (CONTAINMENT, *KINDS):
-        raise ModelError(
-            f"field '{name}.kind' is {reprlib.repr(kind)}; it must be one of {', '.join((CONTAINMENT, *KINDS))}"
-        )
+        raise ModelError(f"field '{name}.kind' is {reprlib.repr(kind)}; it must be {_ONE_OF}")
     needed = ("violations", "window", "margin") if kind == CONTAINMENT else ("window_s", "threshold")
     known = {"kind", "horizon", *needed} | ({"allowance"} if kind == "cusum" else set())
     object_of(data, name, known, needed, remedy=f"{kind} needs {' and '.join(needed)}")
@@ -258,6 +244,8 @@ def _number(value: Any) -> bool:
 
 def _check_horizon(horizon: Any) -> None:
     if not (_whole(horizon) and 1 <= horizon <= MOST_STEPS):
-        raise ModelError(
-            f"alarm: horizon is {reprlib.repr(horizon)}; it must be a whole number of steps, 1 to {MOST_STEPS}"
-        )
+        raise _wrong("horizon", horizon, f"a whole number of steps, 1 to {MOST_STEPS}")
+
+
+def _wrong(name: str, value: Any, must: str) -> ModelError:
+    return ModelError(f"alarm: {name} is {reprlib.repr(value)}; it must be {must}")

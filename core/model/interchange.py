@@ -14,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -354,12 +354,9 @@ def _named(data: dict[str, Any], n: int, m: int, blocks: int | None) -> dict[str
     whole |= {"states": _signals(data, "state", "x", n), "controls": _signals(data, "control", "u", m)}
     if blocks is None:
         return whole
-    columns = []
-    for name, unknown in (("transitions", math.nan), ("tied_to", 0.0)):
-        values = np.asarray(data[name], dtype=np.float64).ravel() if name in data else np.full(blocks, unknown)
-        if len(values) != blocks:
-            raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(blocks, 'block')}")
-        columns.append(values.tolist())
+    columns = [
+        _column(data, *of, "block") for of in (("transitions", [math.nan] * blocks), ("tied_to", [0.0] * blocks))
+    ]
     facts = [
         {"transitions": None if math.isnan(count) else int(count), "tied_to": int(tied) - 1 if tied else None}
         for count, tied in zip(*columns, strict=True)
@@ -399,22 +396,26 @@ def _texts(value: Any) -> list[str]:
 
 
 def _signals(data: dict[str, Any], kind: str, letter: str, count: int) -> list[dict[str, Any]]:
-    columns = []
-    for name, usual in (
-        (f"{kind}_names", [f"{letter}{i + 1}" for i in range(count)]),
-        (f"{kind}_units", [""] * count),
-        (f"{letter}_steady", [0.0] * count),
-        (f"{letter}_scale", [1.0] * count),
-    ):
-        values: list[Any] = usual
-        if name in data:
-            values = _texts(data[name]) if name.startswith(kind) else _real(data[name], name).ravel().tolist()
-        if len(values) != count:
-            raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(count, kind)}")
-        columns.append(values)
-    keys = ("name", "unit", "steady", "scale")
-    rows = zip(*columns, strict=True)
-    return [{"topic": "", "field": letter} | dict(zip(keys, row, strict=True)) for row in rows]
+    columns = {
+        "name": _column(data, f"{kind}_names", [f"{letter}{i + 1}" for i in range(count)], kind, _texts),
+        "unit": _column(data, f"{kind}_units", [""] * count, kind, _texts),
+        "steady": _column(data, f"{letter}_steady", [0.0] * count, kind),
+        "scale": _column(data, f"{letter}_scale", [1.0] * count, kind),
+    }
+    rows = zip(*columns.values(), strict=True)
+    return [{"topic": "", "field": letter} | dict(zip(columns, row, strict=True)) for row in rows]
+
+
+def _column(
+    data: dict[str, Any], name: str, usual: list[Any], what: str, read: Callable[[Any], list[Any]] | None = None
+) -> list[Any]:
+    """A variable as a list of numbers, or as `read` has it, as long as what is usual, which it is by default."""
+    if name not in data:
+        return usual
+    values = _real(data[name], name).ravel().tolist() if read is None else read(data[name])
+    if len(values) != len(usual):
+        raise ModelError(f"'{name}' has {plural(len(values), 'entry')} for {plural(len(usual), what)}")
+    return values
 
 
 def overview(model: Any) -> str:

@@ -293,27 +293,24 @@ class Encoder:
 class VerdictMessages:
     """Messages of the verdicts of one model, for the vectors of `OUTPUTS`.
 
-    `names`: of the states; `make_vector`: makes the messages from names and `velocities`; raises ModelError. Default
-    `NamedVector`; `steps`: of the model's horizons; `statistics`: names of the statistics of the alarm; `outputs`: each
-    vector of `OUTPUTS` that model and alarm have, by name, in their order.
+    `names`: of the model and its alarm, by `names_of`; `make_vector`: makes the messages from names and `velocities`;
+    raises ModelError. Default `NamedVector`; `outputs`: each vector of `OUTPUTS` that model and alarm have, by name, in
+    their order.
     """
 
     def __init__(
         self,
-        names: Sequence[str],
+        names: Mapping[str, Sequence[str]],
         make_vector: Callable[[Sequence[str], bool], NamedVector] | None = None,
-        steps: Sequence[int] = (),
-        statistics: Sequence[str] = (),
     ) -> None:
-        every, self._n = names_of(names, steps, statistics), len(names)
-        foresees = bool(steps)
+        self._n, foresees = len(names["states"]), bool(names["horizons"])
         self.outputs = {
             output.name: output
             for output in OUTPUTS
-            if output.position and every[output.of] and (foresees or output.when != "predicted over")
+            if output.position and names[output.of] and (foresees or output.when != "predicted over")
         }
         kinds = {(output.of, bool(output.velocity)) for output in self.outputs.values()}
-        self._vectors = {(of, marked): (make_vector or NamedVector)(every[of], marked) for of, marked in sorted(kinds)}
+        self._vectors = {(of, marked): (make_vector or NamedVector)(names[of], marked) for of, marked in sorted(kinds)}
 
     def encoder(self, names: Sequence[str]) -> Encoder:
         """What makes the messages of some outputs."""
@@ -338,23 +335,17 @@ def _numbers(body: bytearray, count: int) -> int:
 class VerdictRecords:
     """MCAP message records of many verdicts at once, with the bytes that `VerdictMessages` gives one by one.
 
-    `names`: of the states; `channels`: number of the channel of each of `RECORDED` that is to be there, by name;
-    `steps`: of the model's horizons; `statistics`: names of the statistics of the alarm.
+    `names`: of the model and its alarm, by `names_of`; `channels`: number of the channel of each of `RECORDED` that is
+    to be there, by name.
     """
 
-    def __init__(
-        self,
-        names: Sequence[str],
-        channels: Mapping[str, int],
-        steps: Sequence[int] = (),
-        statistics: Sequence[str] = (),
-    ) -> None:
-        self._n, every = len(names), names_of(names, steps, statistics)
+    def __init__(self, names: Mapping[str, Sequence[str]], channels: Mapping[str, int]) -> None:
+        self._n = len(names["states"])
         chosen = [o for o in RECORDED if o.name in channels and o.when != "changed"]
-        self._outputs = [o for o in chosen if not o.position or every[o.of]]
+        self._outputs = [o for o in chosen if not o.position or names[o.of]]
         self._channels = [channels[output.name] for output in self._outputs]
         self._count = [0] * len(self._outputs)
-        self._vectors = {o.name: NamedVector(every[o.of], bool(o.velocity)) for o in self._outputs if o.position}
+        self._vectors = {o.name: NamedVector(names[o.of], bool(o.velocity)) for o in self._outputs if o.position}
         row = bytearray()
         self._begins: list[int] = []
         self._unjudged = 0  # bytes of the records without a verdict, which come first

@@ -87,27 +87,26 @@ class Recent:
 class Scene:
     """What a snapshot file holds.
 
-    `entries`: messages in order of arrival; `names`: of the states; `inputs`: topic -> type of what came in; `outputs`:
-    name of an output (flags, violation, lower, ...) -> its topic; `notes`: pairs for a metadata record; `definition`:
-    type name -> text of its definition; `steps`: of the horizons of the model; `statistics`: names of the statistics of
-    the alarm; `reasons`: without any sample; default none are written.
+    `entries`: messages in order of arrival; `names`: of the model and its alarm, by `names_of`; `inputs`: topic -> type
+    of what came in; `outputs`: name of an output (flags, violation, lower, ...) -> its topic; `notes`: pairs for a
+    metadata record; `definition`: type name -> text of its definition; `reasons`: without any sample; default none are
+    written.
     """
 
     entries: Sequence[Entry]
-    names: Sequence[str]
+    names: Mapping[str, Sequence[str]]
     inputs: Mapping[str, str]
     outputs: Mapping[str, str]
     notes: Mapping[str, str]
     definition: Callable[[str], str]
-    steps: Sequence[int] = ()
-    statistics: Sequence[str] = ()
     reasons: Reasons | None = None
 
     def write(self, path: Path) -> int:
         """Write an MCAP file."""
         count = 0
-        messages = VerdictMessages(self.names, steps=self.steps, statistics=self.statistics)
+        messages = VerdictMessages(self.names)
         encode = {name: messages.encoder([name]) for name in messages.outputs}
+        has = len(self.names["states"]), len(self.names["horizons"]), tuple(self.names["statistics"])
         with open(path, "xb") as stream:
             writer = McapWriter(stream, "uncertain-lti")
             writer.metadata("uncertain_lti", self.notes)
@@ -130,8 +129,8 @@ class Scene:
                 writer.message(inputs[entry.topic], log_time, entry.data)
                 count += 1
                 for verdict in entry.verdicts:
-                    has = verdict.n, verdict.horizons, verdict.statistic_names
-                    if has != (len(self.names), len(self.steps), tuple(self.statistics)):
+                    horizons = verdict.n * (1 + verdict.horizons) if verdict.horizons else 0
+                    if (verdict.n, horizons, verdict.statistic_names) != has:
                         continue
                     for output, channel in outputs.items():
                         if output.when == "judged" and not verdict.judged:

@@ -177,7 +177,7 @@ def _write_verdicts(
     writer: McapWriter, channels: dict[str, int], model: UncertainLTI, verdicts: Verdicts, decisions: Decisions
 ) -> None:
     """The verdicts on the clock messages, in the order of their decisions, and the reasons where they change."""
-    records = VerdictRecords(model.state_names, channels, model.steps, verdicts.statistic_names)
+    records = VerdictRecords(names_of(model.state_names, model.steps, verdicts.statistic_names), channels)
     names = {name for output in RECORDED for name in (output.position, output.velocity) if name}
     kept, log_time = ~decisions.dropped, np.maximum.accumulate(decisions.arrival)
     row = np.cumsum(kept) - 1  # in the verdicts; of a dropped message the one before

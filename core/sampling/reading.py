@@ -285,36 +285,6 @@ def read_as_fitted_with_decisions(
     recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
 ) -> tuple[Transient, Decisions]:
     """`read_as_fitted`, and which message decided each clock message."""
-    return sample(_stream_for_model(recording, signals, progress), signals)
-
-
-def read_field(
-    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, field: FieldPath
-) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """A field of any topic, and after which samples of the same recording its values came.
-
-    Returns (K,): samples that were decided before each message came; Returns (K,): the values; NaN where a message has
-    no such number.
-    """
-    if topic not in recording.topics:
-        raise BagError(no_topic(recording, topic))
-    field.check(topic, recording.topics[topic].type, recording.type_fields(topic))
-    clock = signals.clock or ""
-    topics, paths = [topic], [[field]]
-    if clock != topic:
-        topics.append(clock)
-        paths.append([FieldPath(signals.signals[signals.on(clock)[0]].field)])
-    columns = recording.columns(topics, paths)
-    _refuse_absent(recording, topic, field, columns.values[0][:, 0])
-    of_field = columns.topic == 0
-    is_clock = of_field if clock == topic else ~of_field
-    came = np.cumsum(is_clock)[of_field] - (clock == topic)  # clock messages before it; it goes with its own
-    return np.searchsorted(decisions.by[~decisions.dropped], came), columns.values[0][:, 0]
-
-
-def _stream_for_model(
-    recording: Recording | str | os.PathLike[str], signals: SignalMap, progress: Progress | None = None
-) -> Stream:
     if any(not s.topic for s in signals.signals):
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
@@ -343,7 +313,31 @@ def _stream_for_model(
             f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; fit it to such "
             f"recordings, with time: log for that topic"
         )
-    return stream
+    return sample(stream, signals)
+
+
+def read_field(
+    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, field: FieldPath
+) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """A field of any topic, and after which samples of the same recording its values came.
+
+    Returns (K,): samples that were decided before each message came; Returns (K,): the values; NaN where a message has
+    no such number.
+    """
+    if topic not in recording.topics:
+        raise BagError(no_topic(recording, topic))
+    field.check(topic, recording.topics[topic].type, recording.type_fields(topic))
+    clock = signals.clock or ""
+    topics, paths = [topic], [[field]]
+    if clock != topic:
+        topics.append(clock)
+        paths.append([FieldPath(signals.signals[signals.on(clock)[0]].field)])
+    columns = recording.columns(topics, paths)
+    _refuse_absent(recording, topic, field, columns.values[0][:, 0])
+    of_field = columns.topic == 0
+    is_clock = of_field if clock == topic else ~of_field
+    came = np.cumsum(is_clock)[of_field] - (clock == topic)  # clock messages before it; it goes with its own
+    return np.searchsorted(decisions.by[~decisions.dropped], came), columns.values[0][:, 0]
 
 
 def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.PathLike[str]]) -> SignalMap:

@@ -59,7 +59,9 @@ def group_names(transients: Sequence[Transient], key: str) -> list[str]:
     """
     kind, _, value = key.partition("=")
     if kind == "folder" and not value:
-        return _folders(transients)
+        folders = [_folder(t) for t in transients]
+        common = os.path.commonpath(folders) if folders else ""
+        return [os.path.relpath(f, common) if f != common else os.path.basename(f) or f for f in folders]
     if kind == "hours" and value:
         with suppress(ValueError):
             if 0 < float(value) < math.inf:
@@ -94,12 +96,6 @@ def resolve_groups(transients: Sequence[Transient], groups: Sequence[Any] | str 
             f"it is left out; record another, or validate without groups"
         )
     return names, grouping
-
-
-def _folders(transients: Sequence[Transient]) -> list[str]:
-    folders = [_folder(t) for t in transients]
-    common = os.path.commonpath(folders) if folders else ""
-    return [os.path.relpath(f, common) if f != common else os.path.basename(f) or f for f in folders]
 
 
 def _folder(transient: Transient) -> str:
