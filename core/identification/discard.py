@@ -117,6 +117,7 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
 
     It is taken out once the next is asked for. It ends when none has an effect.
     """
+    engine.keeps = True
     engine.solve(criterion)
     first = np.array([_value(row, criterion, engine.fleet.weights) for row in engine.rows])
     unit = np.full(len(first), max(float(first.sum()), 1e-300)) if criterion == "qp" else np.maximum(first, 1e-300)

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -91,6 +92,30 @@ class Programmes:
         """Go over to refined coordinates of the row, in which solvers start afresh."""
         self.row.refine()
         self.attempt, self._last = _ATTEMPTS[0], {}
+        self._start_simplex_afresh()
+
+    def release(self, whole: bool = False) -> None:
+        """Hold the working set alone; unless the whole of it, what the last programmes rest on and the nearest."""
+        row, slack, sides = self.row, self.row.slack(), {}
+        near, pool = np.flatnonzero(slack < 0.0), row.pool
+        kept = np.argsort(np.argsort(slack[pool])) < (len(pool) if whole else row.r + row.q)
+        for kind, last in self._last.items():
+            if last.active is not None and len(pool):
+                end = len(last.active) - len(row.asked)
+                if (end - len(last.xi)) % len(pool) == 0:  # the pool has not grown since
+                    sides[kind] = last.active[len(last.xi) : end].reshape(-1, len(pool))
+                    kept |= sides[kind].any(axis=0)
+        more = np.setdiff1d(near, pool)  # outside by rounding
+        row.pool = np.concatenate([pool[kept], more])
+        row.hold(row.samples[np.sort(row.pool)])
+        for kind, last in self._last.items():
+            if kind not in sides:
+                self._last[kind] = replace(last, active=None)
+                continue
+            assert last.active is not None
+            some = np.pad(sides[kind][:, kept], ((0, 0), (0, len(more)))).ravel()
+            start, asked = last.active[: len(last.xi)], last.active[len(last.active) - len(row.asked) :]
+            self._last[kind] = replace(last, active=np.concatenate([start, some, asked]))
         self._start_simplex_afresh()
 
     def drop(self, index: int) -> None:
@@ -310,8 +335,8 @@ class Programmes:
         return np.vstack(sides), np.concatenate([y, -y])
 
     def least_width(self) -> float:
-        """A lower bound of δ, in units of scale: by multipliers, or the optimum on the working set."""
-        row = self.row
+        """A lower bound of δ, in units of scale, by multipliers; -inf where there are none."""
+        row, bound = self.row, -np.inf
         assert row.limit is not None
         for kind in ("nominal", "regularised") if "nominal" in self._last else ("regularised",):
             size, unit = (row.r, self._unit) if kind == "nominal" else (row.r + row.q, 1.0)
@@ -320,12 +345,10 @@ class Programmes:
             cost = np.append(np.zeros(size), 1.0)
             low, high = np.append(row.lower[:size], 0.0), np.append(row.upper[:size], np.inf)
             for active in self._active_sets(kind, len(xi) + len(h)):
-                bound = linear_bound(cost, G, h, low, high, xi, active) * unit
+                bound = max(bound, linear_bound(cost, G, h, low, high, xi, active) * unit)
                 if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
                     return bound
-        simplex = self.minimax()
-        simplex.add(*self.rows(row.pool))
-        return max(bound, 0.0, float(simplex.solve()[-1]))
+        return bound
 
     def minimax(self, nominal_alone: bool = False) -> Simplex:
         """Minimise δ, the last unknown, after all others or the nominal elements alone."""

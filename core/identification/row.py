@@ -359,13 +359,6 @@ class Row:
         psi = ((self.psi_columns.take(psi) * self.unit_psi[:, None]) / size).T
         return _Held(samples.z, samples.dt, samples.s, phi, psi, size)
 
-    def release(self) -> None:
-        """Hold the working set alone, and what is outside by rounding."""
-        outside = self.slack() < 0.0
-        outside[self.pool] = False
-        self.pool = np.concatenate([self.pool, np.flatnonzero(outside)])
-        self.hold(self.samples[np.sort(self.pool)])
-
     def along(self, pool: Index) -> Array:
         """Regressors of the nominal unknowns of some samples, in the row's coordinates, (K, r)."""
         return self.plain_phi[pool] if self.basis is None else self.plain_phi[pool] @ self.basis

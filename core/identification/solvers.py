@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -30,6 +30,10 @@ _SLIGHT = 1e-11
 """The same of a row that the programme left out."""
 _HOLD = 1e-2
 """Share of the largest weight with which a step is held back that mends what an answer violates."""
+_MENDED = 1e-12
+"""What is not worth mending."""
+_FIRMER = (1.0, 1e3, 1e6)
+"""Factors on it, tried in turn: the firmer, the finer is the solver's tolerance."""
 _NEAR = 2
 """Rows per unknown that a programme begins with."""
 MANY = 60
@@ -79,14 +83,15 @@ def solve_qp(of: Programme, active: Sense | None = None, any_solver: bool = True
     """
     answer, violation = _solved(of, active, any_solver, feasible)
     hold = _HOLD * float(np.diagonal(of.H).max(initial=0.0))
-    while violation > _SLIGHT and answer.active is not None:
-        try:
-            nearer, left = _solved(of.held(hold, answer.xi), answer.active, False, feasible)
-        except FitError:
-            break
-        if left > 0.1 * violation:
-            break
-        answer, violation = nearer, left
+    for factor in _FIRMER:
+        while violation > _MENDED and answer.active is not None:
+            try:
+                nearer, left = _solved(of.held(factor * hold, answer.xi), answer.active, False, feasible)
+            except FitError:
+                break
+            if left > 0.1 * violation:
+                break
+            answer, violation = replace(nearer, active=answer.active), left  # what the objective itself rests on
     return answer
 
 

@@ -108,6 +108,7 @@ class WorkingSet:
         self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
+        self.keeps = False  # working sets of rows that are done, which choosing what to discard looks into
         self._together = False  # (10) with full weights: the rows meet in the objective
         self._like: Row | None = None  # the row that held samples last
 
@@ -315,13 +316,8 @@ class WorkingSet:
 
     def _least_width(self, row: Row) -> float:
         """A lower bound of δ."""
-        if self.programmes[row.i].exact:
-            return self.programmes[row.i].least * row.limit_unit
-        self.solvers.add("HiGHS simplex")
-        try:
-            return self.programmes[row.i].least_width() * row.limit_unit
-        except FitError:
-            return -np.inf
+        own = self.programmes[row.i]
+        return (own.least if own.exact else own.least_width()) * row.limit_unit
 
     def _above(self, row: Row, bounds: Array) -> float:
         """How far the largest width of a row will be above its bound at most, relative."""
@@ -429,7 +425,7 @@ class WorkingSet:
             self._prove(settle, rows)
             if self._in_groups:
                 for row in rows:
-                    row.release()
+                    self.programmes[row.i].release(self.keeps)
 
     def _prove(self, settle: Settle, rows: list[Row]) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
