@@ -46,7 +46,7 @@ START_NS, STEP_NS = 10**18, 10_000_000
 class Input:
     """Stands in for a subscription: messages arrive when the test says so."""
 
-    def __init__(self, node: Any, topic: str, type_name: str, kind: Any, callback: Any, wish: Any, raw: bool) -> None:
+    def __init__(self, node: Any, topic: str, type_name: str, callback: Any, wish: Any) -> None:
         self.topic, self.type_name, self.callback = topic, type_name, callback
         self.received = self.lost = self.late = 0
         self.publishers, self.problems, self.look_soon, self.qos = 1, list[str](), False, QoSProfile(depth=1)

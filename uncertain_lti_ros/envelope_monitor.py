@@ -530,7 +530,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
                 "why": session.reason(time.monotonic(), self.settings.real("state_timeout")) if session else "",
-                "looks_like": like.words if session and (like := session.likeness()) else "",
+                "looks_like": like.words if session and (like := session.explainer.likeness()) else "",
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,
                 "held_back": self.outputs.sender.held_back,

@@ -18,6 +18,7 @@ from rclpy.node import Node
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.monitor.outputs import RECORDED, names_of
+from uncertain_lti.monitor.reason import Reasons
 from uncertain_lti.monitor.session import Session
 from uncertain_lti.monitor.snapshot import Album, Entry, Recent, Scene
 from uncertain_lti_ros.parameters import Settings
@@ -110,7 +111,9 @@ class Snapshots:
         }
         topics = {output.name: node.resolve_topic_name(f"~/{output.name}") for output in RECORDED}
         names = names_of(model.state_names, model.steps, monitor.alarms.names)
-        return Scene(self.recent.entries(), names, session.types, topics, about, definition, session.reasons.fresh())
+        return Scene(
+            self.recent.entries(), names, session.types, topics, about, definition, Reasons(model, monitor.alarms.rules)
+        )
 
     @property
     def last(self) -> str:

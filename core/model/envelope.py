@@ -30,7 +30,10 @@ from uncertain_lti.signals.signal_map import SignalMap
 
 
 class Envelope(Elements):
-    """The elements of a model over one step and several, with what they hold for."""
+    """The elements of a model over one step and several, with what they hold for.
+
+    `scheduling_positions`: where the scheduling signals are in [x; u; s], one per axis; empty without a schedule.
+    """
 
     schedule: Schedule | None
     block_data: tuple[BlockData, ...]
@@ -41,7 +44,7 @@ class Envelope(Elements):
     domain: Domain
     residuals: Residuals | None
     alarm: tuple[Rule, ...]
-    _positions: list[int]
+    scheduling_positions: list[int]
 
     @property
     def alarm_rule(self) -> AlarmRule:
@@ -76,7 +79,7 @@ class Envelope(Elements):
         z, rows = np.asarray(z, dtype=np.float64), self.n + self.m
         if self.schedule is None:
             return self.centre_and_half_at(z[:rows], dt)
-        return self.centre_and_half_at(z[:rows], dt, None, self.schedule.table, z[self._positions])
+        return self.centre_and_half_at(z[:rows], dt, None, self.schedule.table, z[self.scheduling_positions])
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """Normalised [x; u; s] (n + m + q, K) of K transitions in recorded units."""
@@ -92,21 +95,16 @@ class Envelope(Elements):
         """Where the regime of samples z (n + m + q, K) is unknown: beyond end knots, or where no recording was."""
         if self.schedule is None:
             return np.zeros(z.shape[1], dtype=bool)
-        s = z[self._positions]
+        s = z[self.scheduling_positions]
         places, weights = self.schedule.corners(s)
         known = np.array([data.known for data in self.block_data])
         return np.asarray(self.schedule.beyond(s) | ((weights > 0) & ~known[places]).any(axis=0))
-
-    @property
-    def scheduling_positions(self) -> tuple[int, ...]:
-        """Where the scheduling signals are in [x; u; s], one per axis; empty without a schedule."""
-        return tuple(self._positions)
 
     def main_block(self, z: Array) -> NDArray[np.intp]:
         """The block of the largest weight at z (n + m + q, K), of two alike the first; -1 for an unlisted mode."""
         if self.schedule is None:
             return np.zeros(z.shape[1], dtype=np.intp)
-        return self.schedule.main_block(z[self._positions])
+        return self.schedule.main_block(z[self.scheduling_positions])
 
     def why_unlisted(self, values: Sequence[float]) -> str:
         """Which mode of a sample [x; u; s] in recorded units the model does not list, in words; empty where none."""
@@ -136,7 +134,7 @@ class Envelope(Elements):
         """Each axis with its knots or modes, and its signal in a sample, in recorded units and normalised."""
         if self.schedule is None:
             return []
-        point, some = self.operating_point, self._positions
+        point, some = self.operating_point, self.scheduling_positions
         s = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)[some].tolist()
         at = self.schedule.recorded_values(self.signals.signals)
         return list(zip(self.schedule.axes, at, [values[i] for i in some], s, strict=True))
@@ -150,7 +148,7 @@ class Envelope(Elements):
         own = np.diagonal(self.A, axis1=-2, axis2=-1)
         if self.schedule is None:
             return np.repeat(own[:, None], z.shape[1], axis=1)
-        return np.asarray(blended(own, *self.schedule.corners(z[self._positions])))
+        return np.asarray(blended(own, *self.schedule.corners(z[self.scheduling_positions])))
 
     def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
         """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count."""
@@ -168,7 +166,7 @@ class Envelope(Elements):
             counted,
             None if domain.measure is None else domain.measure.occupied,
             self.schedule,
-            self._positions,
+            self.scheduling_positions,
             [data.known for data in self.block_data],
         )
 
@@ -188,7 +186,7 @@ class Envelope(Elements):
         `k` (N,): sample that each transition begins with; where one does not follow the one before, windows end; `z`
         (n + m + q, N): normalised, in order of time; `dt` (N,): s; `steps`: lengths, increasing.
         """
-        judge, vectors, n, m = self._runner(), z[self._positions], self.n, self.m
+        judge, vectors, n, m = self._runner(), z[self.scheduling_positions], self.n, self.m
         begin = unbroken_over(k, vectors, self.schedule)
         run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
         done, kept, by_transition = 0, None, np.asfortranarray(z)  # as `advance` reads them

@@ -164,7 +164,7 @@ class UncertainLTI(Envelope):
         self.signals = signals
         self.operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
         names = [s.name for s in signals.signals]
-        self._positions = list(schedule.positions(names)) if schedule is not None else []
+        self.scheduling_positions = list(schedule.positions(names)) if schedule is not None else []
         for name in names[n + m :]:
             if schedule is None or name not in [axis.signal for axis in schedule.axes]:
                 raise ModelError(f"scheduling signal '{name}' schedules nothing; leave it out")
@@ -272,10 +272,10 @@ class UncertainLTI(Envelope):
             raise ModelError(f"{odd[0]} is {values[odd[0]]}; give a finite number")
         point = self.operating_point
         recorded_values = np.zeros(len(point.steady))
-        recorded_values[self._positions] = [values[name] for name in names]
+        recorded_values[self.scheduling_positions] = [values[name] for name in names]
         if unlisted := self.why_unlisted(recorded_values.tolist()):
             raise ModelError(f"{unlisted}; give one of them")
-        s = normalised(recorded_values, point.steady, point.scale)[self._positions]
+        s = normalised(recorded_values, point.steady, point.scale)[self.scheduling_positions]
         places, weights = self.schedule.corners(s[:, None])
         return self._unscheduled({name: blended(getattr(self, name), places, weights)[..., 0] for name in ARRAYS})
 

@@ -103,12 +103,10 @@ class CatchUp:
         full = len(self._waiting) > MOST
         if self._never and self._start and not full:
             return self._release(now, now - self._longest)
-        if full or now >= self._until or (not self._never and self._is_calm(now)):
+        quiet = not self._never and now - self._heard >= _QUIET
+        if full or now >= self._until or (quiet and all(w.is_calm(now, self._least) for w in self._ways.values())):
             return self.finish(now)
         return []
-
-    def _is_calm(self, now: float) -> bool:
-        return now - self._heard >= _QUIET and all(way.is_calm(now, self._least) for way in self._ways.values())
 
     def finish(self, now: float) -> list[Waiting]:
         """Release everything."""

@@ -54,7 +54,7 @@ class Reasons:
     """
 
     def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
-        self._model, self._rules = model, rules
+        self._model = model
         self._words = {label: rule.words for label, rule in zip(labels(rules), rules, strict=True)}
         self.reset()
 
@@ -64,10 +64,6 @@ class Reasons:
         self._blamed: dict[str, list[str]] = {}
         self._jumps: list[str] = []
         self._held = self.by = ""
-
-    def fresh(self) -> Reasons:
-        """The same without any sample."""
-        return Reasons(self._model, self._rules)
 
     def take(self, verdict: Verdict, alarm: bool) -> str:
         """`push` of a verdict of the monitor."""
@@ -177,7 +173,7 @@ def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Stat
     unknown = np.isnan(np.column_stack([transient.x, transient.u, transient.s]))
     rows += [np.array([number[status] for status in statuses], dtype=np.int64), unknown]
     if verdicts.unlisted_mode.any():
-        after = np.column_stack([transient.x, transient.u, transient.s])[:, list(model.scheduling_positions)]
+        after = np.column_stack([transient.x, transient.u, transient.s])[:, model.scheduling_positions]
         rows.append(np.where(verdicts.unlisted_mode[:, None], np.roll(after, 1, axis=0), 0.0))
     facts = np.column_stack(rows)
     changes = np.ones(len(facts), dtype=bool)

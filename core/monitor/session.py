@@ -28,7 +28,6 @@ from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.drift import Days
-from uncertain_lti.monitor.likeness import Likeness
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.monitor.reason import WHY
 from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
@@ -135,7 +134,7 @@ class Session(Stream):
             level = ERROR
             if self.monitor.alarm or not self.latched:
                 complaints.insert(0, f"alarm: {self.reasons.by or self.rule_text()}")
-            if (like := self.likeness()) is not None and like.words:
+            if (like := self.explainer.likeness()) is not None and like.words:
                 complaints.insert(1, like.words)
         else:
             level = WARN if complaints else OK
@@ -167,10 +166,6 @@ class Session(Stream):
             return ""
         absent = condition.field.absent(reader.decode(data))
         return f"{condition.topic} comes without a number in {condition.field.text}" + f": {absent}" * bool(absent)
-
-    def likeness(self) -> Likeness | None:
-        """What the alarm that is on, or was on last, looks like."""
-        return self.explainer.likeness()
 
     def frozen_text(self, moved: Moved) -> str:
         """What is said of a frozen state."""
@@ -380,7 +375,7 @@ class EventLog:
         self.turned(session, (), now)
         self._catch_up(now)
         if session.monitor.alarm and self._named:
-            like = session.likeness()
+            like = session.explainer.likeness()
             if like and like.words and self._matters["likeness"].becomes((self._alarm_since, like.label), now):
                 self._log(OK, f"the alarm {like.words}")
         known, clock, lags = self._matters["problems"].logged or (), session.sampler.clock, session.lags

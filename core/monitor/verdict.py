@@ -134,11 +134,8 @@ class Verdict:
             return f"Verdict({self.status.value}: no verdict)"
         left = int((self.flags == 1.0).sum())
         said = f"{left} of {plural(len(self.flags), 'state')} violated" if left else "contained"
-        return f"Verdict({said}{', ' + self._where if self.outside_domain else ''}{', ALARM' * self.alarm})"
-
-    @property
-    def _where(self) -> str:
-        return "in a regime that was not fitted" if self.unknown_regime else "outside the fitted domain"
+        where = ", in a regime that was not fitted" if self.unknown_regime else ", outside the fitted domain"
+        return f"Verdict({said}{where if self.outside_domain else ''}{', ALARM' * self.alarm})"
 
     @property
     def judged(self) -> bool:

@@ -31,7 +31,7 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.proposal.public_fit import fit
-from uncertain_lti.proposal.search import PAYS, Score, score_of
+from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of
 from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import Memory
@@ -39,8 +39,6 @@ from uncertain_lti.signals.values import Additive
 from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
 
-KNOTS = (2, 3, 5)
-"""Numbers of knots tried on a promising signal."""
 PROMISING, SIGNALS = 0.9, 2
 """Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
 TRANSITIONS = 4000
@@ -127,7 +125,7 @@ def schedules(transients: Sequence[Transient], best: Setting) -> Iterator[list[S
     for name in signals:
         yield [
             best.beside(f"{count} knots on {name}", options={**best.options, "schedule": {name: count}})
-            for count in KNOTS
+            for count in COUNTS
         ]
 
 

@@ -400,7 +400,7 @@ def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
     """Why regimes are unknown, and modes not in the model, each reason once with its count."""
     if model.schedule is None or not (verdicts.unknown_regime.any() or verdicts.unlisted_mode.any()):
         return []
-    s, point, found = _before(model, verdicts)[list(model.scheduling_positions)], model.operating_point, []
+    s, point, found = _before(model, verdicts)[model.scheduling_positions], model.operating_point, []
     for axis, i, values in zip(model.schedule.axes, model.scheduling_positions, s, strict=True):
         unit = f" {model.signals.signals[i].unit}".rstrip()
 
