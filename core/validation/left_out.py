@@ -149,9 +149,9 @@ def leave_out(
             model = fit(pieces, weights=chosen, describe_data=False, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
-        model, reach = model.with_residuals_of(full), Reach(model, pieces)
+        model, level = model.with_residuals_of(full), Reach(model, pieces).level
         for i in out:
-            parts[i] = judge(model, full, cut(*cuts[i]), shown[i], names[i] if grouping else "", reach)
+            parts[i] = judge(model, full, cut(*cuts[i]), shown[i], names[i] if grouping else "", level)
     kind = "blocks" if blocks else "transients"
     hint = "" if grouping or blocks else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)

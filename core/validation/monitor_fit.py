@@ -26,7 +26,7 @@ from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.validation.groups import resolve_groups
 from uncertain_lti.validation.left_out import leave_out
 from uncertain_lti.validation.panel import Evidence, Panel, extended, learn
-from uncertain_lti.validation.part import Part, Reach, fitted_parts, judge
+from uncertain_lti.validation.part import Part, fitted_parts, judge
 from uncertain_lti.validation.result import Validation
 
 CLEARLY = 0.9
@@ -195,7 +195,12 @@ def updated(
     alarm, kept = model.fit_summary.get("alarm", {}), (model.memory or {}).get("evidence")
     if "limit_per_hour" not in alarm:  # given by hand, or not learnt
         return found
-    every = (judge(model, model, run, run.name, reach=_Ranges(model)) for run in runs)
+
+    def beyond(steps: Transitions) -> NDArray[np.intp]:
+        """1 where a transition begins outside the ranges of the model: all that it keeps of what it was fitted to."""
+        return model.domain.beyond(model.normalised_columns(steps)).astype(np.intp)
+
+    every = (judge(model, model, run, run.name, level=beyond) for run in runs)
     parts = [part for part in every if part.judged]
     panel = None
     if kept and parts:
@@ -207,14 +212,3 @@ def updated(
         kept, alarm = panel.evidence.to_dict(), {**alarm, **panel.summary(found), "note": NOTE}
     memory = found.memory and {**found.memory, "evidence": kept}
     return found.replace(memory=memory, fit_summary={**found.fit_summary, "alarm": alarm})
-
-
-class _Ranges(Reach):
-    """Beyond what a model was fitted to is what leaves its ranges: all that it keeps of them."""
-
-    def __init__(self, model: UncertainLTI) -> None:
-        self._model = model
-
-    def level(self, steps: Transitions) -> NDArray[np.intp]:
-        """(K,): 0 where a transition begins within the ranges, 1 beyond them."""
-        return self._model.domain.beyond(self._model.normalised_columns(steps)).astype(np.intp)

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -156,9 +156,12 @@ def judge(
     transient: Transient,
     name: str,
     group: str = "",
-    reach: Reach | None = None,
+    level: Callable[[Transitions], NDArray[np.intp]] | None = None,
 ) -> Part:
-    """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1."""
+    """One left-out transient by the model fitted without it, through the monitor that judges live; margin 1.
+
+    `level`: as of `Reach`; default within what was fitted.
+    """
     verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
@@ -195,7 +198,7 @@ def judge(
         longer,
         longer_residual,
         own[places],
-        np.zeros(len(steps.dt), dtype=np.intp) if reach is None else reach.level(steps),
+        np.zeros(len(steps.dt), dtype=np.intp) if level is None else level(steps),
         outside_domain=int(verdicts.outside_domain.sum()),
         unseen=int((outside.any(axis=1) & ~verdicts.outside_domain[judged]).sum()),
         mean_width=width.mean(axis=0),
