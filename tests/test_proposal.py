@@ -493,8 +493,9 @@ def test_a_column_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path)
         propose([tmp_path / "run.csv"], states=["none"])
 
 
-def table_of(path, columns):
-    rows = np.column_stack([0.01 * np.arange(len(next(iter(columns.values())))), *columns.values()])
+def table_of(path, columns, time=None):
+    time = 0.01 * np.arange(len(next(iter(columns.values())))) if time is None else time
+    rows = np.column_stack([time, *columns.values()])
     np.savetxt(path, rows, delimiter=",", header=",".join(["time", *columns]), comments="")
     return path
 
@@ -561,6 +562,26 @@ def test_the_file_of_one_joint_is_that_of_all(recordings):
 
 
 # --- recordings that mislead ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["even", "fine", "lossy"])
+def test_stamps_that_are_rounded_of_an_even_clock_make_the_step_constant(tmp_path, kind):
+    """Three samples in ten milliseconds, stamped in whole ones or in microseconds, or one of them lost now and then."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 20)
+    t = np.cumsum(1 + (rng.random(len(u)) < 0.3)) / 300 if kind == "lossy" else np.arange(len(u)) / 300
+    t = np.round(t, 6 if kind == "fine" else 3)
+    path = table_of(tmp_path / "run.csv", {"speed": answers(rng, u[:, None])[:, 0], "speed_cmd": u}, t)
+    proposal = propose([path])
+    assert ("step: constant" in proposal.text) == (kind == "even")
+    if kind == "even":
+        model = fitted([path], proposal)
+        assert model.signals.step == pytest.approx(1 / 300, rel=2e-3)
+        other = tmp_path / "recorded.yaml"
+        other.write_text(proposal.text.replace("step: constant", "step: recorded"))
+        recorded = fit(read_transients([path], other), describe_data=False)
+        narrower = np.divide(model.fit_summary["mean_width"], recorded.fit_summary["mean_width"])
+        assert narrower.max() < 0.5
 
 
 def test_a_delay_that_half_of_the_recording_denies_is_none():

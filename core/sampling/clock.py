@@ -74,6 +74,8 @@ class Counters(Counter[str]):
         return {key[len(start) :]: count for key, count in self.items() if key.startswith(start) and count}
 
 
+_EVEN, _COARSE = 200, 8
+"""Steps over which an even clock is told from one that loses samples; most units in a step that is coarse."""
 LONGEST_NS = 2**62
 """Longer than any recording; what is longer still counts as this."""
 
@@ -128,6 +130,28 @@ def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> in
     over = max(1, min(100, longest // 4))
     times = [np.concatenate([np.zeros(1, np.int64), np.cumsum(s)]) for s in steps]
     return max(1, round(float(np.median(np.concatenate([t[over:] - t[:-over] for t in times]))) / over))
+
+
+def coarse_ns(instants: Sequence[NDArray[np.int64]]) -> int | None:
+    """Unit to which an even clock's stamps are rounded, so coarse that its steps differ; None if no such clock.
+
+    Stamps of even samples stay within rounding of a line; where samples are lost, or uneven, they leave it.
+
+    `instants` (messages,): of each recording, ns.
+    """
+    steps = np.concatenate([np.empty(0, np.int64), *(np.diff(i) for i in instants)])
+    if len(steps) < _EVEN or steps.min() <= 0:
+        return None
+    unit, usual = int(np.gcd.reduce(steps)), int(np.median(steps))
+    if usual > _COARSE * unit or (steps == usual).mean() > 0.99:
+        return None
+    count, line = np.arange(_EVEN + 1), []
+    for each in instants:
+        for start in range(0, len(each) - _EVEN, _EVEN):
+            part = each[start : start + _EVEN + 1] - each[start]
+            if np.diff(part).max() <= usual + 2 * unit:  # no break in it
+                line.append(np.ptp(part - np.polyval(np.polyfit(count, part, 1), count)) <= 1.6 * unit)
+    return unit if line and np.mean(line) >= 0.8 else None
 
 
 def resolve(
