@@ -389,7 +389,7 @@ class WorkingSet:
             row.widen_pool(most=4 * (row.r + row.q))
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
-        """Settle rows on all cores, which the solvers do without the lock; with full weights, all at once."""
+        """Settle rows on all cores, though DAQP and PIQP hold the lock; with full weights, all at once."""
         if self._together:
             settle(rows[0])
             return
