@@ -146,6 +146,16 @@ def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypat
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
 
 
+def test_a_row_without_a_proof_by_multipliers_is_proven_by_the_simplex_method(monkeypatch):
+    """And by that alone: it is not solved a third time, in refined coordinates."""
+    refined = []
+    monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
+    monkeypatch.setattr(programmes, "linear_bound", lambda *_: -np.inf)
+    monkeypatch.setattr(programmes.Programmes, "refine", refined.append)
+    model = fit(drawn(small_plant(8), 3000, 8, noise=1e-3), "lp", additive="noise")
+    assert not refined and 0.0 <= model.fit_summary["optimality_gap"] < 1e-7
+
+
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 def test_both_methods_agree_and_contain(criterion):
     transient = drawn(small_plant(11), 200, 11)

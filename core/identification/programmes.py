@@ -53,6 +53,8 @@ of the squared widths. Whether it was is seen from the optimum of δ alone, at t
 it seldom is small enough, so they are left to the simplex method at once.
 """
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
+_ROWS = {"quadratic": 2, "nominal": 2, "regularised": 3}
+"""Rows of a sample in each kind of programme."""
 _LIKE = 1e4
 """Factor on the tie-break's weight with which an interior point looks for what is active."""
 INDEPENDENT = 1e-6
@@ -96,26 +98,21 @@ class Programmes:
 
     def release(self, whole: bool = False) -> None:
         """Hold the working set alone; unless the whole of it, what the last programmes rest on and the nearest."""
-        row, slack, sides = self.row, self.row.slack(), {}
-        near, pool = np.flatnonzero(slack < 0.0), row.pool
-        kept = np.argsort(np.argsort(slack[pool])) < (len(pool) if whole else row.r + row.q)
-        for kind, last in self._last.items():
-            if last.active is not None and len(pool):
-                end = len(last.active) - len(row.asked)
-                if (end - len(last.xi)) % len(pool) == 0:  # the pool has not grown since
-                    sides[kind] = last.active[len(last.xi) : end].reshape(-1, len(pool))
-                    kept |= sides[kind].any(axis=0)
-        more = np.setdiff1d(near, pool)  # outside by rounding
+        row, slack, pool = self.row, self.row.slack(), self.row.pool
+        kept, active = np.full(len(pool), whole), {kind: self._sides(kind) for kind in self._last}
+        kept[np.argsort(slack[pool])[: row.r + row.q]] = True
+        for sides in active.values():
+            if sides is not None:
+                kept[: sides.shape[1]] |= sides.any(axis=0)
+        more = np.setdiff1d(np.flatnonzero(slack < 0.0), pool)  # outside by rounding
         row.pool = np.concatenate([pool[kept], more])
         row.hold(row.samples[np.sort(row.pool)])
         for kind, last in self._last.items():
-            if kind not in sides:
-                self._last[kind] = replace(last, active=None)
-                continue
-            assert last.active is not None
-            some = np.pad(sides[kind][:, kept], ((0, 0), (0, len(more)))).ravel()
-            start, asked = last.active[: len(last.xi)], last.active[len(last.active) - len(row.asked) :]
-            self._last[kind] = replace(last, active=np.concatenate([start, some, asked]))
+            if last.active is not None and (sides := active[kind]) is not None:
+                some = sides[:, kept[: sides.shape[1]]]
+                some = np.pad(some, ((0, 0), (0, len(row.pool) - some.shape[1]))).ravel()
+                start, asked = last.active[: len(last.xi)], last.active[len(last.active) - len(row.asked) :]
+                self._last[kind] = replace(last, active=np.concatenate([start, some, asked]))
         self._start_simplex_afresh()
 
     def drop(self, index: int) -> None:
@@ -143,14 +140,12 @@ class Programmes:
         """
         row = self.row
         feasible = FEASIBLE if row.refined else ROUGH
-        last, per_sample = self._last.get(kind), len(h) // max(len(row.pool), 1)
-        start = None
-        if last is not None and last.active is not None and per_sample:
-            known = last.active[len(lower) : len(last.active) - len(row.asked)].reshape(per_sample, -1)
+        last, known, start = self._last.get(kind), self._sides(kind), None
+        if last is not None and last.active is not None and known is not None and len(row.pool):
             known = known[:, : len(row.pool)]  # the pool grows, but for discards
             start = np.zeros(len(lower) + len(h) + len(row.asked), dtype=np.int32)
             start[: len(lower)] = last.active[: len(lower)]
-            there = start[len(lower) : len(lower) + len(h)].reshape(per_sample, -1)
+            there = start[len(lower) : len(lower) + len(h)].reshape(known.shape[0], -1)
             there[:, : known.shape[1]] = known
         begin = np.zeros(len(lower)) if last is None else last.xi
         if last is None and row.basis is None:
@@ -171,6 +166,13 @@ class Programmes:
             answer = solve_qp(Programme(*objective(*self.attempt), *limits), feasible=feasible)
         self._last[kind] = answer
         return answer.xi, answer.solver
+
+    def _sides(self, kind: str) -> Sense | None:
+        """Which rows of each sample were active in the last programme of a kind, (rows, samples of its pool)."""
+        last = self._last.get(kind)
+        if last is None or last.active is None:
+            return None
+        return last.active[len(last.xi) : len(last.active) - len(self.row.asked)].reshape(_ROWS[kind], -1)
 
     def _active_sets(self, kind: str, count: int) -> list[Sense | None]:
         """What to make multipliers of: what was active in the last programme of a kind and size, then the slack."""
@@ -239,12 +241,13 @@ class Programmes:
         the nominal elements, and, if their sizes are independent, the half-widths. Of many the next is so near that
         one may be missing: what it leaves open is rounding.
         """
-        row, last = self.row, self._last.get("nominal")
-        active, missing = None if last is None else last.active, int(row.r + row.q >= MANY)
-        if active is None or np.count_nonzero(active) + missing <= row.r:
+        row, last, sides = self.row, self._last.get("nominal"), self._sides("nominal")
+        missing = int(row.r + row.q >= MANY)
+        if last is None or last.active is None or sides is None:
             return False
-        samples = active[row.r + 1 :][: 2 * len(row.pool)].reshape(2, -1).any(axis=0)
-        psi = row.psi[row.pool][samples]
+        if np.count_nonzero(last.active) + missing <= row.r:
+            return False
+        psi = row.psi[row.pool[: sides.shape[1]][sides.any(axis=0)]]
         if len(psi) + missing < row.q:
             return False
         values = np.linalg.svd(psi, compute_uv=False)

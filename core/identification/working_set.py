@@ -299,6 +299,7 @@ class WorkingSet:
             self.programmes[row.i].exact = True
         for group in self._groups(again):
             self._settle_and_prove(settle, group)
+        bounds[[row.i for row in again]] = [self._least_width(row) for row in again]
         again = [
             row
             for row in self.rows
