@@ -35,12 +35,11 @@ from pathlib import Path
 import numpy as np
 from measure import best, peak_memory, table
 
-from uncertain_lti.identification import fit, formulation
+from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import write_cache
-from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fitting import fit_fleet
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Columns, Problem, solve_as_written
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
@@ -203,7 +202,7 @@ def joint(scale):
     rows = []
     for criterion in ("qp", "lp"):
         ours, model = best(lambda c=criterion: solve(problem, c))
-        peer, (_, _, objective) = best(lambda c=criterion: formulation.solve(problem, c, cp.CLARABEL), 1)
+        peer, (_, _, objective) = best(lambda c=criterion: solve_as_written(problem, c, cp.CLARABEL), 1)
         difference = np.max(np.abs(np.asarray(model.fit_summary["objective"]) / objective - 1))
         rows.append(
             [

@@ -35,8 +35,7 @@ from uncertain_lti import OperatingPoint, Transient
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.columns import Regimes
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Problem, Regimes
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.schedule import Axis, Schedule
 

@@ -17,10 +17,9 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
-from uncertain_lti.identification import fit, fleet, formulation, passes, programmes, solvers, working_set
+from uncertain_lti.identification import fit, fleet, passes, programmes, solvers, working_set
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.columns import Columns, Regimes
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Columns, Problem, Regimes, solve_as_written
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.plants.leibov import leibov2006
@@ -114,7 +113,7 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
     }[kind]
     model = fit(transient, criterion, weights, additive)
     problem = assemble([transient], OperatingPoint.identity(n, 2), weights, additive)
-    _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL, **CLARABEL)
+    _, _, expected = solve_as_written(problem, criterion, cp.CLARABEL, **CLARABEL)
     assert np.atleast_1d(objective(model)) == pytest.approx(expected, rel=1e-6)
     assert model.fit_summary["optimality_gap"] < 1e-7
     # and the number stored is that of the bounds themselves
@@ -141,7 +140,7 @@ def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypat
     transient = drawn(small_plant(8), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")
     problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
-    _, _, expected = formulation.solve(problem, criterion, cp.CLARABEL if criterion == "qp" else cp.HIGHS)
+    _, _, expected = solve_as_written(problem, criterion, cp.CLARABEL if criterion == "qp" else cp.HIGHS)
     assert np.atleast_1d(objective(model)) == pytest.approx(expected, rel=1e-6)
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
 
@@ -627,7 +626,7 @@ def test_discards_are_the_best_single_ones(criterion, seed):
     problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
 
     def objective(*without):
-        return formulation.solve(problem.without(np.array(without, dtype=int)), criterion, cp.CLARABEL)[2]
+        return solve_as_written(problem.without(np.array(without, dtype=int)), criterion, cp.CLARABEL)[2]
 
     everything = objective()
     effects = [float(np.sum((everything - objective(k)) / everything)) for k in range(60)]

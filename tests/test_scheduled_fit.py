@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from uncertain_lti import OperatingPoint, Transient
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification import fit, formulation, working_set
+from uncertain_lti.identification import fit, working_set
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.columns import Regimes
+from uncertain_lti.identification.problem import Regimes, solve_as_written
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.schedule import Axis, Schedule
@@ -76,7 +76,7 @@ def optimum(transient, schedule, additive, criterion, weights=None):
     solvers = [(cp.HIGHS, {})] if criterion == "lp" else [(cp.PIQP, tight), (cp.CLARABEL, {})]
     for solver, options in solvers:
         try:
-            return formulation.solve(problem, criterion, solver, **options)[2]
+            return solve_as_written(problem, criterion, solver, **options)[2]
         except FitError:
             continue
     raise AssertionError("no solver has an optimum of the problem as written")

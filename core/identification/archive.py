@@ -24,11 +24,10 @@ from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.assembly import assemble, is_constant
-from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.diagnosis import check_solvable
 from uncertain_lti.identification.fitting import contradiction_named, fit_fleet, structure_of, with_repeats
 from uncertain_lti.identification.fleet import DaskFleet, Fleet
-from uncertain_lti.identification.problem import DiskPartition, Problem
+from uncertain_lti.identification.problem import Columns, DiskPartition, Problem, Regimes
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of, unused
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.operating_point import OperatingPoint

@@ -20,8 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import LARGEST, Array, real
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
-from uncertain_lti.identification.columns import Columns, Regimes
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Columns, Problem, Regimes
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.values import Additive

@@ -25,7 +25,6 @@ from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, on_cores, o
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.assembly import assemble, median_step
-from uncertain_lti.identification.columns import Regimes
 from uncertain_lti.identification.diagnosis import check_solvable, describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
@@ -33,7 +32,7 @@ from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
 from uncertain_lti.identification.memory import Recording, remembered
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Problem, Regimes
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure

@@ -21,9 +21,8 @@ import numpy as np
 from uncertain_lti.base.arrays import Array, core_count
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification import passes
-from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
-from uncertain_lti.identification.problem import Partition, Problem
+from uncertain_lti.identification.problem import Columns, Partition, Problem
 from uncertain_lti.model.domain import Occupancy, cells_for
 from uncertain_lti.model.horizon import Residuals
 

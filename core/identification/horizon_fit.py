@@ -24,10 +24,9 @@ import numpy as np
 from uncertain_lti.base.arrays import LARGEST, Array, one_thread_each
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
-from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.optimum import optimum
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Columns, Problem, Regimes
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.horizon import Horizon, Run, Widths

@@ -28,10 +28,9 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, moments, scan
-from uncertain_lti.identification.problem import Block, Problem
+from uncertain_lti.identification.problem import Block, Columns, Problem
 from uncertain_lti.kernel.arithmetic import boxes_of
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.model.uncertain_lti import UncertainLTI

@@ -20,9 +20,8 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
-from uncertain_lti.identification import formulation
 from uncertain_lti.identification.passes import Envelope, Judged, Moments
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Problem, solve_as_written
 from uncertain_lti.identification.programmes import GOOD
 from uncertain_lti.identification.row import LEAST
 from uncertain_lti.identification.working_set import Solution, WorkingSet
@@ -198,6 +197,6 @@ def _as_written(engine: WorkingSet, criterion: str) -> Solution:
     """Solve the whole problem by cvxpy, and measure what it left outside."""
     (problem,) = engine.fleet.partitions
     assert isinstance(problem, Problem)
-    theta, d, objective = formulation.solve(problem, criterion)
+    theta, d, objective = solve_as_written(problem, criterion)
     solver = "cvxpy with OSQP" if criterion == "qp" else "cvxpy with HiGHS"
     return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={solver})

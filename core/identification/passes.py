@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.assembly import scaled_eigenvalues
-from uncertain_lti.identification.columns import Columns
-from uncertain_lti.identification.problem import Block, Partition
+from uncertain_lti.identification.problem import Block, Columns, Partition
 from uncertain_lti.kernel.arithmetic import Blocks, centre_and_half, near_bounds, occupy, pair_count, sums_of, verdicts
 
 T = TypeVar("T", "Moments", "Judged")

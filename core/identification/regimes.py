@@ -21,9 +21,8 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.base.text import meant, plural
-from uncertain_lti.identification.columns import Columns, Regimes
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Columns, Problem, Regimes
 from uncertain_lti.model.schedule import MOST_AXES, Axis, Schedule
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti.identification.columns import Columns
 from uncertain_lti.identification.passes import Moments, Samples
+from uncertain_lti.identification.problem import Columns
 
 LEAST = 1e-9
 """Widths below this share of the steps themselves are rounding, and so is their distance from the optimum."""
