@@ -14,7 +14,7 @@ import pytest
 from test_update import runs_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, fit
-from uncertain_lti.monitor.drift import Days, _student, drift_in_words
+from uncertain_lti.monitor.deployed import Days, _student, drift_in_words
 from uncertain_lti.reports.check import check_data
 
 

@@ -23,12 +23,11 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.signature import Signature, closeness
-from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Pattern
+from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Pattern, learn_signatures
 from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text, signature_text
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.validation.labelled_faults import learn_signatures
 
 DT, ONSET = 0.02, 500
 A = np.array([[-2.0, 1.0, 0.0], [0.0, -3.0, 2.0], [1.5, 0.0, -4.0]])

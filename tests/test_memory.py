@@ -19,8 +19,15 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, validate
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
 from uncertain_lti.model.domain import Sampling
-from uncertain_lti.proposal.tune import Remembered, memory_candidates, remember
-from uncertain_lti.sampling.recall import memory_of, recall, recalled, with_delays, with_memories
+from uncertain_lti.proposal.tune import (
+    Remembered,
+    memory_candidates,
+    memory_of,
+    recall,
+    remember,
+    with_delays,
+    with_memories,
+)
 from uncertain_lti.signals.field_path import FieldPath, Memory, parse_memory
 from uncertain_lti.signals.signal_map import Signal
 
@@ -175,18 +182,6 @@ def test_a_memory_that_pays_is_a_candidate_and_narrows_what_was_left_out() -> No
 def test_no_memory_is_a_candidate_where_every_state_is_measured() -> None:
     runs = [oscillating(seed, blind=False) for seed in range(2)]
     assert not any(one.of.startswith("x") for some in memory_candidates(runs) for one in some)
-
-
-def test_what_a_transient_recalls_follows_what_was_done_to_its_states() -> None:
-    """As for a fault that is put into a recorded run."""
-    run = remember([oscillating(1)], [Remembered("swing", Memory("diff")), Remembered("push", Memory("lag", 2))])[0]
-    x = run.x.copy()
-    x[400:] += 1.0
-    changed = recalled(run.replace(x=x))
-    moved = np.flatnonzero((np.abs(np.nan_to_num(changed.u - run.u)) > 1e-9).any(axis=1))
-    assert moved.tolist() == [400] and changed.u[400, 1] - run.u[400, 1] == pytest.approx(1.0)
-    np.testing.assert_array_equal(changed.u[2:, 2], run.u[:-2, 0])
-    assert recalled(oscillating(1).replace(signals=None, state_names=["y"], control_names=["u"])).u.shape == (900, 1)
 
 
 @pytest.mark.parametrize(

@@ -22,8 +22,8 @@ from engine_bag import SIGNALS, engine_bag
 import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, validate
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.cli.command import schedule as _schedule
 from uncertain_lti.cli.main import main
-from uncertain_lti.cli.options import schedule as _schedule
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.free_run import run_over
 from uncertain_lti.proposal.search import EXCESS, KnotCandidate, Score, choose_knots, chosen_of

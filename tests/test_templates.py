@@ -19,7 +19,7 @@ import pytest
 from uncertain_lti import SignalMap, Transient
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.identification import fit
-from uncertain_lti.sampling.recall import with_memories
+from uncertain_lti.proposal.tune import with_memories
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal import members_of
 

@@ -23,8 +23,18 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, FitError, ModelError
-from uncertain_lti.cli.command import Command, Result, load_model, model_target, read_fitted, read_labelled
-from uncertain_lti.cli.options import OPTIONS, RECORDINGS, RULES, helped
+from uncertain_lti.cli.command import (
+    OPTIONS,
+    RECORDINGS,
+    RULES,
+    Command,
+    Result,
+    helped,
+    load_model,
+    model_target,
+    read_fitted,
+    read_labelled,
+)
 
 if TYPE_CHECKING:
     from uncertain_lti import SignalMap, Transient, UncertainLTI
@@ -289,8 +299,8 @@ def run_validate(options: argparse.Namespace) -> Result:
 def run_signature(options: argparse.Namespace) -> Result:
     """Learn the signatures and write the model with them."""
     from uncertain_lti import EnvelopeMonitor
+    from uncertain_lti.monitor.likeness import learn_signatures
     from uncertain_lti.reports.model_text import signature_text
-    from uncertain_lti.validation.labelled_faults import learn_signatures
 
     output = model_target(options.output, options.force)
     pairs = [text.partition("=") for text in options.bags]

@@ -19,8 +19,20 @@ from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, ModelError, SignalError
 from uncertain_lti.base.text import plural, shortlist
-from uncertain_lti.cli.command import ALARM, BAD_INPUT, DONE, UNKNOWN, Command, Result, complain, load_model
-from uncertain_lti.cli.options import DEPLOYED, PUBLISHED, RECORDINGS, helped
+from uncertain_lti.cli.command import (
+    ALARM,
+    BAD_INPUT,
+    DEPLOYED,
+    DONE,
+    PUBLISHED,
+    RECORDINGS,
+    UNKNOWN,
+    Command,
+    Result,
+    complain,
+    helped,
+    load_model,
+)
 
 if TYPE_CHECKING:
     from uncertain_lti import UncertainLTI
@@ -110,7 +122,7 @@ def _judged(options: argparse.Namespace) -> Judged:
 
 def run_check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
-    from uncertain_lti.monitor.drift import drift_in_words
+    from uncertain_lti.monitor.deployed import drift_in_words
     from uncertain_lti.reports.check import check_data, check_text, outcome
 
     judged = _judged(options)

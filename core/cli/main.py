@@ -27,8 +27,19 @@ from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError, ModelError, UncertainLTIError, absent
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli import FAULT, INTERRUPTED, fit, judge, start
-from uncertain_lti.cli.command import BAD_INPUT, DONE, NOT_READ, Command, Result, complain, drop_output, load_model, run
-from uncertain_lti.cli.options import PUBLISHED, helped
+from uncertain_lti.cli.command import (
+    BAD_INPUT,
+    DONE,
+    NOT_READ,
+    PUBLISHED,
+    Command,
+    Result,
+    complain,
+    drop_output,
+    helped,
+    load_model,
+    run,
+)
 
 
 def run_info(options: argparse.Namespace) -> Result:

@@ -20,8 +20,7 @@ from typing import Any
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.cli.command import Command, Result, model_target
-from uncertain_lti.cli.options import RECORDINGS, helped
+from uncertain_lti.cli.command import RECORDINGS, Command, Result, helped, model_target
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000

@@ -7,18 +7,22 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""A monitor as it is deployed: the rule that parameters give, and a recording judged as the node would judge it."""
+"""A monitor as it is deployed: its rule as parameters give it, a recording judged as live, and its drift over weeks."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.text import plural, shortened
+from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Armed, Arming, Condition
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -28,6 +32,11 @@ from uncertain_lti.sampling.transient import Transient
 
 LONGEST_GRACE = 86400.0
 """s; that of the node's parameter."""
+CHANCE, RECORDINGS = 0.01, 5
+"""Share of checks in which a state at most seems to move that does not, and recordings from which on one shows it."""
+_WEEK, _YEAR_2001, _FAR = 7 * 86_400e9, 978_307_200e9, 520
+"""ns; ns since 1970; weeks or recordings from which on nobody wants to know."""
+_DAY, _KEPT = 86_400 * 10**9, 60  # ns; days
 
 
 @dataclasses.dataclass(frozen=True)
@@ -140,3 +149,78 @@ def condition_words(condition: Condition | None, grace: float, latch: bool) -> l
         *([f"grace {grace:g} s"] if grace else []),
         *(["latched"] if latch else []),
     ]
+
+
+class Days:
+    """Largest utilisation of each state on each day without an alarm, of a monitor that runs for weeks."""
+
+    def __init__(self, model: UncertainLTI) -> None:
+        self._model = model
+        self._days: list[dict[str, Any]] = []
+        self.words: list[str] = []
+
+    def take(self, t_ns: int, largest: Sequence[float]) -> None:
+        """What the verdicts up to an instant reached; with a new day the words are those of the days before it."""
+        if not self._days or t_ns // _DAY != self._days[-1]["t_ns"] // _DAY:
+            if len(self._days) > RECORDINGS:
+                self.words = drift_in_words(self._model, self._days, "day")
+            states = {name: {"largest": 0.0} for name in self._model.state_names}
+            self._days = [*self._days[-_KEPT:], {"t_ns": t_ns, "verdicts": 1, "states": states}]
+        for state, value in zip(self._days[-1]["states"].values(), largest, strict=True):
+            state["largest"] = max(state["largest"], value)
+
+
+def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]], what: str = "recording") -> list[str]:
+    """A sentence on each state whose largest utilisation moves, and when it reaches its threshold.
+
+    Its logarithm is a line over the weeks, or over the recordings where their stamps are no dates; `recordings`: as of
+    `check_data`; `what`: they are.
+    """
+    some = sorted((r for r in recordings if r["verdicts"]), key=lambda r: int(r["t_ns"]))
+    if len(some) < RECORDINGS:
+        return []
+    stamps = np.array([r["t_ns"] for r in some], dtype=np.float64)
+    dated = stamps[0] > _YEAR_2001 and stamps[-1] - stamps[0] > _WEEK
+    unit, at = ("week", (stamps - stamps[0]) / _WEEK) if dated else (what, np.arange(len(some)) * 1.0)
+    x, found = at - at.mean(), []
+    sure = _student(len(x) - 2, CHANCE / model.n)
+    for name, limit in zip(model.state_names, _limits(model), strict=True):
+        peaks = np.array([r["states"][name]["largest"] or math.nan for r in some])
+        y = np.log(peaks) - np.log(peaks).mean()
+        slope = float(x @ y / (x @ x))
+        error = float(np.linalg.norm(y - slope * x)) / math.sqrt((len(x) - 2) * float(x @ x))
+        if not abs(slope) > sure * error:  # not of what was not judged, either
+            continue
+        text = f"the largest utilisation of {shortened(name)} {'rises' if slope > 0.0 else 'falls'} by "
+        text += f"{100 * abs(math.expm1(slope)):.2g} % a {unit} over {plural(len(x), what)}"
+        left = (math.log(limit) - float(np.log(peaks).mean())) / slope - float(x[-1])
+        if slope > 0.0 and left < _FAR:
+            when = f"in {plural(math.ceil(left), what)}"
+            if dated:
+                when = f"on {datetime.fromtimestamp(stamps[-1] / 1e9, UTC) + timedelta(weeks=left):%Y-%m-%d}"
+            text += f"; at that rate it reaches its threshold of {limit:.3g} {when}" if left > 0.0 else "; it is past "
+            text += "" if left > 0.0 else f"its threshold of {limit:.3g}"
+            text += (
+                ", and the promised rate of false alarms no longer holds: if the machine is healthy, update the model"
+            )
+        found.append(text)
+    return found
+
+
+def _student(freedom: int, chance: float) -> float:
+    """What |t| of Student's distribution exceeds with a chance: scipy is no need of a robot that checks.
+
+    With t = tan(a) √freedom the density of a is as cos(a)^(freedom - 1).
+    """
+    angle = np.linspace(0.0, 0.5 * math.pi, 200_001)
+    density = np.cos(angle) ** (freedom - 1)
+    below = np.cumsum(np.append(0.0, 0.5 * (density[1:] + density[:-1])))
+    return math.sqrt(freedom) * math.tan(float(np.interp((1.0 - chance) * below[-1], below, angle)))
+
+
+def _limits(model: UncertainLTI) -> list[float]:
+    """|utilisation| of each state in one verdict that raises the alarm."""
+    for rule in model.alarm:
+        if isinstance(rule, StatisticRule) and (rule.kind, rule.window_s, rule.horizon) == ("energy", 0.0, 1):
+            return [math.sqrt(threshold) for threshold in rule.thresholds(model.n)]
+    return [model.alarm_rule.margin] * model.n

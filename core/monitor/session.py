@@ -24,10 +24,9 @@ from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
 from uncertain_lti.model.repeats import Moved, frozen_words, repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.deployed import Days, condition_words
 from uncertain_lti.monitor.deployed import Rule as Rule
-from uncertain_lti.monitor.deployed import condition_words
 from uncertain_lti.monitor.deployed import listed_states as listed_states
-from uncertain_lti.monitor.drift import Days
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.monitor.reason import WHY
 from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream

@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""tune(): what `fit` does not do by itself, delays, schedules and lags, tried by what their panels see."""
+"""tune(): what `fit` does not do by itself, delays, schedules and memories, tried by what their panels see."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import FitError, UncertainLTIError
+from uncertain_lti.base.errors import FitError, TransientError, UncertainLTIError
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import meant, plural
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.evidence import autocorrelation, late_controls
@@ -32,9 +33,9 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of
-from uncertain_lti.sampling.recall import with_delays, with_memories
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import Memory
+from uncertain_lti.signals.signal_map import Signal, with_rules
 from uncertain_lti.signals.values import Additive
 from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
@@ -414,3 +415,83 @@ def _row(words: str, size: float, base: float, model: UncertainLTI) -> dict[str,
         "width_over_range": float(share.max()) if np.isfinite(share).all() else None,
         "limit_per_hour": model.fit_summary["alarm"]["limit_per_hour"],
     }
+
+
+def recall(values: Array, memory: Memory, dt: Array, opens: NDArray[np.bool_]) -> Array:
+    """What each sample takes from the samples up to it, as the `Sampler` has it.
+
+    `values` (N,): of the field itself; `dt` (N,): step that leads to each sample, s; that of the first of a segment
+    does not count; `opens` (N,): the first sample of each segment; Returns (N,): naN where the segment has too few
+    samples before.
+    """
+    place = np.arange(len(values))
+    begin = np.maximum.accumulate(np.where(opens, place, 0)) if len(values) else place
+    source = place - memory.samples
+    past = np.where(source >= begin, values[np.maximum(source, 0)], math.nan)
+    if memory.kind == "lag":
+        return past
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return values - past if memory.kind == "diff" else (values - past) / dt
+
+
+def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory]]) -> Transient:
+    """The same run with further controls that follow from earlier samples of its states and controls."""
+    names = [*transient.state_names, *transient.control_names, *transient.scheduling_names]
+    z = np.hstack([transient.x, transient.u])
+    columns, added = [], []
+    for name, (of, memory) in memories.items():
+        if of not in names[: z.shape[1]]:
+            there = names[: z.shape[1]]
+            raise TransientError(
+                f"{transient.name}: there is no '{of}'{meant(of, there)}; there are {', '.join(there)}"
+            )
+        if name in names:
+            raise TransientError(f"{transient.name}: '{name}' is there already; choose another name")
+        names.append(name)
+        place = names.index(of)
+        columns.append(_column(transient, z[:, place], memory))
+        if transient.signals is not None:
+            added.append(memory_of(transient.signals[place], memory, name))
+    u = np.column_stack([transient.u, *columns])
+    if transient.signals is not None:
+        signals = replace(transient.signals, controls=(*transient.signals.controls, *added))
+        signals = replace(
+            signals, structure=with_rules(signals.structure, {name: of for name, (of, _) in memories.items()})
+        )
+        return transient.replace(u=u, signals=signals)
+    return transient.replace(u=u, control_names=(*transient.control_names, *memories))
+
+
+def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
+    """The same run with some controls taken so many samples earlier, as `delay` in a signals file does."""
+    u, controls = transient.u.copy(), list(transient.signals.controls) if transient.signals is not None else []
+    for name, samples in delays.items():
+        if name not in transient.control_names:
+            there = ", ".join(transient.control_names)
+            raise TransientError(f"{transient.name}: there is no control '{name}'; there are {there}")
+        j = list(transient.control_names).index(name)
+        if controls and controls[j].memory is not None:
+            raise TransientError(f"{transient.name}: control '{name}' is {controls[j].field}; it takes no delay")
+        u[:, j] = _column(transient, u[:, j], Memory("lag", samples))
+        if controls:
+            controls[j] = replace(controls[j], delay=controls[j].delay + samples)
+    if transient.signals is not None:
+        return transient.replace(u=u, signals=replace(transient.signals, controls=tuple(controls)))
+    return transient.replace(u=u)
+
+
+def memory_of(signal: Signal, memory: Memory, name: str) -> Signal:
+    """A memory of a signal, as a control."""
+    unit = f"{signal.unit}/s" if signal.unit and memory.kind == "rate" else signal.unit
+    steady = signal.steady if memory.kind == "lag" else 0.0
+    if signal.delay:
+        samples = signal.delay + memory.samples if memory.kind == "lag" else 0
+        if not samples:
+            raise TransientError(f"'{signal.name}' is delayed, and has no {memory.kind}; take it of the field itself")
+        memory = Memory("lag", samples)
+    return replace(signal, name=name, field=memory.of(signal.field), steady=steady, unit=unit, delay=0)
+
+
+def _column(transient: Transient, values: Array, memory: Memory) -> Array:
+    opens = np.diff(transient.segment, prepend=-1) != 0
+    return recall(values, memory, np.concatenate([[math.nan], transient.dt])[: len(values)], opens)

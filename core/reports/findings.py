@@ -23,7 +23,7 @@ from uncertain_lti.base.text import finite_data, list_of, number, numbers_of, pl
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.drift import drift_in_words
+from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import UNVOUCHED, check_data
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation

@@ -22,9 +22,9 @@ from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.likeness import Learnt
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.validation.labelled_faults import Learnt
 
 MOST_SHOWN = 20
 """Signals whose elements, and discarded transitions that are printed."""
