@@ -710,3 +710,28 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         assert re.search(words, proposal.text), words
     model = fitted([path], proposal)
     assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0
+
+
+def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_and_set_points_as_controls(tmp_path):
+    """A drive at 20 rows a second: a label beside it, an end switch, a brake, a set point that its speed follows."""
+    rng = np.random.default_rng(3)
+    speed, load, brake, rows = 0.0, 0.0, 0, []
+    for k in range(1500):
+        target = 3.0 * math.sin(k / 40) + math.sin(k / 13)
+        brake = int(rng.integers(0, 2)) if k % 30 == 0 else brake
+        label = 1 + k % 2 if k in range(1400, 1420) else 0
+        t = 0.05 * k - (0.9 if k in range(700, 720) else 0.0)  # a clock that is set back for a second
+        rows.append([f"{t:.2f}", speed, target, load, brake, 1 - brake, rng.integers(0, 2) if k % 9 == 0 else 0, label])
+        speed += 0.9 * (target - speed) * (1 - 0.5 * brake) + 0.01 * rng.normal()
+        load += 0.1 * (target - load) + 0.05 * brake + 0.01 * rng.normal()
+    names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Load", "Brake_IN", "Released", "Idle", "Label"]
+    path = tmp_path / "drive.csv"
+    path.write_text(",".join(names) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    proposal = propose([path])
+    assert [c.path for c in proposal.states] == ["Axis_ActSpeed", "Load"], proposal.text
+    assert [c.path for c in proposal.controls] == ["Axis_SetSpeed", "Brake_IN"], proposal.text
+    for words in ("Label: a label by its name", "Idle.*shows in the next step of none", "Released: moves with"):
+        assert re.search(words, proposal.text), words
+    assert "max_hold" not in proposal.text  # what is in the row of the states is as old as they are
+    assert any("Label looks like a label, and is not 0 in 20 rows" in w for w in proposal.warnings), proposal.warnings
+    assert propose([path], states=["/table:Label"]).states[0].path == "Label"

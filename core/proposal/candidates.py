@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.text import shortlist
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.recording import usual_step
 from uncertain_lti.recordings.table import TYPE
 from uncertain_lti.signals.field_path import FUNCTIONS, QUATERNION
@@ -260,6 +260,10 @@ _COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pw
 
 
 _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in a table
+_SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
+
+
+_LABEL = re.compile(r"(anomaly|anomalous|attack|att_?flag|fault|label|^class$|change_?point|ground_?truth|is_?normal)")
 
 
 _REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
@@ -330,7 +334,44 @@ def role_of_column(name: str) -> str:
         return "state"
     if _REFERENCE.search(low):
         return "reference"
-    return "control" if _COMMAND.search(low) or _COLUMN.search(low) else "state"
+    return "control" if _COMMAND.search(low) or _COLUMN.search(low) or _SET.search(name) else "state"
+
+
+TWO_VALUES = "takes two values only"
+"""Why a measurement is no state; in a table it may be a switch."""
+
+
+def set_aside_labels(sources: Sequence[Source]) -> list[str]:
+    """Leave out columns of tables that are labels by their names; a warning for each that does not stay the same."""
+    warnings = []
+    for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
+        if not _LABEL.search(candidate.path.lower()):
+            continue
+        values = np.concatenate([np.empty(0), *candidate.values])
+        values = values[np.isfinite(values)]
+        candidate.reason = "a label by its name, and no signal of the machine"
+        if len(found := np.unique(values)) > 1:
+            usual = found[np.argmax([np.count_nonzero(values == value) for value in found])]
+            warnings.append(
+                f"{candidate.path} looks like a label, and is not {usual:.6g} in "
+                f"{plural(int(np.count_nonzero(values != usual)), 'row')}: leave out of the recordings what was not "
+                "healthy, as a fit takes all of them for healthy"
+            )
+    return warnings
+
+
+def take_switches(sources: Sequence[Source]) -> list[Source]:
+    """Columns of tables that are switched, which leave the measurements and may be controls."""
+    found = []
+    for table in (s for s in sources if s.type == TYPE and s.role == "state"):
+        switches = [c for c in table.candidates if c.reason == TWO_VALUES]
+        if not switches:
+            continue
+        for candidate in switches:
+            candidate.reason = ""
+        table.candidates = [c for c in table.candidates if not any(c is one for one in switches)]
+        found.append(replace(table, candidates=switches, role="switch", reason=""))
+    return found
 
 
 def at_rest(sources: Sequence[Source]) -> str:

@@ -385,7 +385,6 @@ HELD = 0.8
 """Share of an analyser's changes that come after the same number of rows, two or more."""
 GATED = 0.99
 """Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
-_LABEL = re.compile(r"(anomaly|anomalous|attack|att_?flag|fault|label|^class$|change_?point|ground_?truth|is_?normal)")
 _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
 
 
@@ -445,10 +444,7 @@ def _finite(candidate: Candidate) -> Array:
 
 def _unfit(candidate: Candidate) -> str:
     """Why a column is no signal at all; what hardly moves is one."""
-    if _LABEL.search(candidate.path.lower()):
-        return "a label by its name, and no signal of the plant"
-    reason = candidate.reason
-    return "" if re.match(r"always|leaves its usual|takes two", reason) else reason
+    return "" if re.match(r"always|leaves its usual|takes two", candidate.reason) else candidate.reason
 
 
 def _is_set(candidate: Candidate) -> bool:

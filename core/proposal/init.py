@@ -28,6 +28,7 @@ from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.proposal.candidates import (
     FEWEST,
     OF_QUATERNION,
+    TWO_VALUES,
     WRAPPING,
     Candidate,
     Source,
@@ -38,6 +39,8 @@ from uncertain_lti.proposal.candidates import (
     residual,
     role_by_name,
     role_of_column,
+    set_aside_labels,
+    take_switches,
 )
 from uncertain_lti.proposal.choosing import choose, is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
@@ -276,7 +279,7 @@ def _judge(candidate: Candidate, source: Source) -> None:
     elif (moved := len(finite) - int(np.unique(finite, return_counts=True)[1].max())) < max(3, len(finite) // 500):
         candidate.reason = f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
     elif source.role == "state" and len(np.unique(finite)) < 3:
-        candidate.reason = "takes two values only"
+        candidate.reason = TWO_VALUES
     elif source.role != "control" and _counts(values, np.concatenate(source.arrival)):
         candidate.reason = "grows as a clock or a counter does"
     elif max(abs(float(finite.min())), abs(float(finite.max()))) > 1e15:
@@ -378,11 +381,14 @@ def propose(
     if runs:
         bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
     sources = read_sources(bags, progress)
+    labels = set_aside_labels(sources) if not states else []
     if not (states or controls or like) and is_plant(sources):
-        return _of_plant(bags, sources, runs)
+        return _of_plant(bags, sources, runs, labels)
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
+    switches = [] if controls else take_switches(sources)
     commands, measured = assign_roles(sources)
+    commands += switches
     sources += [s for s in commands if not any(s is other for other in sources)]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
@@ -406,7 +412,7 @@ def propose(
     set_operating_point(chosen, used, sources)
     for candidate in ready:
         set_own_scale(candidate)
-    warnings = (*(warning for bag in bags for warning in bag.warnings), *([doubt] if doubt else []))
+    warnings = (*(warning for bag in bags for warning in bag.warnings), *labels, *([doubt] if doubt else []))
     for topic in (s.topic for s in sources if s.role == "control"):
         lacking = [str(bag.path) for bag in bags if topic not in bag.topics or not bag.topics[topic].count]
         if 0 < len(lacking) < len(bags):
@@ -421,13 +427,14 @@ def propose(
     return Proposal(tuple(chosen), tuple(used), text, warnings, tuple(members))
 
 
-def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str) -> Proposal:
+def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str, labels: Sequence[str]) -> Proposal:
     """The proposal for process data; names are those of the columns."""
     chosen, used = plant_signals(sources)
     if not chosen:
         raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
     text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
-    return Proposal(tuple(chosen), tuple(used), text, tuple(warning for bag in bags for warning in bag.warnings))
+    warnings = (*(warning for bag in bags for warning in bag.warnings), *labels)
+    return Proposal(tuple(chosen), tuple(used), text, warnings)
 
 
 def _members(

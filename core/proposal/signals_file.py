@@ -126,6 +126,8 @@ def _listed(scale: float) -> float:
 
 def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
     """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do."""
+    if source.topic == clock.topic:  # it comes with the states
+        return None, ""
     steps = np.concatenate([np.diff(a) for a in source.arrival if len(a) > 1] or [np.empty(0)]) * 1e-9
     steps = steps[steps > 0]
     if not len(steps):

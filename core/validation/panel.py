@@ -135,7 +135,7 @@ class Evidence:
         found = []
         for rule, sizes in zip(rules, self.thresholds(rules, self.widths.shape[1], what), strict=True):
             sizes = self.factor * sizes
-            values = tuple((sizes if rule.kind == "mean" else sizes**2).tolist())
+            values = tuple(np.minimum(sizes if rule.kind == "mean" else sizes**2, LARGEST).tolist())
             found.append(replace(rule, threshold=values[0] if rule.kind in JOINT else values))
         return tuple(found)
 
