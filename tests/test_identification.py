@@ -299,6 +299,14 @@ def test_input_that_never_moves_is_named():
             assert (model.B[:, 1] == 0).all() and (model.dB[:, 1] == 0).all()
 
 
+def test_inputs_that_never_move_are_named_in_one_message():
+    raw = drawn(small_plant(1, 2, 3), 200, 1, rest=0)
+    u = raw.u * [1.0, 0.0, 0.0]
+    model = fit(Transient(raw.t_ns, raw.x, u, control_names=["throttle", "steering", "brake"]), additive="noise")
+    told = [message for message in model.fit_summary["messages"] if "in every transition" in message]
+    assert len(told) == 1 and "'steering' and 'brake' are 0 in every transition, so their columns are not" in told[0]
+
+
 def test_signals_that_move_together_are_named():
     raw = drawn(small_plant(1, 2, 2), 200, 1, rest=0)
     u = np.column_stack([raw.u[:, 0], -2.0 * raw.u[:, 0]])

@@ -74,7 +74,7 @@ _REMEDIES = (  # words of a message on the state, or on any signal; what narrows
     ("`delay:", False, "set the delay that the notes propose"),
     ("sampling is slow", False, "sample faster"),
     ("moves too little", False, "record the controls moving more"),
-    ("is not identifiable", False, "record the controls moving more"),
+    ("not identifiable", False, "record the controls moving more"),
 )
 
 
@@ -102,11 +102,14 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
     names = [*names, "the disturbance c"] if problem.columns.drift else list(names)
     dead = sums.phi_scale == 0
-    messages = [
-        f"rank deficient: '{names[j]}' is 0 in every transition, so its column is not identifiable and is set "
-        f"to 0; record it moving, or leave it out"
-        for j in np.flatnonzero(dead)
-    ]
+    messages, still = [], [names[j] for j in np.flatnonzero(dead)]
+    if still:
+        several = len(still) > 1
+        be, columns, them = ("are", "their columns are", "them") if several else ("is", "its column is", "it")
+        messages.append(
+            f"rank deficient: {_quoted(still)} {be} 0 in every transition, so {columns} not identifiable and set to 0; "
+            f"record {them} moving, or leave {them} out"
+        )
     free = np.flatnonzero(~dead)
     values, vectors = _directions(sums, free)
     limit = 1e-12 * len(free)

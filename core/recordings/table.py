@@ -88,7 +88,9 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
     if values.dtype.kind == "M":
         return column, values.astype("datetime64[ns]").astype(np.int64), words
     if values.dtype.kind == "O":
-        return column, _of_text(where, values.tolist()), words
+        times, order = _of_text(where, values.tolist())
+        words = " and ".join(part for part in (words, order) if part)
+        return column, times, f"column '{column}': {words}" if order else words
     unit = layout.unit or _unit(column, values, table.units.get(column, ""))
     if layout.unit is None and unit != "s":
         words = f"{words}{' and ' if words else ''}its numbers are taken for {unit}"
@@ -181,10 +183,10 @@ def _too_late(where: str) -> BagError:
     )
 
 
-def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
-    """ISO 8601 with or without a zone (UTC where there is none), or times of day."""
+def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
+    """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted."""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
-    cells = _as_iso(where, cells)
+    cells, order = _as_iso(where, cells)
     plain: list[str] = []
     rows: list[int] = []
     shifts: list[int] = []
@@ -220,15 +222,18 @@ def _of_text(where: str, cells: Sequence[object]) -> NDArray[np.int64]:
         times[rows] = parsed - np.array(shifts, dtype=np.int64)
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
-    return times
+    return times, order
 
 
-def _as_iso(where: str, cells: Sequence[object]) -> Sequence[object]:
-    """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day and goes forward."""
+def _as_iso(where: str, cells: Sequence[object]) -> tuple[Sequence[object], str]:
+    """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day and goes forward.
+
+    Where all rows are of one day, the time between them does not depend on the order.
+    """
     texts = [str(cell).strip() for cell in cells if str(cell).strip()]
     found = [m for m in map(_DAY.fullmatch, texts) if m is not None]
     if not found or len(found) < len(texts):
-        return cells
+        return cells, ""
     orders = []
     for day, month in ((1, 2), (2, 1)):
         texts = [
@@ -238,9 +243,11 @@ def _as_iso(where: str, cells: Sequence[object]) -> Sequence[object]:
         ]
         if all(1 <= int(text[5:7]) <= 12 for text in texts) and all(a <= b for a, b in pairwise(texts)):
             orders.append(texts)
-    if len(orders) == 1 or (orders and orders[0] == orders[1]):
+    known = len(orders) == 1 or (orders and orders[0] == orders[1])
+    if known or (orders and len({m.group(1, 2, 3) for m in found}) == 1):
         iso = iter(orders[0])
-        return [next(iso) if str(cell).strip() else cell for cell in cells]
+        order = "" if known else f"its one day, {found[0][0].split()[0]}, is taken for day, month, year"
+        return [next(iso) if str(cell).strip() else cell for cell in cells], order
     raise BagError(
         f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times such as "
         f"2026-11-22T06:28:01.25Z"
