@@ -299,7 +299,9 @@ def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array
     )
     near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
     near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
-    index, first = np.unique(np.argsort(near, axis=1, kind="stable")[:, :count].T, return_index=True)
+    nearest = np.sort(np.argpartition(near, min(count, near.shape[1]) - 1, axis=1)[:, :count], axis=1)
+    order = np.take_along_axis(nearest, np.argsort(np.take_along_axis(near, nearest, 1), axis=1, kind="stable"), 1)
+    index, first = np.unique(order.T, return_index=True)
     return np.sort(some[index[np.argsort(first)[:most]]])
 
 

@@ -39,7 +39,7 @@ _FURTHEST, _MANY = 4_000, 100
 as many unknowns a row its programmes take longer than the pass that finds them."""
 MAX_ROUNDS, FEW_ROUNDS = 200, 60
 Settle = Callable[[Row], None]
-_HELD_BYTES = 300_000_000
+_HELD_BYTES = 180_000_000
 """Memory for the samples of the rows that are proven together, about."""
 _SILENCE = 2.0
 """After so long, s, a word on how far the rows are."""
