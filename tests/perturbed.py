@@ -26,6 +26,7 @@ import numpy as np
 from bag_writer import JAZZY, Layout, Message, Topic, float64, joint_state, vector, write
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
+from uncertain_lti.base.arrays import LARGEST
 from uncertain_lti.cli.judge import check_recording
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
@@ -143,7 +144,11 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
         ),
         alarm=rules,
         residuals=residuals(),
-        repeats=Repeats(rng.choice([0.0, 0.02, 0.05], n)) if may(0.6) else None,
+        repeats=Repeats(
+            rng.choice([0.0, 0.02, 0.05], n), *rng.choice([0.0, 0.5, LARGEST], (3, n)), rng.choice([0.0, 6000.0], n)
+        )
+        if may(0.6)
+        else None,
     )  # fmt: skip
 
 

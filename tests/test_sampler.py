@@ -589,20 +589,6 @@ def at(topic: str, arrival: int, stamp: int | None, value: float = 1.0) -> Sent:
     return Sent(topic, arrival * TICK, None if stamp is None else stamp * TICK, (value,))
 
 
-def test_what_is_as_new_as_the_chosen_message_comes_late_and_what_is_older_does_not() -> None:
-    sampler = Sampler(two_topics())
-    for message in (at("/u", 5, 5), at("/c", 6, 6), at("/c", 7, 7)):
-        sampler.push(*message)
-    for stamp, late in ((4, 0), (5, 1), (6, 2)):
-        sampler.push(*at("/u", 8, stamp))
-        assert sampler.counters["late /u"] == late
-
-
-def test_what_is_heard_first_after_a_step_back_is_not_late_for_a_sample_before_it() -> None:
-    _, sampler = run(two_topics(), [at("/c", 1, 100), at("/c", 2, 101), at("/c", 3, 50), at("/u", 4, 50)])
-    assert sampler.counters["resets"] == 1 and not sampler.counters["late /u"]
-
-
 @pytest.mark.parametrize("control_first", [True, False])
 def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: bool) -> None:
     """Otherwise a hundred old messages are kept and looked through at every sample from there on."""
@@ -614,31 +600,6 @@ def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: boo
                 sampler.push(*message)
         assert len(sampler.kept("/u")) <= 2
     assert sampler.counters["resets"] == 2
-
-
-def test_a_topic_that_stepped_back_with_the_clock_may_step_back_before_it_again() -> None:
-    """The open sample keeps what it had chosen before."""
-    signals = two_topics()
-    stamps = [("/u", 100), ("/c", 100), ("/u", 50), ("/c", 50), ("/c", 52), ("/u", 58), ("/u", 51), ("/c", 53)]
-    messages = [at(topic, 100 + k, stamp, float(k)) for k, (topic, stamp) in enumerate(stamps)]
-    hold_against(Reference(signals, messages, forgets=True), signals, messages)
-    assert run(signals, messages)[0][-1][0].u.tolist() == [2.0]
-
-
-def test_a_topic_that_is_heard_first_in_the_second_pass_joins_no_pass_to_another() -> None:
-    """The clock's first step back has no counterpart there; each later one comes after that of the topic."""
-    sampler = Sampler(two_topics())
-    steps = [*sampler.push(*at("/c", 298, 298)), *sampler.push(*at("/c", 299, 299))]
-    for k in range(1, 11):
-        begin = 300 * k
-        for tick in range(200):
-            if k > 1 or tick:
-                steps += sampler.push(*at("/u", begin + tick, 100 + tick, float(k)))
-            if tick == 0 and k > 1:  # the last sample of the pass before
-                steps += sampler.push(*at("/c", begin + tick, 300, float(k - 1)))
-            steps += sampler.push(*at("/c", begin + tick, 100 + tick, float(k)))
-    judged = [step for step in steps if step.status is Status.OK]
-    assert len(judged) > 1900 and all(step.before[0] == step.before[1] for step in judged)
 
 
 @settings(max_examples=60)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from test_frozen import steps_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
@@ -23,8 +24,6 @@ from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRul
 from uncertain_lti.model.horizon import Horizon, Residuals
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
-from uncertain_lti.sampling.clock import Status
-from uncertain_lti.sampling.sampler import Step
 
 C = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.3], [0.0, -0.3, 0.5]])
 MEAN = np.array([0.1, -0.2, 0.0])
@@ -271,16 +270,6 @@ def a_run(seed: int, count: int = 400, n: int = 3, drift: float = 0.2) -> Transi
     t = np.cumsum(rng.integers(9_000_000, 11_000_000, count))
     t[320:] -= t[320] - t[100]  # time jumps back
     return Transient(t * 1, x, np.zeros((count, 1)))
-
-
-def steps_of(run: Transient) -> list[Step]:
-    found = []
-    for k, status in enumerate(run.statuses()):
-        before, dt = [np.nan] * 4, np.nan
-        if k and status is Status.OK:
-            before, dt = [*run.x[k - 1], *run.u[k - 1]], run.dt[k - 1]
-        found.append(Step(status, int(run.t_ns[k]), 0, dt, before, run.x[k].tolist()))
-    return found
 
 
 def test_a_masked_state_does_not_count() -> None:
