@@ -14,7 +14,6 @@ from __future__ import annotations
 import re
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -26,7 +25,8 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from ros_processes import Diagnostics, World, open_world, until
+from ros_processes import Diagnostics, World, until
+from ros_processes import world as world
 from sensor_msgs.msg import JointState
 from test_live import CONTROL, EPOCH_NS, STATE, by_hand, joint_state, saved, stamp_of, vector
 
@@ -35,12 +35,6 @@ from uncertain_lti_ros.parameters import DEFAULTS
 from uncertain_lti_ros.process import BAD_USAGE
 
 ROOT = Path(__file__).resolve().parents[1]
-
-
-@pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with open_world(tmp_path) as world:
-        yield world
 
 
 def pair(k: int) -> tuple[Vector3Stamped, JointState]:

@@ -26,9 +26,11 @@ from bag_writer import Layout, Message, Topic, float64, joint_state, vector, wri
 from rosbags.highlevel import AnyReader
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
-from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
+from uncertain_lti.model.alarm_rule import KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.model.horizon import Horizon
+from uncertain_lti.model.horizon import Horizon, Residuals
+from uncertain_lti.model.repeats import Repeats
+from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.reason import over_recording
@@ -97,6 +99,34 @@ def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) 
         **options,
     )
     return model
+
+
+def everything_armed() -> UncertainLTI:
+    """The model by hand with a schedule, horizons, every kind of statistic at one of them, and repeats."""
+    plain, rng, n = by_hand(), np.random.default_rng(4), 2
+
+    def scheduled(scale: float = 1.0) -> dict[str, Any]:
+        share = rng.uniform(0.5, 1.0, 3)
+        arrays = {name: getattr(plain, name) for name in ARRAYS} | {"v": np.full(n, 0.005)}
+        return {name: np.stack([scale * s * value for s in share]) for name, value in arrays.items()}
+
+    residuals = Residuals(np.zeros(n), np.eye(n))
+    lengths = (2, 5, 12)
+    rules: list[Any] = [AlarmRule(2, 5), AlarmRule(2, 4, 1.2, horizon=5)]
+    for i, kind in enumerate(KINDS):
+        allowance = 0.1 if kind == "cusum" else 0.0
+        rules.append(StatisticRule(kind, 20 * STEP_NS * 1e-9, 2.0, lengths[i % 3] if i % 2 else 1, allowance))
+    return UncertainLTI(
+        **scheduled(),
+        schedule=Schedule((Axis("a", knots=(-0.1, 0.0, 0.1)),)),
+        block_data=[BlockData(100)] * 3,
+        horizons=[Horizon(h, **scheduled(0.4), residuals=residuals) for h in lengths],
+        signals=plain.signals,
+        sampling=plain.sampling,
+        alarm=rules,
+        residuals=residuals,
+        repeats=Repeats(np.full(n, 0.1)),
+    )
 
 
 def saved(model: UncertainLTI, folder: Path, name: str = "hand") -> Path:
@@ -230,18 +260,25 @@ class Outputs:
         assert self.topics["violation"].messages[-1].data == verdicts[-1].alarm
 
 
-def test_header_time_gives_live_what_it_gives_offline(world: World, tmp_path: Path) -> None:
-    model = by_hand(alarm_rule=AlarmRule(2, 5))
-    path = saved(model, tmp_path)
-    bag = header_bag(model, tmp_path / "run.mcap", 600)
+def test_everything_armed_gives_live_what_it_gives_offline(world: World, tmp_path: Path) -> None:
+    """Late, repeated, swapped, damaged and absent messages; stamps that jump, go back or are missing."""
+    path = saved(everything_armed(), tmp_path)
+    bag = header_bag(by_hand(), tmp_path / "run.mcap", 600)
     verdicts = offline(path, bag)
-    assert {v.status for v in verdicts} >= {Status.OK, Status.MISSING, Status.GAP}
-    world.monitor(path)
-    outputs = Outputs.of(world)
+    judged = [v for v in verdicts if v.judged]
+    assert {v.status for v in verdicts} >= {Status.OK, Status.MISSING, Status.GAP, Status.UNSTAMPED}
+    assert {v.alarm for v in judged} == {True, False}
+    process = world.monitor(path)
+    names = ("horizon_utilisation", "statistics")
+    outputs = Outputs.of(world, *names)
     world.command("play", bag, "--rate", 3.0).succeed()
     outputs.hold_against(verdicts, ("a", "b"))
+    for name in names:
+        told = outputs.topics[name].count(len(judged))
+        assert [bits(m.position) for m in told] == [bits(np.ravel(getattr(v, name))) for v in judged]
+        assert sum(not np.isnan(m.position).any() for m in told) > 50
     status = world.status()
-    assert status["verdicts"] == sum(v.judged for v in verdicts)
+    assert status["verdicts"] == len(judged) and status["unexpected_errors"] == 0 and "Traceback" not in process.output
     assert sum(status["lost"].values()) == 0 and status["received"].keys() == {STATE, CONTROL}
 
 

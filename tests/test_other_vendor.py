@@ -23,8 +23,7 @@ pytest.importorskip("cyclonedds", reason="the cyclonedds wheel, which subscribes
 
 from ros_processes import World
 from ros_processes import world as world
-from test_armed_node import everything_armed
-from test_live import by_hand, header_bag, offline, saved
+from test_live import by_hand, everything_armed, header_bag, offline, saved
 
 from uncertain_lti.sampling.clock import Status
 

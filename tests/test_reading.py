@@ -26,9 +26,7 @@ from bag_writer import (
     Topic,
     cdr,
     float64,
-    header,
     joint_state,
-    message,
     metadata_yaml,
     ramp,
     write,
@@ -298,23 +296,6 @@ def test_an_angle_starts_on_the_branch_nearest_to_a_steady_value_that_was_resolv
     first, second = read_transients([one, two], signals)
     np.testing.assert_allclose(first.x[:, 0], angles, atol=1e-12)
     np.testing.assert_allclose(second.x[:, 0], angles[-5:], atol=1e-12)
-
-
-@settings(max_examples=30)
-@given(st.lists(st.floats(-0.5, 0.5), min_size=2, max_size=60), st.floats(-20, 20))
-def test_unwrapping_a_quaternion_gives_the_angle_that_turned(
-    tmp_path_factory: pytest.TempPathFactory, turns: list[float], steady: float
-) -> None:
-    angles = np.concatenate([[steady], steady + np.cumsum(turns)])
-    type_name = "geometry_msgs/msg/QuaternionStamped"
-    data = []
-    for k, a in enumerate(angles.tolist()):
-        q = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(a / 2), w=math.cos(a / 2))
-        data.append(("/q", k * 10 * MS, cdr(type_name, header=header((k + 1) * 10 * MS), quaternion=q)))
-    path = save(tmp_path_factory.getbasetemp(), {"/q": type_name}, data, "turning.mcap")
-    signals = SignalMap((Signal("yaw", "/q", "unwrap(yaw(quaternion))", steady=steady),))
-    (transient,) = read_transients(path, signals)
-    np.testing.assert_allclose(transient.x[:, 0], angles, atol=1e-9)
 
 
 # --- files ---------------------------------------------------------------------------------------------------
