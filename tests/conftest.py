@@ -40,10 +40,12 @@ adopt_orphans()
 ROOT = Path(__file__).resolve().parents[1]
 
 
-# What another numpy can change: arithmetic, files, the kernel, and the node, as ROS on Ubuntu has numpy 1.26.
+# What another numpy can change: arithmetic, files, the kernel, and the node, as ROS on Ubuntu has numpy 1.26. Of the
+# sampler and of field paths `reading` and `cdr_arrays` show it.
 _NUMPY = """
-    cdr_arrays kernel model monitor node_stream operating_point reading sampler signals transient
+    cdr_arrays horizons kernel model monitor node_stream operating_point reading schedule transient
 """.split()
+_SOME_NUMPY = ["interchange"]  # with tests that are marked one by one
 
 
 # Their fixtures cost more than their tests: side by side each worker would make them again.
@@ -60,6 +62,12 @@ def stem(path: str) -> str:
 def pytest_itemcollected(item: pytest.Item) -> None:
     if stem(str(item.path)) in _NUMPY:
         item.add_marker("numpy")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Of a pass by the marker numpy, files without such a test: to import them takes as long as the pass."""
+    only = config.option.markexpr.startswith("numpy") and collection_path.suffix == ".py"
+    return True if only and stem(str(collection_path)) not in (*_NUMPY, *_SOME_NUMPY) else None
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -213,6 +213,8 @@ def test_a_masked_state_that_leaves_its_bounds_beside_a_frozen_one_raises_no_rul
     verdicts = EnvelopeMonitor(three(), masked=("x2",)).check(transient)
     assert verdicts.frozen[80].tolist() == [False, False, True] and verdicts.flags[80, 1] == 1.0
     assert verdicts.alarm[80] and verdicts.raised(80) == ()
+    live = EnvelopeMonitor(three(), masked=("x2",))
+    assert [live.judge(step) for step in steps_of(transient)][80].raised == ()
 
 
 NOISY = [0.0], [0.0], [0.0], [LARGEST]

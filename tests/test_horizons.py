@@ -31,8 +31,6 @@ from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Sampler, Step
 from uncertain_lti.signals.signal_map import Signal
 
-pytestmark = pytest.mark.numpy
-
 SPEED = Schedule((Axis("x1", knots=(-0.5, 0.0, 1.0)),))
 
 

@@ -25,8 +25,6 @@ from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal
 
-pytestmark = pytest.mark.numpy
-
 SPEED = Axis("speed", knots=(-0.5, 0.0, 1.0))
 GEAR = Axis("gear", modes=(1.0, 2.0, 4.0))
 
