@@ -23,6 +23,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 _PR_SET_CHILD_SUBREAPER = 36
+LASTING: set[int] = set()  # children that serve several tests
 _HELPERS = (b"multiprocessing.resource_tracker", b"multiprocessing.forkserver")  # live as long as who imports them
 
 
@@ -108,7 +109,8 @@ def end_children(before: set[int], patience: float) -> list[str]:
 
 
 def _strays(before: set[int]) -> list[int]:
-    return [p for p in children() - before if runs(p) and not any(helper in _command(p) for helper in _HELPERS)]
+    new = children() - before - LASTING
+    return [p for p in new if runs(p) and not any(helper in _command(p) for helper in _HELPERS)]
 
 
 def _command(pid: int) -> bytes:

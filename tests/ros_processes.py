@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from processes import own_domain
+from processes import LASTING, own_domain
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.experimental import EventsExecutor
@@ -41,6 +42,36 @@ from std_srvs.srv import Trigger
 PATIENCE = 300.0  # s; costs nothing where all is well
 MONITOR = "/envelope_monitor"
 _NODES = "import sys; from uncertain_lti_ros.nodes import {0}; sys.exit({0}())"
+_COMMANDS = "import sys; from uncertain_lti.cli.main import main; sys.exit(main())"
+_SERVER = """
+import json, os, signal, sys
+import geometry_msgs.msg, sensor_msgs.msg, std_msgs.msg
+import uncertain_lti_ros.envelope_monitor, uncertain_lti_ros.plant, uncertain_lti_ros.player, uncertain_lti_ros.recorder
+for line in sys.stdin:
+    code, arguments, env, folder, log = json.loads(line)
+    ours, theirs = os.pipe()
+    if not (between := os.fork()):
+        if not (pid := os.fork()):
+            break
+        os.write(theirs, b"%d" % pid)
+        os._exit(0)
+    os.waitpid(between, 0)  # so that whoever asked is the parent
+    os.close(theirs)
+    print(os.read(ours, 20).decode(), flush=True)
+    os.close(ours)
+else:
+    sys.exit()
+os.setsid()
+os.chdir(folder)
+os.environ.clear()
+os.environ.update(env)
+signal.signal(signal.SIGINT, signal.default_int_handler)
+for number, (path, how) in enumerate([(os.devnull, os.O_RDONLY), *[(log, os.O_WRONLY | os.O_APPEND)] * 2]):
+    os.dup2(os.open(path, how), number)
+os.closerange(3, 256)
+sys.argv = ["program", *arguments]
+exec(code, {"__name__": "__main__"})
+"""
 
 
 def until(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -> Any:
@@ -52,11 +83,53 @@ def until(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -
     return found
 
 
+@cache
+def _server() -> subprocess.Popen[str]:
+    """A process that has imported what nodes and commands need, which takes a second, and forks each of them."""
+    command = [sys.executable, "-u", "-c", _SERVER]
+    server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    LASTING.add(server.pid)
+    return server
+
+
+class _Forked:
+    """What `Process` asks of a process, of one that `_server` has forked: a child of ours, as we adopt orphans."""
+
+    def __init__(self, code: str, arguments: list[str], env: dict[str, str], log: Path) -> None:
+        server = _server()
+        assert server.stdin and server.stdout
+        server.stdin.write(json.dumps([code, arguments, env, os.getcwd(), str(log)]) + "\n")
+        server.stdin.flush()
+        self.pid, self._status = int(server.stdout.readline()), None
+
+    def poll(self) -> int | None:
+        if self._status is None and (done := os.waitpid(self.pid, os.WNOHANG))[0]:
+            self._status = os.waitstatus_to_exitcode(done[1])
+        return self._status
+
+    def wait(self, patience: float = PATIENCE) -> int:
+        end = time.monotonic() + patience
+        while (status := self.poll()) is None:
+            if time.monotonic() > end:
+                raise subprocess.TimeoutExpired("program", patience)
+            time.sleep(0.005)
+        return status
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+
 class Process:
     """A process in a group of its own; what it prints goes to a file."""
 
-    def __init__(self, name: str, command: list[str], env: dict[str, str], log: Path) -> None:
+    def __init__(self, name: str, command: list[str], env: dict[str, str], log: Path, forked: bool = False) -> None:
         self.name, self._log = name, log
+        log.touch()
+        if forked:
+            code, *arguments = command
+            self._process: Any = _Forked(code, arguments, env, log)
+            return
         with open(log, "wb") as stream:
             self._process = subprocess.Popen(
                 command, env=env, stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, start_new_session=True
@@ -173,19 +246,20 @@ class World:
 
     # --- processes ---
 
-    def start(self, name: str, *command: str) -> Process:
+    def start(self, name: str, *command: str, forked: bool = False) -> Process:
+        """A new Python with these arguments; forked: code and its arguments, in one that has imported the programs."""
         log = self.folder / f"{len(self._processes)}-{name}.log"
-        process = Process(name, [sys.executable, *command], self.env, log)
+        process = Process(name, [*command] if forked else [sys.executable, *command], self.env, log, forked)
         self._processes.append(process)
         return process
 
     def run_node(self, module: str, parameters: dict[str, Any], *more: str) -> Process:
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
-        return self.start(module, "-c", _NODES.format(module), "--ros-args", *given, *more)
+        return self.start(module, _NODES.format(module), "--ros-args", *given, *more, forked=True)
 
     def command(self, name: str, *arguments: Any) -> Process:
         """`play`, `record`, `watch` or `demo`."""
-        return self.start(name, "-m", "uncertain_lti.cli.main", name, *(str(a) for a in arguments))
+        return self.start(name, _COMMANDS, name, *(str(a) for a in arguments), forked=True)
 
     def monitor(self, model: Path | str, *more: str, name: str = MONITOR, **parameters: Any) -> Process:
         """An envelope_monitor that is active."""
