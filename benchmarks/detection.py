@@ -32,7 +32,8 @@ from typing import Any
 
 import numpy as np
 from coil import coil_runs
-from detectors import DETECTORS, WINDOWS, Array, Learn, averaged, least_squares, table
+from detectors import DETECTORS, WINDOWS, Array, Learn, averaged, least_squares
+from measure import markdown
 from shared_recordings import airborne, crazypad_labels
 from turbofan_fleet import Ramped, first_sample, lever_moves, simulate_fleet
 
@@ -173,10 +174,10 @@ def report(cases: Sequence[Case], raw: Path | None) -> None:
             for k in (1, 2)
         )
         header = (title, "healthy that alarm", *draws[0].faulty)
-        print(table(header, [line.cells(draws[0]) for line in (ours, *equal[:SHOWN], *own[:SHOWN])]), flush=True)
+        print(markdown(header, [line.cells(draws[0]) for line in (ours, *equal[:SHOWN], *own[:SHOWN])]), flush=True)
         if raw is not None:
             raw.mkdir(parents=True, exist_ok=True)
-            text = table(header, [line.cells(draws[0]) for line in (ours, *equal, *own)])
+            text = markdown(header, [line.cells(draws[0]) for line in (ours, *equal, *own)])
             (raw / f"{''.join(c if c.isalnum() else '-' for c in title.lower())}.md").write_text(text)
 
 

@@ -36,11 +36,6 @@ WINDOWS = (10, 30)
 """Rows over which each score is averaged, too: those of the panel."""
 
 
-def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table."""
-    return "".join("| " + " | ".join(line) + " |\n" for line in (header, ["---"] * len(header), *rows))
-
-
 def lagged(rows: Array, lags: int) -> Array:
     """Rows (T, p) as (T - lags, p (lags + 1)), the newest first."""
     return sliding_window_view(rows, lags + 1, axis=0)[..., ::-1].transpose(0, 2, 1).reshape(len(rows) - lags, -1)

@@ -31,9 +31,11 @@ def peak_memory():
     return int(line.split()[1]) * 1024
 
 
+def markdown(header, rows):
+    """A Markdown table."""
+    return "".join("| " + " | ".join(line) + " |\n" for line in (header, ["---"] * len(header), *rows))
+
+
 def table(title, header, rows):
-    """Print a Markdown table."""
-    print(f"\n**{title}**\n")
-    for line in (header, ["---"] * len(header), *rows):
-        print("| " + " | ".join(line) + " |")
-    print(flush=True)
+    """Print a table with its title."""
+    print(f"\n**{title}**\n\n{markdown(header, rows)}", flush=True)

@@ -519,9 +519,14 @@ def test_days_are_read_where_one_order_of_day_and_month_alone_goes_forward(tmp_p
     assert run.t_ns[0] == np.datetime64("2014-01-12T00:00", "ns").astype(int)
 
 
-def test_rows_of_one_day_need_no_order_of_day_and_month(tmp_path):
+def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("Time,x\n" + "".join(f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}\n" for k in range(90)))
     (bag,) = group_recordings([path])
     assert set(np.diff(bag.times).tolist()) == {10**9}
-    assert "column 'Time': its one day, 09/04/2021, is taken for day, month, year" in " ".join(bag.warnings)
+    assert "column 'Time': '09/04/2021 11:00:00' is taken for day, month, year" in " ".join(bag.warnings)
+    for order, first, second in (("day, month", "09/10/16", "10/10/16"), ("month, day", "10/09/16", "10/10/16")):
+        path.write_text("Time,x\n" + "".join(f"{first if k < 24 else second} {k % 24:02},{k}\n" for k in range(48)))
+        (bag,) = group_recordings([path])
+        assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}
+        assert f"is taken for {order}, year" in " ".join(bag.warnings)

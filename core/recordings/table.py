@@ -228,30 +228,41 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
 def _as_iso(where: str, cells: Sequence[object]) -> tuple[Sequence[object], str]:
     """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day and goes forward.
 
-    Where all rows are of one day, the time between them does not depend on the order.
+    Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
     """
     texts = [str(cell).strip() for cell in cells if str(cell).strip()]
     found = [m for m in map(_DAY.fullmatch, texts) if m is not None]
     if not found or len(found) < len(texts):
         return cells, ""
-    orders = []
-    for day, month in ((1, 2), (2, 1)):
+    orders = {}
+    for order, day, month in (("day, month, year", 1, 2), ("month, day, year", 2, 1)):
         texts = [
             f"{m[3] if len(m[3]) == 4 else '20' + m[3]}-{int(m[month]):02}-{int(m[day]):02}T{int(m[4] or 0):02}:"
             f"{m[5] or '00'}:{m[6] or '00'}"
             for m in found
         ]
         if all(1 <= int(text[5:7]) <= 12 for text in texts) and all(a <= b for a, b in pairwise(texts)):
-            orders.append(texts)
-    known = len(orders) == 1 or (orders and orders[0] == orders[1])
-    if known or (orders and len({m.group(1, 2, 3) for m in found}) == 1):
-        iso = iter(orders[0])
-        order = "" if known else f"its one day, {found[0][0].split()[0]}, is taken for day, month, year"
-        return [next(iso) if str(cell).strip() else cell for cell in cells], order
-    raise BagError(
-        f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times such as "
-        f"2026-11-22T06:28:01.25Z"
-    )
+            orders[order] = texts
+    taken, note = list(orders), ""
+    if len({tuple(texts) for texts in orders.values()}) == 2:
+        even = [order for order, texts in orders.items() if _is_even(texts)]
+        taken = even if len(even) == 1 else taken * (len({m.group(1, 2, 3) for m in found}) == 1)
+        note = f"'{found[0][0][:40]}' is taken for {(taken or even or [''])[0]}"
+    if not taken:
+        raise BagError(
+            f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times "
+            f"such as 2026-11-22T06:28:01.25Z"
+        )
+    iso = iter(orders[taken[0]])
+    return [next(iso) if str(cell).strip() else cell for cell in cells], note
+
+
+def _is_even(texts: Sequence[str]) -> bool:
+    """Whether no step between these instants is much longer than the usual one."""
+    if not all(map(_parses, texts)):
+        return False
+    steps = np.diff(np.array([text.replace(",", ".") for text in texts], dtype="datetime64[ms]").astype(np.int64))
+    return len(steps) > 1 and bool(steps.max() <= 2 * np.median(steps))
 
 
 def _parses(text: str) -> bool:
