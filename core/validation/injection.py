@@ -176,13 +176,14 @@ def _response(
     done = point.normalise_u(done)
     faster = np.where(size >= 0, 1.0 / (1.0 + np.abs(size)), 1.0 + np.abs(size))  # of the time constant: slower first
     moved_by = np.zeros_like(x)  # the difference that the fault makes
+    first = windows.onset
     with np.errstate(over="ignore", invalid="ignore"):
-        for k in range(windows.onset, x.shape[1] - 1):
+        healthy, _ = model.centre_and_half(x[:, first:-1], u[:, first:-1], dt[:, first:], s[:, first:-1])
+        for k in range(first, x.shape[1] - 1):
             before, step = x[:, k] + moved_by[:, k], dt[:, k]
             for r in of_states:
                 at = r.position - n
                 done[:, k, at] += _recall(r, moved_by[:, :, r.of] * point.X[r.of], k, dt) / point.U[at]
-            healthy, _ = model.centre_and_half(x[:, k], u[:, k], step, s[:, k])
             faulty, _ = model.centre_and_half(before, done[:, k], step, s[:, k])
             faulty = faulty.copy()
             if kind == "time_constant":
@@ -190,7 +191,7 @@ def _response(
             elif kind == "gain":
                 idle, _ = model.centre_and_half(before, np.zeros_like(u[:, k]), step, s[:, k])
                 faulty[:, i] += size * (faulty[:, i] - idle[:, i])
-            difference = faulty - healthy
+            difference = faulty - healthy[:, k - first]
             # nothing is known of the machine where a sample is missing: the difference stays as it was
             known = np.isfinite(difference).all(axis=1, keepdims=True)
             moved_by[:, k + 1] = np.where(known, difference, moved_by[:, k])
