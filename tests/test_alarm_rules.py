@@ -165,15 +165,6 @@ def test_residuals_that_cannot_be_are_refused(residuals: Any, words: str) -> Non
         assert where in str(refused.value)
 
 
-@pytest.mark.parametrize("counted", [(True, True, True), (True, False, True), (False, False, True)])
-def test_whitening_gives_the_quadratic_form(counted: tuple[bool, ...]) -> None:
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(3, 3))
-    C, r, on = root @ root.T, rng.normal(size=3), np.flatnonzero(counted)
-    white = Residuals(np.zeros(3), C).whitening(counted) @ r
-    assert white @ white == pytest.approx(r[on] @ np.linalg.solve(C[np.ix_(on, on)], r[on]))
-
-
 def test_a_state_that_follows_from_others_adds_nothing_to_the_chi_square() -> None:
     C = np.array([[1.0, 1.0, 0.0], [1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
     white = Residuals(np.zeros(3), C).whitening([True] * 3)

@@ -136,6 +136,8 @@ def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
         ["start", "absent.mcap", "--output", "/sys/x"],
         ["check", "leibov2006", "run.mcap", "--write", "/sys/x.mcap"],
         ["report", "leibov2006", "run.mcap", "--output", "/sys/x.html"],
+        ["plot", "leibov2006", "run.mcap", "--output", "/sys/x.png"],
+        ["layout", "leibov2006", "--foxglove", "/sys/x.json"],
     ],
     ids=lambda arguments: arguments[0],
 )

@@ -184,22 +184,6 @@ def test_a_name_that_the_terminal_has_no_letters_for(tmp_path):
     assert done.returncode == 0 and "gr\\xf6" in done.stdout
 
 
-def test_a_folder_that_cannot_be_written(folder, capsys):
-    """Written to as nobody in particular, since root may write anywhere."""
-    target = "/proc/nowhere"
-    model, bag = str(folder / "m.model.json"), str(folder / "run.mcap")
-    for line in (
-        [*fit_of(folder), "--output", f"{target}.model.json"],
-        ["check", model, bag, "--write", f"{target}.mcap"],
-        ["report", model, bag, "--output", f"{target}.html"],
-        ["layout", model, "--foxglove", f"{target}.json"],
-        ["init", bag, "--output", f"{target}.yaml"],
-        ["plot", model, bag, "--output", f"{target}.png"],
-    ):
-        assert main(line) == 2
-        assert target in capsys.readouterr().err.splitlines()[-1]
-
-
 def test_a_fault_of_the_program_is_no_alarm(folder, monkeypatch, capsys):
     from uncertain_lti.cli import judge
 

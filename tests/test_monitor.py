@@ -140,7 +140,7 @@ def cases(draw: st.DrawFn) -> tuple[UncertainLTI, Transient]:
     return model, Transient(t, z[:, :n], z[:, n:], signals=signals, max_gap=0.05)
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(cases())
 def test_verdicts_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient]) -> None:
     """The margin widens the bounds, which are in recorded units, and not the utilisation."""

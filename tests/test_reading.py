@@ -89,7 +89,7 @@ def same(transient: Transient, reference: Reference) -> None:
     assert +transient.counters == +reference.counters
 
 
-@settings(max_examples=100)
+@settings(max_examples=50)
 @given(cases() | cases(tame=True), st.sampled_from(["none", "lz4", "zstd"]))
 def test_recordings_become_what_the_rules_say(
     tmp_path_factory: pytest.TempPathFactory, case: tuple[SignalMap, list[Sent]], compression: str

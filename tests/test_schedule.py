@@ -21,7 +21,6 @@ import pytest
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
-from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal
 
@@ -35,12 +34,6 @@ def test_between_knots_the_weights_interpolate_and_beyond_them_the_end_holds() -
     expected = [[1, 1, 0.5, 0, 0, 0, 0], [0, 0, 0.5, 1, 0.75, 0, 0], [0, 0, 0, 0, 0.25, 1, 1]]
     np.testing.assert_array_equal(schedule.weights(s), expected)
     np.testing.assert_array_equal(schedule.beyond(s), [True, False, False, False, False, False, True])
-
-
-def test_weights_reproduce_what_is_linear_between_knots() -> None:
-    rng = np.random.default_rng(5)
-    s = rng.uniform(-0.5, 1.0, (1, 200))
-    np.testing.assert_allclose(np.array(SPEED.knots) @ Schedule((SPEED,)).weights(s), s[0], atol=1e-15)
 
 
 def test_a_mode_holds_alone_and_one_that_is_not_listed_is_unknown() -> None:
@@ -146,15 +139,6 @@ def test_a_point_that_no_block_holds_at_is_refused_by_its_signal() -> None:
     ):
         with pytest.raises(ModelError, match=words):
             model.at(speed=speed, gear=gear)
-
-
-def test_the_same_block_at_every_knot_is_the_model_without_a_schedule() -> None:
-    model = scheduled(np.random.default_rng(4), Schedule((SPEED,)))
-    one = model.blocks[1]
-    tied = model.replace(**{name: np.stack([getattr(one, name)] * 3) for name in ARRAYS})
-    rng = np.random.default_rng(5)
-    x, u = rng.normal(size=(50, 2)), rng.normal(size=(50, 1))
-    np.testing.assert_allclose(tied.bounds(x, u, 0.1), one.bounds(x, u, 0.1), rtol=1e-13, atol=1e-13)
 
 
 def test_the_monitor_says_where_the_regime_is_unknown_and_gives_no_verdict_on_a_strange_mode() -> None:

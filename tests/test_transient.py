@@ -49,7 +49,7 @@ def runs(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, fl
     return t, z[:, :n], z[:, n:], draw(st.sampled_from([0.02, 0.05])), draw(st.sampled_from([0.0, 0.0, 0.02]))
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(runs())
 def test_cut_and_judged_usable_as_the_sampler_does(run: tuple[Any, ...]) -> None:
     t, x, u, max_gap, min_step = run
