@@ -14,7 +14,7 @@ import os
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
@@ -64,8 +64,9 @@ def checked(model, count, jumps=(), gaps=(), back=(), unknown=()):
     return EnvelopeMonitor(model).check(Transient(10**18 + np.cumsum(step), x, u, name="/tmp/$a$.mcap", max_gap=0.1))
 
 
+@settings(max_examples=30)
 @given(
-    count=st.integers(2 * PIXELS + 1, 40_000),
+    count=st.integers(2 * PIXELS + 1, 10_000),
     jumps=st.lists(st.integers(1, 2 * PIXELS), max_size=20),
     gaps=st.lists(st.integers(1, 2 * PIXELS), max_size=4),
     back=st.lists(st.integers(1, 2 * PIXELS), max_size=1),
