@@ -76,14 +76,8 @@ def two_at_once(messages: list[Message]) -> list[Message]:
     return [(came + 1e-5 * k + 0.4 * STEP * (k > 0), *message) for k, (_, *message) in enumerate(early)] + messages[4:]
 
 
-DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {
-    "on time": lambda m: m,
-    "controls come 3 s after the states": lambda m: held_up(m, CONTROL_TOPIC, 0.0, 3.0),
-    "both come in bursts": lambda m: held_up(held_up(m, STATE_TOPIC, 0.0, 2.0), CONTROL_TOPIC, 0.0, 2.1),
-    "states come 0.6 s after the controls": lambda m: held_up(m, STATE_TOPIC, 0.0, 0.6),
+DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {  # of others `perturbed.held_up_on_the_way` has any
     "two samples come at once, their states less so": two_at_once,
-    "stopped, then topic by topic": lambda m: stopped(m, 5.01, 10**6, STATE_TOPIC),
-    "stopped, then in chunks, controls first": lambda m: stopped(m, 5.01, 7, CONTROL_TOPIC),
     "stopped, then in parts": in_parts,
     "stopped, and controls 3 s later": lambda m: held_up(stopped(m, 5.01, 16, STATE_TOPIC), CONTROL_TOPIC, 5.01, 12.0),
 }

@@ -92,6 +92,11 @@ def test_an_unknown_fault_stays_unknown(taught: UncertainLTI) -> None:
         assert found["label"] is None and "looks like no known fault" in found["text"]
 
 
+def test_recordings_of_one_label_that_are_not_alike_do_not_name_each_other(model: UncertainLTI) -> None:
+    labelled = [("one", EnvelopeMonitor(model).check(run(100, fault))) for fault in FAULTS[:2]]
+    assert [found for *_, found in learn_signatures(model, labelled).named] == ["", ""]
+
+
 def test_faults_that_look_alike_are_both_named_and_neither_is_chosen(taught: UncertainLTI) -> None:
     (known,) = (s for s in taught.signatures if s.label == FAULTS[0])
     twins = taught.replace(signatures=[Signature(label, known.steps, known.moments) for label in ("one", "two")])

@@ -87,6 +87,7 @@ def test_cut_and_judged_usable_as_the_sampler_does(run: tuple[Any, ...]) -> None
     assert transient.segments == len(opens)
 
 
+@settings(max_examples=40)
 @given(runs())
 def test_a_transient_of_its_own_samples_is_itself(run: tuple[Any, ...]) -> None:
     t, x, u, max_gap, min_step = run
@@ -246,6 +247,7 @@ def pandas_fixture() -> Any:
     return pytest.importorskip("pandas")
 
 
+@settings(max_examples=40)
 @given(runs())
 def test_a_data_frame_gives_what_its_arrays_give(run: tuple[Any, ...]) -> None:
     pandas = pytest.importorskip("pandas")
@@ -306,6 +308,7 @@ def read(folder: Path, text: str | bytes, **options: Any) -> Transient:
         return Transient.from_csv(path, **({"time": "t", "states": ["x"], "controls": ["u"]} | options))
 
 
+@settings(max_examples=40)
 @given(runs(), st.sampled_from([",", ";", "\t"]), st.booleans())
 def test_a_csv_file_gives_what_its_arrays_give(
     tmp_path_factory: pytest.TempPathFactory, run: tuple[Any, ...], delimiter: str, quoted: bool
