@@ -299,6 +299,17 @@ def test_input_that_never_moves_is_named():
             assert (model.B[:, 1] == 0).all() and (model.dB[:, 1] == 0).all()
 
 
+def test_a_fit_does_not_end_for_what_is_said_of_it(monkeypatch):
+    """Of exact data of a simulator no solver finds which samples carry the width; the fit itself is done by then."""
+
+    def gives_up(*_):
+        raise FitError("no solver could solve the quadratic programme")
+
+    raw = drawn(small_plant(1, 2, 2), 400, 1, rest=0)
+    monkeypatch.setattr("uncertain_lti.identification.discard._solve", gives_up)
+    assert count_outside(fit(raw, additive="noise", seek_carriers=True), [raw]) == 0
+
+
 def test_inputs_that_never_move_are_named_in_one_message():
     raw = drawn(small_plant(1, 2, 3), 200, 1, rest=0)
     u = raw.u * [1.0, 0.0, 0.0]

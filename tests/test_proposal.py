@@ -710,6 +710,8 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         assert re.search(words, proposal.text), words
     model = fitted([path], proposal)
     assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0
+    noise = [message for message in model.fit_summary["messages"] if "'Temp' moves like noise" in message]
+    assert noise and "leave it out" not in noise[0] and "its level is judged" in noise[0]  # as the proposal has it
 
 
 def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_and_set_points_as_controls(tmp_path):

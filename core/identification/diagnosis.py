@@ -25,6 +25,7 @@ from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.evidence import (
     DETERMINED,
+    FASTEST,
     NOISE,
     autocorrelation,
     lagged_states,
@@ -513,9 +514,13 @@ def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
     n = problem.n
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
     moving = np.ptp(problem.z[:, :n], axis=0) > 0
+    slow = float(np.median(problem.dt)) * FASTEST >= 1.0
+    remedy = (
+        "its level is judged; how it moves needs faster rows" if slow else "leave it out, or record the machine at work"
+    )
     return {
         i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "
-        f"variance at the next; leave it out, or record the machine at work"
+        f"variance at the next; {remedy}"
         for i in np.flatnonzero(moving & (share < NOISE)).tolist()
     }
 
@@ -576,8 +581,8 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
     named = [m for m in messages if f"'{state}'" in m]
     if any(words in m for words in (_CODE, "wraps around", "change sign together") for m in named):
         return "it jumps without moving, as said above"
-    if any(_NOISE in m for m in named):
-        return "it moves like noise: leave it out, or record the machine at work"
+    if noise := [m for m in named if _NOISE in m]:
+        return f"it moves like noise: {noise[0].rpartition('; ')[2]}"
     found = [remedy for words, own, remedy in _REMEDIES if any(words in m for m in (named if own else messages))]
     return ", or ".join(dict.fromkeys([*found, *(["try --additive noise"] if additive == "none" else [])]))
 

@@ -23,6 +23,8 @@ from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.horizon import unbroken_over
 from uncertain_lti.signals.signal_map import Signal
 
+FASTEST = 1.05
+"""Rows per second up to which a recording is of a plant: most sensors answer within a row, and levels are judged."""
 NOISE = 0.5
 """A state of whose variance less than this share is predicted from one sample to the next moves like noise."""
 FOLLOW, ALTERNATE = 0.5, -0.7

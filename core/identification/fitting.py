@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal
@@ -286,7 +286,10 @@ def fit_fleet(
         if describe_on is None:
             return None
         whole = describe_on.N == sums.count and method == "working-set"
-        few = carriers(describe_on, structure) if seek_carriers and whole else None
+        few = None
+        if seek_carriers and whole:
+            with suppress(FitError):  # a fit that is done does not end for what is said of it
+                few = carriers(describe_on, structure)
         rank, messages = describe(
             model, describe_on, sums, found.mean_width, transients, few, discarded if criterion == "qp" else None
         )

@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.identification.evidence import LONGEST_DELAY, NOISE, lags, predicted
+from uncertain_lti.identification.evidence import FASTEST, LONGEST_DELAY, NOISE, lags, predicted
 from uncertain_lti.proposal.candidates import (
     FAINT,
     FEWEST,
@@ -375,8 +375,6 @@ def _spread(values: Array) -> Array:
     return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300)[:, None])
 
 
-FASTEST = 1.05
-"""Rows per second up to which a table is of a plant: most of its sensors answer within a row, and all are judged."""
 MOST_VALUES = 8
 """Values of a command that is switched, at most."""
 TOLD = 0.9
