@@ -9,10 +9,10 @@
 
 """Updates of models against the fit of all recordings: how many are proven, and how far their objective is from it.
 
-python benchmarks/update.py            # the engine's recordings, random plants, and real flights if they are there
+python benchmarks/update.py            # the engine's recordings, random plants, and real robots if they are there
 python benchmarks/update.py plants     # those alone
 
-Of each machine the first third of its recordings and more, up to all but one, are fitted, and updated with the next.
+Of each machine some of its recordings, drawn at random and in any order, are fitted, and updated with one or two others.
 """
 
 import sys
@@ -39,9 +39,13 @@ def turbofan():
 
 
 def plants():
-    for seed in range(4):
+    for seed in range(8):
         for n, m in ((2, 1), (4, 2), (8, 3)):
-            yield pieces(plant(n, m, 40_000, seed))
+            yield pieces(plant(n, m, 40_000, seed), 5)
+
+
+def go2():
+    yield pieces(read_shared("go2", "go2/test_3.mcap")[0], 8)
 
 
 def crazypad():
@@ -52,18 +56,22 @@ def crazypad():
 def main():
     """A row for each machine and criterion."""
     rows = []
-    known = {"turbofan": turbofan, "plants": plants} | ({"crazypad": crazypad} if DATA.is_dir() else {})
+    known = {"turbofan": turbofan, "plants": plants}
+    known |= {"crazypad": crazypad, "go2": go2} if DATA.is_dir() else {}
     for name in sys.argv[1:] or known:
         for criterion, number in (("qp", "(10)"), ("lp", "(11)")):
             options, apart, refused = {"additive": "noise", "alarm": "containment"}, [], 0
+            rng = np.random.default_rng(0)
             for runs in known[name]():
                 for k in range(max(len(runs) // 3, 1), len(runs)):
+                    order = rng.permutation(len(runs))[: k + int(rng.integers(1, 3))]
+                    some, more = ([runs[i] for i in part] for part in np.split(order, [k]))
                     try:
-                        model = fit(runs[:k], criterion, **options).update(runs[k])
+                        model = fit(some, criterion, **options).update(more)
                     except FitError:
                         refused += 1
                         continue
-                    whole = fit(runs[: k + 1], criterion, **options).fit_summary["objective"]
+                    whole = fit(some + more, criterion, **options).fit_summary["objective"]
                     apart.append(np.abs(np.divide(model.fit_summary["objective"], whole) - 1.0).max())
             rows.append([name, number, str(len(apart)), str(refused), f"{max(apart, default=0.0):.0e}"])
     table("updates", ["machine", "criterion", "proven", "refused", "objective apart"], rows)
