@@ -271,7 +271,7 @@ def test_each_rule_names_the_states_that_it_blames() -> None:
     alarm = Alarm(rules, two_states(), np.ones(2, dtype=bool))
     found = [(r.label, r.horizon, r.state, r.value) for r in alarm.reasons(range(4), values, sizes, flags)]
     assert found == [
-        ("containment", 1, "x1", 1.0), ("containment@4", 4, "x2", 1.0), ("mean", 1, "x2", -1.1), ("chi2", 1, "", 7.0),
+        ("containment", 1, "x1", 1.0), ("containment@4", 4, "x2", 1.0), ("mean", 1, "x2", -1.1), ("chi2", 1, "x2", 7.0),
     ]  # fmt: skip
     masked = Alarm(rules, two_states(), np.array([False, True])).reasons(range(3), values, sizes, flags)
     assert [(r.label, r.state) for r in masked] == [("containment", ""), ("containment@4", "x2"), ("mean", "x2")]

@@ -53,19 +53,25 @@ def model(runs):
 
 def test_fit_alone_gives_a_panel_that_is_quiet_on_what_it_saw_and_sees_what_it_promises(model, runs):
     kinds = [(rule.kind, rule.window_s) for rule in model.alarm]
-    assert kinds == [("energy", 0.0), ("energy", pytest.approx(1.05)), ("mean", pytest.approx(3.05)),
-                     ("chi2", pytest.approx(3.05))]  # fmt: skip
+    assert kinds == [("energy", 0.0), ("energy", pytest.approx(1.05)), ("ewma", pytest.approx(10.05))]
     monitor, alarm = EnvelopeMonitor(model), model.fit_summary["alarm"]
     assert not any(monitor.check(run).alarm.any() for run in runs)
     assert alarm["worth"] == "good" and alarm["alarms"] == 0 and alarm["units"] == 8
     one_rule = rate_interval(np.zeros(8), alarm["hours"], 0.9, one_sided=True)[1]
-    four_rules = rate_interval(np.full(8, 3 / 8), alarm["hours"], 0.9, one_sided=True)[1]
-    assert alarm["limit_per_hour"] >= four_rules > one_rule
-    bias = 2 * alarm["biases"][0]
+    three_rules = rate_interval(np.full(8, 2 / 8), alarm["hours"], 0.9, one_sided=True)[1]
+    assert alarm["limit_per_hour"] >= three_rules > one_rule
+    bias = 3 * alarm["biases"][0]
     seen = [monitor.check(plant(100 + seed, bias=bias)) for seed in range(6)]
     for verdicts in seen:
         first = verdicts.transient.t[verdicts.alarm]
         assert len(first) and 0 <= first[0] - 30.0 <= alarm["within"] + DT
+
+
+def test_a_slow_average_takes_four_recordings_that_say_how_far_they_differ(runs):
+    for count, slow in ((1, {"mean", "chi2"}), (3, {"mean", "chi2"}), (4, {"ewma"})):
+        assert {rule.kind for rule in fit(runs[:count], "lp", additive="noise").alarm} == {"energy", *slow}
+    alone = [Transient(run.t, run.x[:, :1], run.u) for run in runs]
+    assert [rule.kind for rule in fit(alone, "lp", additive="noise").alarm] == ["energy", "energy", "ewma"]
 
 
 def test_flags_stay_those_of_the_bounds(model, runs):
@@ -236,9 +242,9 @@ def test_windows_are_at_most_a_tenth_of_what_was_left_out(runs):
 
     model = plain(runs, "lp", additive="noise", describe_data=False)
     for steps in (5, 40, 95, 1000):
-        for rule in rules_for(model, steps, DT):
+        for rule in [*rules_for(model, steps, DT), *rules_for(model, steps, DT, apart=True)]:
             window = round(rule.window_s / DT - 0.5) if rule.window_s else 1
-            assert window <= max(steps / (3 if rule.kind in ("mean", "chi2") else 10), 1)
+            assert window <= max(steps / {"energy": 10, "mean": 3, "chi2": 3, "ewma": 2}[rule.kind], 1)
 
 
 def test_a_rare_event_of_one_recording_does_not_silence_the_alarm(runs):
@@ -319,7 +325,7 @@ def test_large_problems_are_armed_by_what_was_fitted(runs, monkeypatch):
     monkeypatch.setattr("uncertain_lti.validation.monitor_fit.LIMIT", 10.0)
     model = fit(runs, "lp", additive="noise")
     alarm = model.fit_summary["alarm"]
-    assert "learnt on fitted data" in alarm["note"] and len(model.alarm) == 4
+    assert "learnt on fitted data" in alarm["note"] and len(model.alarm) == 3
     assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in runs)
 
 

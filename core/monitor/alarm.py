@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import WORTH_THREADS, Array, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
-from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, labels
+from uncertain_lti.model.alarm_rule import CONTAINMENT, JOINT, KINDS, AlarmRule, Rule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.field_path import FieldPath
 
@@ -40,7 +40,8 @@ class Raised:
     """One reason for the alarm.
 
     `label`: of the rule, as of `alarm_rule.labels`; `kind`: of the rule; `horizon`: of the rule, in steps; `state`: the
-    state; empty for all together, and where no state of this verdict is to blame; `value`: the statistic over its
+    state; of a joint statistic the one of which a statistic of its own is nearest to its threshold, if there is one;
+    empty where no state of this verdict is to blame; `value`: the statistic over its
     threshold, with its sign; 1 of containment; `span`: the window of the rule in words, if another rule of its kind and
     horizon has to be told from it.
     """
@@ -56,6 +57,8 @@ class Raised:
     def words(self) -> str:
         """`energy of fan_speed over 40 steps at 1.3 times its threshold`, for example."""
         state = f" of {self.state}" if self.state else ""
+        if self.kind in JOINT:
+            state = " of all states" + f" (nearest: {self.state})" * bool(self.state)
         over = f" over {self.horizon} steps" if self.horizon > 1 else ""
         what = f"{self.kind}{state}{over}" + f" ({self.span})" * bool(self.span)
         return what if self.kind == "containment" else f"{what} at {abs(self.value):.3g} times its threshold"
@@ -185,12 +188,20 @@ class Alarm:
                 continue
             begin = self._begins[i]
             if rule.kind in JOINT:
-                found.append(Raised(label, rule.kind, rule.horizon, "", float(values[begin]), span))
+                state = self._nearest_state(values)
+                found.append(Raised(label, rule.kind, rule.horizon, state, float(values[begin]), span))
                 continue
             for j in np.flatnonzero(self._counted).tolist():
                 if abs(values[begin + j]) > 1.0:
                     found.append(Raised(label, rule.kind, rule.horizon, names[j], float(values[begin + j]), span))
         return tuple(found)
+
+    def _nearest_state(self, values: Sequence[float]) -> str:
+        """The state of which a statistic of its own is nearest to its threshold; empty where there is none."""
+        begins = [b for rule, b in zip(self.rules, self._begins, strict=True) if rule.kind not in (CONTAINMENT, *JOINT)]
+        counted = np.flatnonzero(self._counted).tolist()
+        near = [(abs(values[b + j]), j) for b in begins for j in counted if values[b + j] == values[b + j]]
+        return self._model.state_names[max(near)[1]] if near else ""
 
     def over(
         self,

@@ -9,10 +9,10 @@
 
 """The panel: a small fixed set of alarm rules, whose thresholds are learnt on what was left out of the fit.
 
-The size of a rule is |utilisation| of one verdict, the root of the mean square over a window, the size of the mean over
-a window, or the root of the joint chi-square. Its threshold for a state is the largest size on healthy data, whether
-left out or fitted, with an allowance for the largest of so few: of N independent windows, sizes of n states reach
-beyond those of one as the quantiles of a normal distribution do,
+The size of a rule is |utilisation| of one verdict, the root of the mean square over a window or of a moving average,
+the size of the mean over a window, or the root of the joint chi-square. Its threshold for a state is the largest size
+on healthy data, whether left out or fitted, with an allowance for the largest of so few: of N independent windows,
+sizes of n states reach beyond those of one as the quantiles of a normal distribution do,
 
     threshold = median + a (largest - median),   a = sqrt(log(N n) / log N).
 
@@ -47,8 +47,12 @@ from uncertain_lti.validation.intervals import cluster_size, rate_interval
 from uncertain_lti.validation.part import Part, by_unit, rising, unit_numbers
 from uncertain_lti.validation.result import Validation
 
-PANEL = (("energy", 1, 1), ("energy", 10, 10), ("mean", 30, 3), ("chi2", 30, 3))
+PANEL = (("energy", 1, 1), ("energy", 10, 10))
 """Kind and window of each rule, in verdicts, and how many such windows a typical left-out stretch must hold."""
+SLOW = (("ewma", 100, 2),)
+"""The same of slow rules, where TELLING recordings or groups say how far they differ."""
+SLOW_OF_FEW = (("mean", 30, 3), ("chi2", 30, 3))
+"""The same of fewer, or of one, whose blocks share what drifts slowly."""
 FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
 CONFIDENCE = 0.9
@@ -223,15 +227,15 @@ class Panel:
         }
 
 
-def rules_for(model: UncertainLTI, steps: int, dt: float) -> list[StatisticRule]:
+def rules_for(model: UncertainLTI, steps: int, dt: float, apart: bool = False) -> list[StatisticRule]:
     """The rules of a panel with thresholds of 1, for left-out stretches of so many steps of dt, s.
 
-    The same rules look at the longest horizon of the model.
+    The same rules look at the longest horizon of the model. `apart`: TELLING recordings or groups are left out.
     """
     found = []
     longest = {horizon.steps: horizon.residuals for horizon in model.horizons[-1:]}
     for h, residuals in ({1: model.residuals} | longest).items():
-        for kind, window, least in PANEL:
+        for kind, window, least in (*PANEL, *(SLOW if apart else SLOW_OF_FEW)):
             window = min(window, steps // least)
             if window < 1 or (kind in JOINT and (model.n < 2 or residuals is None)):
                 continue
@@ -271,7 +275,8 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
         raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
     dt = float(np.median(np.concatenate([part.dt for part in parts])))
     lengths = sorted(part.judged for part in parts)
-    rules = rules_for(validation.model, lengths[len(lengths) // 10], dt)
+    apart = validation.what != "block" and int(unit_numbers(parts).max()) + 1 >= TELLING
+    rules = rules_for(validation.model, lengths[len(lengths) // 10], dt, apart)
     evidence, shown, unlike = _gathered(rules, parts, fitted, dt)
     found = evidence.with_alarms(rules, validation.what, shown)
     while rate is not None and _limit(found, len(rules)) <= rate and found.factor > _LEAST:
