@@ -9,10 +9,10 @@
 
 """Updates of models against the fit of all recordings: how many are proven, and how far their objective is from it.
 
-python benchmarks/update.py            # the engine's recordings, random plants, and real robots if they are there
+python benchmarks/update.py            # the engine, random plants, and real robots if they are there
 python benchmarks/update.py plants     # those alone
 
-Of each machine some of its recordings, drawn at random and in any order, are fitted, and updated with one or two others.
+Of each machine some recordings, drawn at random and in any order, are fitted, and updated with one or two others.
 """
 
 import sys
