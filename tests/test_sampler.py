@@ -589,6 +589,29 @@ def at(topic: str, arrival: int, stamp: int | None, value: float = 1.0) -> Sent:
     return Sent(topic, arrival * TICK, None if stamp is None else stamp * TICK, (value,))
 
 
+def test_what_is_as_new_as_the_chosen_message_comes_late_and_what_is_older_does_not() -> None:
+    sampler = Sampler(two_topics())
+    for message in (at("/u", 5, 5), at("/c", 6, 6), at("/c", 7, 7)):
+        sampler.push(*message)
+    for stamp, late in ((4, 0), (5, 1), (6, 2)):
+        sampler.push(*at("/u", 8, stamp))
+        assert sampler.counters["late /u"] == late
+
+
+STEPS_BACK = [
+    "c105 u106 u101 c107 c108",
+    "c101 u101 u52 u103 c54 u55 c7",
+    "u50 u1 c6 u11 u12 u-33 u19 c21 c23 c28",
+]
+"""Stamps that tell a rule of a step back from its neighbour; so few streams do that drawn ones seldom show it."""
+
+
+@pytest.mark.parametrize("stamps", STEPS_BACK)
+def test_stated_steps_back_follow_the_rules(stamps: str) -> None:
+    messages = [at(f"/{one[0]}", 100 + k, int(one[1:]), float(k)) for k, one in enumerate(stamps.split())]
+    hold_against(Reference(two_topics(), messages, forgets=True), two_topics(), messages)
+
+
 @pytest.mark.parametrize("control_first", [True, False])
 def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: bool) -> None:
     """Otherwise a hundred old messages are kept and looked through at every sample from there on."""
