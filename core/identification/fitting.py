@@ -35,7 +35,6 @@ from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem, Regimes
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
-from uncertain_lti.identification.solver_processes import solver_processes
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 from uncertain_lti.model.alarm_rule import AlarmRule
@@ -213,7 +212,6 @@ def _memory(
     return remembered(model, problem, recordings, sums)
 
 
-@solver_processes()
 @one_thread_each()
 def fit_fleet(
     fleet: Fleet,

@@ -11,18 +11,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification.solver_processes import aside
 
-T = TypeVar("T")
 Sense = NDArray[np.int32]
 
 FEASIBLE = 1e-9
@@ -40,8 +38,6 @@ _NEAR = 2
 """Rows per unknown that a programme begins with."""
 MANY = 60
 """Unknowns from which on an interior point finds what is active sooner than an active-set method."""
-APART = 120
-"""Unknowns from which on a programme takes so long that it is worth a process of its own."""
 _ANEW, _NEAR_INSIDE = 0.02, 3
 """Then: violated rows per unknown from which on it begins anew, and rows per unknown that it begins with."""
 
@@ -170,20 +166,6 @@ _Found = tuple[Array | None, Sense | None]
 
 
 def _daqp(of: Programme, active: Sense | None) -> _Found:
-    return _side_by_side(_daqp_here, of, active)
-
-
-def _piqp(of: Programme, _: Sense | None) -> _Found:
-    found = _side_by_side(_inside_here, of, 1e-12)
-    return (None if found is None else found[0]), None
-
-
-def _side_by_side(solver: Callable[..., T], of: Programme, *options: Any) -> T:
-    """Solve a programme; a large one in a process of its own, as the bindings hold the interpreter's lock."""
-    return aside(solver, of, *options) if len(of.f) >= APART else solver(of, *options)
-
-
-def _daqp_here(of: Programme, active: Sense | None) -> _Found:
     import daqp
 
     size, count = len(of.f), len(of.h)
@@ -202,8 +184,7 @@ def _daqp_here(of: Programme, active: Sense | None) -> _Found:
     return None, None
 
 
-def _inside_here(of: Programme, accuracy: float) -> tuple[Array, Array, Array] | None:
-    """Minimiser of an interior point, and of [lower and upper bounds of ξ; rows of G] multipliers and slacks."""
+def _inside(of: Programme, accuracy: float) -> Any:
     import piqp
 
     solver = piqp.DenseSolver()
@@ -211,19 +192,22 @@ def _inside_here(of: Programme, accuracy: float) -> tuple[Array, Array, Array] |
     solver.settings.eps_rel = accuracy
     solver.settings.max_iter = 500
     solver.setup(of.H, of.f, None, None, of.G, of.h, np.full(len(of.h), np.inf), of.lower, of.upper)
-    if solver.solve() not in (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED):
-        return None
-    found = solver.result
-    multiplier = np.concatenate([found.z_bl, found.z_bu, found.z_l])
-    return np.array(found.x, dtype=np.float64), multiplier, np.concatenate([found.s_bl, found.s_bu, found.s_l])
+    done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
+    return solver.result if solver.solve() in done else None
+
+
+def _piqp(of: Programme, _: Sense | None) -> _Found:
+    found = _inside(of, 1e-12)
+    return (None if found is None else np.array(found.x, dtype=np.float64)), None
 
 
 def _active_inside(of: Programme) -> Sense | None:
     """What an interior point says is active: by the ratio of multiplier and slack, as much as can be independent."""
-    found, size = _side_by_side(_inside_here, _scaled(of)[0], 1e-9), len(of.f)
+    found, size = _inside(_scaled(of)[0], 1e-9), len(of.f)
     if found is None:
         return None
-    _, multiplier, slack = found
+    multiplier = np.concatenate([found.z_bl, found.z_bu, found.z_l])
+    slack = np.concatenate([found.s_bl, found.s_bu, found.s_l])
     share = multiplier / np.maximum(multiplier + slack, 1e-300)
     largest = np.argsort(-share)[:size]
     largest = largest[share[largest] > 0.5]

@@ -390,7 +390,7 @@ class WorkingSet:
             row.widen_pool(most=4 * (row.r + row.q))
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
-        """Settle rows on all cores, though DAQP and PIQP hold the lock; with full weights, all at once."""
+        """Settle rows on all cores, though PIQP holds the lock; with full weights, all at once."""
         if self._together:
             settle(rows[0])
             return
@@ -417,6 +417,7 @@ class WorkingSet:
         columns, count = self.fleet.columns, self.fleet.columns.count
         each = 8 * SUBSAMPLE * (3 * self.fleet.p + len(columns.nominal) + len(columns.half)) * count
         size = max(1, _HELD_BYTES // each)
+        size += size % 2  # as many for either of two cores
         return [rows[k : k + size] for k in range(0, len(rows), size)]
 
     def _settle_and_prove(self, settle: Settle, rows: list[Row]) -> None:
