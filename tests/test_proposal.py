@@ -726,11 +726,11 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
         rows.append([f"{t:.2f}", speed, target, load, brake, 1 - brake, rng.integers(0, 2) if k % 9 == 0 else 0, label])
         speed += 0.9 * (target - speed) * (1 - 0.5 * brake) + 0.01 * rng.normal()
         load += 0.1 * (target - load) + 0.05 * brake + 0.01 * rng.normal()
-    names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Load", "Brake_IN", "Released", "Idle", "Label"]
+    names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Angle_of_Attack", "Brake_IN", "Released", "Idle", "Label"]
     path = tmp_path / "drive.csv"
     path.write_text(",".join(names) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
     proposal = propose([path])
-    assert [c.path for c in proposal.states] == ["Axis_ActSpeed", "Load"], proposal.text
+    assert [c.path for c in proposal.states] == ["Axis_ActSpeed", "Angle_of_Attack"], proposal.text
     assert [c.path for c in proposal.controls] == ["Axis_SetSpeed", "Brake_IN"], proposal.text
     for words in ("Label: a label by its name", "Idle.*shows in the next step of none", "Released: moves with"):
         assert re.search(words, proposal.text), words

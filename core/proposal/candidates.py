@@ -263,7 +263,9 @@ _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in 
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
 
 
-_LABEL = re.compile(r"(anomaly|anomalous|attack|att_?flag|fault|label|^class$|change_?point|ground_?truth|is_?normal)")
+_LABEL = re.compile(r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal)")
+_LABELS = 30
+"""Values that a label takes, at most."""
 
 
 _REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
@@ -349,8 +351,10 @@ def set_aside_labels(sources: Sequence[Source]) -> list[str]:
             continue
         values = np.concatenate([np.empty(0), *candidate.values])
         values = values[np.isfinite(values)]
+        if len(found := np.unique(values)) > _LABELS:  # an angle of attack, for example
+            continue
         candidate.reason = "a label by its name, and no signal of the machine"
-        if len(found := np.unique(values)) > 1:
+        if len(found) > 1:
             usual = found[np.argmax([np.count_nonzero(values == value) for value in found])]
             warnings.append(
                 f"{candidate.path} looks like a label, and is not {usual:.6g} in "
