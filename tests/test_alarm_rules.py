@@ -275,6 +275,8 @@ def test_each_rule_names_the_states_that_it_blames() -> None:
     ]  # fmt: skip
     masked = Alarm(rules, two_states(), np.array([False, True])).reasons(range(3), values, sizes, flags)
     assert [(r.label, r.state) for r in masked] == [("containment", ""), ("containment@4", "x2"), ("mean", "x2")]
+    (joint,) = Alarm(rules, two_states(), np.array([True, False])).reasons([3], values, sizes, flags)
+    assert joint.words == "chi2 of all states (nearest: x1) at 7 times its threshold"
 
 
 @pytest.mark.parametrize(

@@ -23,6 +23,7 @@ from hypothesis import strategies as st
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.proposal.candidates import Candidate, Source
 from uncertain_lti.proposal.choosing import choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
@@ -712,6 +713,7 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0
     noise = [message for message in model.fit_summary["messages"] if "'Temp' moves like noise" in message]
     assert noise and "leave it out" not in noise[0] and "its level is judged" in noise[0]  # as the proposal has it
+    assert "its level is judged, how it moves needs faster rows" in remedies(noise, "noise", "Temp")
 
 
 def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_and_set_points_as_controls(tmp_path):

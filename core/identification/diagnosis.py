@@ -516,7 +516,7 @@ def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
     moving = np.ptp(problem.z[:, :n], axis=0) > 0
     slow = float(np.median(problem.dt)) * FASTEST >= 1.0
     remedy = (
-        "its level is judged; how it moves needs faster rows" if slow else "leave it out, or record the machine at work"
+        "its level is judged, how it moves needs faster rows" if slow else "leave it out, or record the machine at work"
     )
     return {
         i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "

@@ -17,7 +17,7 @@ from __future__ import annotations
 import operator
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import WORTH_THREADS, Array, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
-from uncertain_lti.model.alarm_rule import CONTAINMENT, JOINT, KINDS, AlarmRule, Rule, labels
+from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, labels
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.signals.field_path import FieldPath
 
@@ -41,9 +41,9 @@ class Raised:
 
     `label`: of the rule, as of `alarm_rule.labels`; `kind`: of the rule; `horizon`: of the rule, in steps; `state`: the
     state; of a joint statistic the one of which a statistic of its own is nearest to its threshold, if there is one;
-    empty where no state of this verdict is to blame; `value`: the statistic over its
-    threshold, with its sign; 1 of containment; `span`: the window of the rule in words, if another rule of its kind and
-    horizon has to be told from it.
+    empty where no state of this verdict is to blame; `value`: the statistic over its threshold, with its sign; 1 of
+    containment; `span`: the window of the rule in words, if another rule of its kind and horizon has to be told from
+    it.
     """
 
     label: str
@@ -74,6 +74,11 @@ class Nearest(NamedTuple):
     state: str
     value: float
     threshold: float
+
+    @property
+    def share(self) -> float:
+        """Its size over its threshold."""
+        return abs(self.value) / self.threshold
 
 
 def row_of(rule: Rule, model: UncertainLTI) -> int:
@@ -153,18 +158,23 @@ class Alarm:
         """Each statistic over its threshold, 1 and -1 being the threshold, in the order of `names`."""
         return self._statistics.values()
 
-    def nearest(self, values: Sequence[float]) -> dict[str, Nearest]:
-        """Of each rule with a statistic the one that is nearest to its threshold."""
-        found, n = {}, self._model.n
+    def _known(self, values: Sequence[float]) -> Iterator[tuple[Rule, str, Nearest]]:
+        """Each statistic that has a value, with its rule and what that is called."""
         for rule, label, begin in zip(self.rules, self.labels, self._begins, strict=True):
             if isinstance(rule, AlarmRule):
                 continue
-            limits = rule.thresholds(n)
+            limits = rule.thresholds(self._model.n)
             names = (EVERY_STATE,) if rule.kind in JOINT else self._model.state_names
-            part = zip(values[begin : begin + len(limits)], limits, names, strict=True)
-            known = [Nearest(name, value * limit, limit) for value, limit, name in part if value == value]
-            if known:
-                found[label] = max(known, key=lambda nearest: abs(nearest.value) / nearest.threshold)
+            for value, limit, name in zip(values[begin : begin + len(limits)], limits, names, strict=True):
+                if value == value:
+                    yield rule, label, Nearest(name, value * limit, limit)
+
+    def nearest(self, values: Sequence[float]) -> dict[str, Nearest]:
+        """Of each rule with a statistic the one that is nearest to its threshold."""
+        found = dict[str, Nearest]()
+        for _, label, one in self._known(values):
+            if label not in found or one.share > found[label].share:
+                found[label] = one
         return found
 
     def raised(self) -> tuple[int, ...]:
@@ -198,10 +208,9 @@ class Alarm:
 
     def _nearest_state(self, values: Sequence[float]) -> str:
         """The state of which a statistic of its own is nearest to its threshold; empty where there is none."""
-        begins = [b for rule, b in zip(self.rules, self._begins, strict=True) if rule.kind not in (CONTAINMENT, *JOINT)]
-        counted = np.flatnonzero(self._counted).tolist()
-        near = [(abs(values[b + j]), j) for b in begins for j in counted if values[b + j] == values[b + j]]
-        return self._model.state_names[max(near)[1]] if near else ""
+        counted = {self._model.state_names[j] for j in np.flatnonzero(self._counted).tolist()}
+        own = (one for rule, _, one in self._known(values) if rule.kind not in JOINT and one.state in counted)
+        return max(own, key=lambda one: one.share, default=Nearest("", 0.0, 1.0)).state
 
     def over(
         self,

@@ -25,6 +25,7 @@ from uncertain_lti.proposal.candidates import (
     FEWEST,
     OF_QUATERNION,
     SHOWS,
+    TWO_VALUES,
     Candidate,
     Source,
     Steps,
@@ -442,7 +443,7 @@ def _finite(candidate: Candidate) -> Array:
 
 def _unfit(candidate: Candidate) -> str:
     """Why a column is no signal at all; what hardly moves is one."""
-    return "" if re.match(r"always|leaves its usual|takes two", candidate.reason) else candidate.reason
+    return "" if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason) else candidate.reason
 
 
 def _is_set(candidate: Candidate) -> bool:
