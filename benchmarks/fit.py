@@ -105,39 +105,43 @@ def solve(problem, criterion):
     return fit_fleet(Fleet.of(problem), signals, criterion, dt_median=DT)
 
 
-def million(scale):
-    """The public call on one recording, against least squares on the same regressors, which only finds a centre.
+def beside_least_squares(transient, regressors, rate, additive, runs, schedule=None):
+    """Rows of a table: the public call against least squares on the same regressors, which only finds a centre.
 
     CPU time of all threads, the two in turn, the least of several: the machine may do other work.
     """
+    for criterion in ("qp", "lp"):
+        peer, ours = np.inf, np.inf
+        for _ in range(runs):
+            began = time.process_time()
+            np.linalg.lstsq(regressors, rate, rcond=None)
+            between = time.process_time()
+            model = fit(transient, criterion, additive=additive, schedule=schedule)
+            ours, peer = min(ours, time.process_time() - between), min(peer, between - began)
+        lower, upper = model.bounds(transient.x[:-1], transient.u[:-1], transient.dt)
+        left = int((~((lower <= transient.x[1:]) & (transient.x[1:] <= upper))).any(axis=1).sum())
+        yield [
+            additive, criterion, str(regressors.shape[1]), f"{peer:.3f} s", f"{ours:.3f} s", f"{ours / peer:.2f}",
+            str(model.fit_summary["solver"]["passes"]), f"{model.fit_summary['optimality_gap']:.0e}", str(left),
+        ]  # fmt: skip
+
+
+BESIDE = [
+    "noise", "additive", "criterion", "regressors", "lstsq", "fit()", "ratio", "passes", "optimality gap", "outside",
+]  # fmt: skip
+
+
+def million(scale):
+    """One recording of a plant whose matrices do not change."""
     N = int(1e6 * scale)
-    rows = []
-    clean = recorded(N)
-    for noise in (0.0, 1e-4):
+    clean, rows = recorded(N), []
+    for noise, kinds in ((0.0, ["none"]), (1e-4, ["noise", "disturbance", "both"])):
         x = clean.x + noise * np.random.default_rng(1).standard_normal(clean.x.shape)
-        transient = Transient(clean.t_ns, x, clean.u)
         z, rate = np.hstack([x[:-1], clean.u[:-1]]), np.diff(x, axis=0) / DT
-        for additive in ("none",) if not noise else ("noise", "disturbance", "both"):
-            for criterion in ("qp", "lp"):
-                peer, ours = np.inf, np.inf
-                for _ in range(4):
-                    began = time.process_time()
-                    np.linalg.lstsq(z, rate, rcond=None)
-                    between = time.process_time()
-                    model = fit(transient, criterion, additive=additive)
-                    ours, peer = min(ours, time.process_time() - between), min(peer, between - began)
-                lower, upper = model.bounds(x[:-1], clean.u[:-1], transient.dt)
-                left = int((~((lower <= x[1:]) & (x[1:] <= upper))).any(axis=1).sum())
-                rows.append(
-                    [f"{noise:g}", additive, criterion, f"{peer:.3f} s", f"{ours:.3f} s", f"{ours / peer:.2f}"]
-                    + [
-                        str(model.fit_summary["solver"]["passes"]),
-                        f"{model.fit_summary['optimality_gap']:.0e}",
-                        str(left),
-                    ]
-                )
-    header = ["noise", "additive", "criterion", "lstsq", "fit()", "ratio", "passes", "optimality gap", "outside"]
-    table(f"fit() on a recording of {N} transitions, n = 5, m = 4: CPU time", header, rows)
+        for additive in kinds:
+            beside = beside_least_squares(Transient(clean.t_ns, x, clean.u), z, rate, additive, 4)
+            rows += [[f"{noise:g}", *row] for row in beside]
+    table(f"fit() on a recording of {N} transitions, n = 5, m = 4: CPU time", BESIDE, rows)
 
 
 def recorded(N, seed=0, schedule=None):
@@ -166,31 +170,16 @@ def scheduled(scale):
     N, knots = int(1e6 * scale), np.linspace(-1, 1, 5)
     schedule = Schedule((Axis("u1", knots=tuple(knots.tolist())),))
     clean, rows = recorded(N, schedule=schedule), []
-    for noise in (0.0, 1e-4):
+    for noise, kinds in ((0.0, ["disturbance"]), (1e-4, ["noise", "both"])):
         x = clean.x + noise * np.random.default_rng(1).standard_normal(clean.x.shape)
-        transient = Transient(clean.t_ns, x, clean.u)
         rate, weights = np.diff(x, axis=0) / DT, schedule.weights(clean.u[:-1, :1].T)
-        for additive in ("disturbance",) if not noise else ("noise", "both"):
+        for additive in kinds:
             drift = [np.ones((N, 1))] if additive != "noise" else []
             z = np.hstack([x[:-1], clean.u[:-1], *drift])
             regressors = np.hstack([w[:, None] * z for w in weights])
-            for criterion in ("qp", "lp"):
-                peer, ours = np.inf, np.inf
-                for _ in range(2):
-                    began = time.process_time()
-                    np.linalg.lstsq(regressors, rate, rcond=None)
-                    between = time.process_time()
-                    model = fit(transient, criterion, additive=additive, schedule=schedule)
-                    ours, peer = min(ours, time.process_time() - between), min(peer, between - began)
-                lower, upper = model.bounds(x[:-1], clean.u[:-1], transient.dt)
-                left = int((~((lower <= x[1:]) & (x[1:] <= upper))).any(axis=1).sum())
-                rows.append(
-                    [f"{noise:g}", additive, criterion, str(regressors.shape[1]), f"{peer:.2f} s", f"{ours:.2f} s"]
-                    + [f"{ours / peer:.2f}", str(model.fit_summary["solver"]["passes"])]
-                    + [f"{model.fit_summary['optimality_gap']:.0e}", str(left)]
-                )
-    header = ["noise", "additive", "criterion", "regressors", "lstsq", "fit()", "ratio", "passes", "optimality gap"]
-    table(f"fit() with 5 knots on {N} transitions, n = 5, m = 4: CPU time", [*header, "outside"], rows)
+            beside = beside_least_squares(Transient(clean.t_ns, x, clean.u), regressors, rate, additive, 2, schedule)
+            rows += [[f"{noise:g}", *row] for row in beside]
+    table(f"fit() with 5 knots on {N} transitions, n = 5, m = 4: CPU time", BESIDE, rows)
 
 
 def joint(scale):
@@ -204,21 +193,10 @@ def joint(scale):
         ours, model = best(lambda c=criterion: solve(problem, c))
         peer, (_, _, objective) = best(lambda c=criterion: solve_as_written(problem, c, cp.CLARABEL), 1)
         difference = np.max(np.abs(np.asarray(model.fit_summary["objective"]) / objective - 1))
-        rows.append(
-            [
-                criterion,
-                f"{peer:.1f} s",
-                f"{ours:.3f} s",
-                f"{peer / ours:.0f}",
-                f"{difference:.0e}",
-                str(outside(problem, model)),
-            ]
-        )
-    table(
-        f"{N} transitions, n = 5, m = 4, against cvxpy with Clarabel",
-        ["criterion", "cvxpy", "ours", "times faster", "difference of objectives", "outside"],
-        rows,
-    )
+        rows.append([criterion, f"{peer:.1f} s", f"{ours:.3f} s", f"{peer / ours:.0f}", f"{difference:.0e}"])
+        rows[-1].append(str(outside(problem, model)))
+    header = ["criterion", "cvxpy", "ours", "times faster", "difference of objectives", "outside"]
+    table(f"{N} transitions, n = 5, m = 4, against cvxpy with Clarabel", header, rows)
 
 
 def pyipm(scale):

@@ -13,10 +13,6 @@
     ./run python benchmarks/live_monitor.py --left 0.003           # the same, three in a thousand samples out of bounds
     ./run python benchmarks/live_monitor.py --soak 600             # ten minutes at 1 kHz: memory and counters
     ./run python benchmarks/live_monitor.py --soak 600 --armed     # the same with everything armed, and live = offline
-    ./run python benchmarks/live_monitor.py --before FOLDER        # beside the monitor of another checkout
-
-FOLDER is a checkout of another version, with its compiled part built in it: `git worktree add FOLDER REVISION`, then
-`python setup.py build_ext --inplace` in it.
 
 What the ratios are held against: with every output heard at most 0.6 times the CPU of the bare node on the default
 executor and 1.5 times that on the events executor, with only ~/violation heard 1.1 times; the flags at most 1 ms
@@ -423,34 +419,27 @@ def status(domain: int) -> dict[str, Any]:
 class Run:
     """One subject, one rate, one size: the processes, and what was measured of them."""
 
-    def __init__(
-        self, n: int, rate: float, seconds: float, left: float = 0.0, before: str = "", domain: int = 0
-    ) -> None:
-        self.n, self.rate, self.seconds, self.left, self.before = n, rate, seconds, left, before
+    def __init__(self, n: int, rate: float, seconds: float, left: float = 0.0, domain: int = 0) -> None:
+        self.n, self.rate, self.seconds, self.left = n, rate, seconds, left
         self.domain = domain or random.randint(1, 100)
         self.env = os.environ | {
             "ROS_DOMAIN_ID": str(self.domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
         }  # fmt: skip
         self.children: list[Child] = []
 
-    def child(self, *command: str, **environment: str) -> Child:
-        self.children.append(Child(self.env | environment, *command))
+    def child(self, *command: str) -> Child:
+        self.children.append(Child(self.env, *command))
         return self.children[-1]
 
     def part(self, *arguments: str) -> Child:
         return self.child(__file__, "--part", *arguments)
 
-    def monitor(self, folder: str, which: str = "", armed: bool = False) -> Child:
-        """The monitor of this checkout, or of the other one; `which` may name "before"."""
+    def monitor(self, folder: str, armed: bool = False) -> Child:
         path = Path(folder) / MODEL
         save_model(path, self.n, self.rate, armed)
         code = "import sys; from uncertain_lti_ros.envelope_monitor import main; sys.exit(main())"
-        environment: dict[str, str] = {}
-        if "before" in which:
-            checkout = str(Path(self.before).resolve() / "tests" / "checkout")
-            environment["PYTHONPATH"] = os.pathsep.join(filter(None, [checkout, os.environ.get("PYTHONPATH")]))
         more = f"qos.depth:={QUEUE_ARMED}" if armed else "violations:=1"
-        return self.child("-P", "-c", code, "--ros-args", "-p", f"model:={path}", "-p", more, **environment)
+        return self.child("-P", "-c", code, "--ros-args", "-p", f"model:={path}", "-p", more)
 
     def measure(self, kind: str, executor: str, outputs: list[str], delays: bool = False) -> dict[str, Any]:
         try:
@@ -458,7 +447,7 @@ class Run:
                 hearer = None
                 if kind in ("monitor", "relay"):
                     relayed = kind == "relay"
-                    subject = self.part(kind, str(self.n), *outputs) if relayed else self.monitor(folder, executor)
+                    subject = self.part(kind, str(self.n), *outputs) if relayed else self.monitor(folder)
                     hearer = self.part("hear", *outputs)
                     hearer.line()
                     if relayed:
@@ -499,12 +488,6 @@ class Run:
 
 
 BARE = "bare, default executor", "bare, events executor"
-VERSIONS = {
-    f"{when}, {heard}": ("monitor", when, outputs)
-    for when in ("before", "now")
-    for heard, outputs in (("all outputs heard", TOPICS), ("~/violation heard", ["violation"]))
-}
-"""The monitor of another checkout beside that of this one, by `--before`."""
 LIMITS = (
     ("monitor, all outputs heard", "bare, default executor", 0.6),
     ("monitor, all outputs heard", "bare, events executor", 1.5),
@@ -563,34 +546,6 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
     print(table(head, rows))
     print()
     print(table(["n", "Hz", "", "at most", "measured", "turns", "held", "publishing only"], held))
-
-
-def compare_versions(before: str, rates: list[float], sizes: list[int], seconds: float, repeats: int) -> None:
-    """CPU per sample of this checkout's monitor over that of another one, turn by turn."""
-    from uncertain_lti.base.text import table
-
-    rows = []
-    for n in sizes:
-        for rate in rates:
-            cpu: dict[str, list[float]] = {name: [] for name in VERSIONS}
-            for _ in range(repeats):
-                for name, subject in VERSIONS.items():
-                    found = Run(n, rate, seconds, before=before).measure(*subject)
-                    assert found["missed"] == 0, f"{name}: {found['missed']} verdicts missing"
-                    cpu[name].append(found["cpu"])
-            for name in VERSIONS:
-                if name.startswith("now"):
-                    ours, theirs = np.array(cpu[name]), np.array(cpu[name.replace("now", "before")])
-                    each = ours / theirs
-                    rows.append(
-                        [
-                            f"{n}", f"{rate:g}", name.removeprefix("now").strip(" ,"),
-                            f"{np.median(theirs):.0f}", f"{np.median(ours):.0f}", f"{np.median(each):.2f}",
-                            f"{each.min():.2f} to {each.max():.2f}",
-                        ]
-                    )  # fmt: skip
-                    print("  ".join(rows[-1]), file=sys.stderr, flush=True)
-    print(table(["n", "Hz", "", "before, µs/sample", "now", "ratio", "turns"], rows))
 
 
 def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[str, Any]:
@@ -671,36 +626,6 @@ def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[
             child.end()
 
 
-def stalled(seconds: float, rate: float, n: int, domain: int) -> None:
-    """What the monitor receives, judges and publishes while its only reader of all outputs stands still; prints it."""
-    before, after = 5.0, 10.0
-    run = Run(n, rate, before + seconds + after, domain=domain)
-    try:
-        with tempfile.TemporaryDirectory() as folder:
-            subject = run.monitor(folder)
-            hearer = run.part("hear", *TOPICS)
-            hearer.line()
-            publisher = run.part("publish", str(n), str(rate), str(run.seconds), "0", "", "hearer")
-            publisher.line()
-            time.sleep(before)
-            memory = subject.memory
-            hearer.process.send_signal(signal.SIGSTOP)
-            time.sleep(seconds)
-            hearer.process.send_signal(signal.SIGCONT)
-            publisher.patient = True
-            sent = int(publisher.line())
-            time.sleep(1.0)
-            said = status(run.domain)
-            print(
-                f"{sent} samples sent, {said['received'][STATE]} received, {said['verdicts']} judged, "
-                f"{said.get('held_back', 0)} held back, {len(hearer.ask()['delays'])} flags heard; memory "
-                f"{subject.memory - memory:+.1f} MiB; counters {said['counters']}"
-            )
-    finally:
-        for child in run.children:
-            child.end()
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seconds", type=float, default=6.0, help="length of one run")
@@ -713,11 +638,7 @@ def main() -> None:
         "--armed", action="store_true", help="with --soak: schedule, horizons, statistics; live = offline"
     )
     parser.add_argument("--domain", type=int, default=0, metavar="N", help="ROS domain of --soak; 0: any")
-    parser.add_argument(
-        "--stalled", type=float, metavar="S", help="instead, stop the reader of all outputs for S seconds"
-    )
     parser.add_argument("--soak-rate", type=float, default=1000.0, metavar="HZ")
-    parser.add_argument("--before", metavar="FOLDER", help="instead, beside the monitor of another checkout")
     parser.add_argument("--part", nargs="+", help=argparse.SUPPRESS)
     args = parser.parse_args()
     if args.part:
@@ -736,10 +657,6 @@ def main() -> None:
         found = soak(args.soak, args.soak_rate, args.sizes[0], args.domain, args.armed)
         if not (found["exact"] and found["growth"] < 1.0):
             raise SystemExit(1)
-    elif args.stalled:
-        stalled(args.stalled, args.rates[-1], args.sizes[0], args.domain)
-    elif args.before:
-        compare_versions(args.before, args.rates, args.sizes, args.seconds, args.repeats)
     else:
         compare(args.rates, args.sizes, args.seconds, args.repeats, args.left)
 

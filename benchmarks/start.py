@@ -10,10 +10,7 @@
 """Verdicts lost while inputs catch up: a monitor that starts into a running stream, or that was stopped for a while.
 
     ./run python benchmarks/start.py                       # the table: 20 starts and 5 stops of each kind
-    ./run python benchmarks/start.py --before FOLDER       # beside the monitor of another checkout
     ./run python benchmarks/start.py --starts 3 --stops 1 --executors events --publishers rclpy
-
-FOLDER is as for `live_monitor.py`.
 
 Processes publish a state and a control message per sample (sensor_msgs/JointState, stamped with the same instant, both
 topics from one process or each from its own) long before the monitor starts, and go on. The monitor notes what it
@@ -187,21 +184,19 @@ def watch(model: str, executor: str) -> None:
 class Run:
     """One start, or one stop, of a monitor in a running stream; `tell` gives what came of it."""
 
-    def __init__(self, folder: Path, vendor: str, reliability: str, executor: str, processes: int, core: str) -> None:
+    def __init__(self, folder: Path, vendor: str, reliability: str, executor: str, processes: int) -> None:
         self.env = os.environ | {
             "ROS_DOMAIN_ID": str(100 + random.randrange(100)),
             "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
             "ROS_LOG_DIR": str(folder),
             "CYCLONEDDS_URI": _CYCLONE,
-            "UNCERTAIN_LTI_MONITOR": core,
         }
-        self.folder, self.executor, self.core = folder, executor, core
+        self.folder, self.executor = folder, executor
         self.vendor, self.reliability, self.processes = vendor, reliability, processes
 
-    def _start(self, *words: str, core: str = "") -> subprocess.Popen[str]:
-        env = self.env | ({"PYTHONPATH": f"{core}/tests/checkout"} if core else {})
+    def _start(self, *words: str) -> subprocess.Popen[str]:
         return subprocess.Popen(
-            [sys.executable, __file__, *words], env=env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+            [sys.executable, __file__, *words], env=self.env, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
 
     def tell(self, stop: bool) -> dict[str, float]:
@@ -217,7 +212,7 @@ class Run:
                 started.append(publisher)
                 assert publisher.stdout is not None and publisher.stdout.readline(), publisher.stderr.read()
             time.sleep(RUNNING)
-            monitor = self._start("watch", str(model), self.executor, core=self.core)
+            monitor = self._start("watch", str(model), self.executor)
             started.append(monitor)
             assert monitor.stderr is not None and "judges" in monitor.stderr.readline()
             time.sleep(AFTER)
@@ -259,37 +254,29 @@ def losses(found: dict[str, Any], rate: float) -> dict[str, float]:
 
 
 def compare(args: argparse.Namespace, folder: Path) -> None:
-    versions = {"now": str(Path(__file__).parents[1])}
-    if args.before:
-        versions = {"before": args.before, **versions}
     kinds = [(False, args.starts), (True, args.stops)]
-    header = ["", "publishers", "reliability", "executor", "monitor", "runs that lost", "verdicts lost", "undelivered",
+    header = ["", "publishers", "reliability", "executor", "runs that lost", "verdicts lost", "undelivered",
               "longest wait, s"]  # fmt: skip
-    rows, totals = [], dict.fromkeys(versions, 0)
+    rows = []
     for stop, runs in kinds:
         for vendor in args.publishers:
             for reliability in args.reliabilities:
                 for executor in args.executors:
-                    told: dict[str, list[dict[str, float]]] = {name: [] for name in versions}
-                    for number in range(runs):
-                        for name, core in versions.items():
-                            run = Run(folder, vendor, reliability, executor, 1 + number % 2, core)
-                            told[name].append(run.tell(stop))
-                    for name, results in told.items() if runs else ():
-                        lost = [int(r["lost"]) for r in results]
-                        totals[name] += sum(lost)
-                        rows.append([
-                            "stop of 4 s" if stop else "start", vendor, reliability, executor, name,
-                            f"{sum(map(bool, lost))} of {runs}",
-                            f"{sum(lost)} of {sum(int(r['samples']) for r in results)} (at most {max(lost)} in a run)",
-                            str(sum(int(r["undelivered"]) for r in results)),
-                            f"{statistics.median(r['longest_wait'] for r in results):.2f}",
-                        ])  # fmt: skip
-                        print(*rows[-1], file=sys.stderr, flush=True)
+                    results = [
+                        Run(folder, vendor, reliability, executor, 1 + number % 2).tell(stop) for number in range(runs)
+                    ]
+                    if not results:
+                        continue
+                    lost = [int(r["lost"]) for r in results]
+                    rows.append([
+                        "stop of 4 s" if stop else "start", vendor, reliability, executor,
+                        f"{sum(map(bool, lost))} of {runs}",
+                        f"{sum(lost)} of {sum(int(r['samples']) for r in results)} (at most {max(lost)} in a run)",
+                        str(sum(int(r["undelivered"]) for r in results)),
+                        f"{statistics.median(r['longest_wait'] for r in results):.2f}",
+                    ])  # fmt: skip
+                    print(*rows[-1], file=sys.stderr, flush=True)
     table("Verdicts lost while inputs catch up", header, rows)
-    if len(versions) == 2:
-        before, now = totals.values()
-        print(f"\nlost verdicts: {before} before, {now} now" + (f", ratio {now / before:.3f}" if before else ""))
 
 
 def main() -> None:
@@ -306,7 +293,6 @@ def main() -> None:
     parser.add_argument("--publishers", nargs="+", choices=VENDORS, default=VENDORS)
     parser.add_argument("--reliabilities", nargs="+", choices=RELIABILITIES, default=RELIABILITIES)
     parser.add_argument("--executors", nargs="+", choices=EXECUTORS, default=EXECUTORS)
-    parser.add_argument("--before", metavar="FOLDER", help="a checkout of another version to compare with")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         compare(args, Path(folder))
