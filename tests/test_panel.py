@@ -60,11 +60,12 @@ def test_fit_alone_gives_a_panel_that_is_quiet_on_what_it_saw_and_sees_what_it_p
     one_rule = rate_interval(np.zeros(8), alarm["hours"], 0.9, one_sided=True)[1]
     three_rules = rate_interval(np.full(8, 2 / 8), alarm["hours"], 0.9, one_sided=True)[1]
     assert alarm["limit_per_hour"] >= three_rules > one_rule
-    bias = 3 * alarm["biases"][0]
-    seen = [monitor.check(plant(100 + seed, bias=bias)) for seed in range(6)]
-    for verdicts in seen:
-        first = verdicts.transient.t[verdicts.alarm]
-        assert len(first) and 0 <= first[0] - 30.0 <= alarm["within"] + DT
+    seen = 0
+    for seed in range(40):
+        verdicts = monitor.check(plant(100 + seed, bias=(-1) ** seed * alarm["biases"][0]))
+        first = np.flatnonzero(verdicts.alarm)
+        seen += len(first) > 0 and first[0] == 300
+    assert alarm["within"] == pytest.approx(DT) and seen >= 36  # nine of ten, as promised
 
 
 def test_a_slow_average_takes_four_recordings_that_say_how_far_they_differ(runs):
@@ -122,12 +123,17 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
     assert evidence.near.tolist() == [rising(v > near, p.starts) for v, p in zip(levels, parts, strict=True)]
     weights = [part.judged for part in parts]
     half = np.average([part.usual_width for part in parts], axis=0, weights=weights) / 2
-    np.testing.assert_allclose(panel.biases, half * np.sqrt(energy.thresholds(2)), rtol=1e-12)
+    middle = np.median(np.abs(np.concatenate([*(p.utilisation for p in parts), *inside])), axis=0)
+    np.testing.assert_allclose(panel.biases, half * (np.sqrt(sample.thresholds(2)) + 2 * middle), rtol=1e-12)
+    middle_half = np.average([part.median_width for part in parts], axis=0, weights=weights) / 2
+    offsets = middle_half * np.sqrt(energy.thresholds(2))
+    assert panel.figure == pytest.approx(scipy.stats.gmean(offsets), rel=1e-12) and panel.within == pytest.approx(DT)
 
 
 @pytest.mark.parametrize(
     ("what", "count", "verdicts", "taken"),
     [
+        ("recording", 2, 4000, "a"),
         ("recording", 3, 4000, "a"),
         ("recording", 3, 400, "as"),
         ("recording", 4, 4000, "an"),
@@ -150,7 +156,8 @@ def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
     one, rule = Evidence(peaks, top, np.full(2, 0.5), verdicts, np.ones((2, 2)), 1, 1, DT), StatisticRule("mean", 1, 1)
     (found,) = one.thresholds([rule], 2, what)
     above = 1.0 + 1e-10  # so that no rounding passes it
-    np.testing.assert_allclose(found, above * np.max([limits[kind] for kind in taken], axis=0), rtol=1e-12)
+    unknown = {2: 1.5, 3: 1.2}.get(count, 1.0)  # how far recordings differ
+    np.testing.assert_allclose(found, unknown * above * np.max([limits[kind] for kind in taken], axis=0), rtol=1e-12)
     assert one.learnt([rule], what)[0].threshold == tuple(found)
     assert one.learnt([StatisticRule("energy", 1, 1)], what)[0].threshold == tuple(found**2)
 
@@ -337,10 +344,10 @@ def test_states_that_are_blind_are_named(runs):
     left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
     panel = learn(left, fitted_parts(full, runs))
     span = full.domain.x_max - full.domain.x_min
-    blind = replace(panel, biases=np.array([panel.biases[0], 0.51 * span[1]]))
+    blind = replace(panel, biases=np.array([panel.biases[0], 1.01 * span[1]]))
     assert worth(full, blind)[0] == "some" and worth(full, blind)[1].startswith("sees only x1: of x2")
-    assert worth(full, replace(panel, biases=0.49 * span))[0] == "good"
-    assert worth(full, replace(panel, biases=0.51 * span))[0] == "none"
+    assert worth(full, replace(panel, biases=0.99 * span))[0] == "good"
+    assert worth(full, replace(panel, biases=1.01 * span))[0] == "none"
     assert "is over ten times the recorded range" in worth(full, replace(panel, biases=1e6 * span))[1]
     assert worth(full, replace(panel, biases=0.041 * span))[1].endswith("jumps of 4.1 % of the recorded range")
     assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0))[0]

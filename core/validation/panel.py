@@ -21,7 +21,9 @@ Elsewhere, and of recordings, which differ by more than their blocks, a threshol
 largest size of one more of them lies with CONFIDENCE (of a block with ALIKE), where the logarithms of the largest sizes
 p of each of G (TELLING at least) are normal,
 
-    exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1.
+    exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
+
+of fewer recordings, whose spread nobody knows, it is larger by a fixed factor, UNKNOWN.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -61,12 +63,14 @@ ALIKE = 0.95
 """As CONFIDENCE, of the largest size in one more block of a single recording."""
 TELLING = 4
 """Recordings, groups or blocks from which on the spread of their largest sizes is known well enough to reckon with."""
+UNKNOWN = {1: 1.5, 2: 1.5, 3: 1.2}
+"""Threshold over what it would be, of fewer recordings or groups than TELLING: half the false alarms of drawn plants."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
 """Down to this share of the thresholds, alarms are assumed to cluster as they do at the thresholds."""
-BLIND = 0.5
-"""A bias of more than this share of the range of a state is no fault worth an alarm."""
+BLIND = 1.0
+"""What jumps by more than this share of the range of a state shows in any plot, without an alarm."""
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
 _FAR = 10.0
@@ -164,10 +168,11 @@ class Panel:
 
     `rules`: the panel; `limit`: false alarms per hour at most, with CONFIDENCE; `alarms`: those on what was left out;
     `hours`: under verdict there; `units`: independent recordings, groups or blocks; `what`: which of them;
-    `biases` (n,): smallest jump of each state that the energy over a window sees at nine of ten times, recorded units;
-    `within`: in this time, s; `figure`: geometric mean over the states of the jumps seen half of the time, which ways
-    to fit are compared by; `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the
-    others do not cover; `asked`: rate that was asked for.
+    `biases` (n,): jump of the reading of each state that the energy of one verdict shows some nine of ten times, the
+    threshold above twice the median size, recorded units; `within`: in this time, s; `figure`: what ways to fit are
+    compared by, the geometric mean over the states of the lasting offset that the energy over a window shows;
+    `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the others do not cover;
+    `asked`: rate that was asked for.
     """
 
     rules: tuple[Rule, ...]
@@ -188,13 +193,15 @@ class Panel:
         cls, evidence: Evidence, rules: Sequence[StatisticRule], what: str, unlike: Sequence[str], asked: float | None
     ) -> Panel:
         """That of these rules; `what`: of `Validation.what`."""
-        thresholds = evidence.thresholds(rules, evidence.widths.shape[1], what)
-        at = max(i for i, rule in enumerate(rules) if (rule.kind, rule.horizon) == ("energy", 1))  # what jumps show in
-        usual, median = evidence.widths / 2.0 * (evidence.factor * thresholds[at])
+        n = evidence.widths.shape[1]
+        thresholds = evidence.thresholds(rules, n, what)
+        energies = [i for i, rule in enumerate(rules) if (rule.kind, rule.horizon) == ("energy", 1)]
+        usual, median = evidence.widths / 2.0
+        sample, window = (evidence.factor * thresholds[i] for i in (energies[0], energies[-1]))
         return cls(
             evidence.learnt(rules, what), _limit(evidence, len(rules)), int(evidence.counts.sum()), evidence.hours,
-            len(evidence.peaks), what, usual, max(rules[at].window_s, evidence.dt),
-            float(np.exp(np.log(np.maximum(median, 1e-300)).mean())), evidence,
+            len(evidence.peaks), what, usual * (sample + 2.0 * evidence.median[:n]), evidence.dt,
+            float(np.exp(np.log(np.maximum(median * window, 1e-300)).mean())), evidence,
             tuple(unlike), asked,
         )  # fmt: skip
 
@@ -347,6 +354,8 @@ def _threshold(
         logs, count = np.log(peaks), len(peaks)
         far = stdtrit(count - 1, ALIKE if blocks else CONFIDENCE) * math.sqrt(1.0 + 1.0 / count)
         found = np.maximum(found, np.exp(logs.mean(axis=0) + far * math.sqrt(logs.var(axis=0, ddof=1).mean())))
+    elif not blocks:
+        found *= UNKNOWN[min(len(peaks), 3)]
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
 
 
@@ -391,7 +400,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         seen = [name for name in names if name not in (*still, *blind)]
         why = [
             *([f"{', '.join(still)} never moved"] if still else []),
-            *([f"of {', '.join(blind)} not even a jump of half the recorded range"] if blind else []),
+            *([f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []),
         ]
         return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
     if panel.unlike:
