@@ -64,7 +64,7 @@ ALIKE = 0.95
 TELLING = 4
 """Recordings, groups or blocks from which on the spread of their largest sizes is known well enough to reckon with."""
 UNKNOWN = {1: 1.5, 2: 1.5, 3: 1.2}
-"""Threshold over what it would be, of fewer recordings or groups than TELLING: half the false alarms of drawn plants."""
+"""Threshold over what it would be, of fewer recordings or groups than TELLING: drawn plants alarm half as often."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
