@@ -23,7 +23,7 @@ p of each of G (TELLING at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
 
-of fewer recordings, whose spread nobody knows, it is larger by a fixed factor, UNKNOWN.
+of two recordings it is UNKNOWN times as large.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -63,8 +63,8 @@ ALIKE = 0.95
 """As CONFIDENCE, of the largest size in one more block of a single recording."""
 TELLING = 4
 """Recordings, groups or blocks from which on the spread of their largest sizes is known well enough to reckon with."""
-UNKNOWN = {1: 1.5, 2: 1.5, 3: 1.2}
-"""Threshold over what it would be, of fewer recordings or groups than TELLING: drawn plants alarm half as often."""
+UNKNOWN = 1.5
+"""Threshold over what it would be, of two recordings or groups, whose spread nobody knows."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
@@ -354,8 +354,8 @@ def _threshold(
         logs, count = np.log(peaks), len(peaks)
         far = stdtrit(count - 1, ALIKE if blocks else CONFIDENCE) * math.sqrt(1.0 + 1.0 / count)
         found = np.maximum(found, np.exp(logs.mean(axis=0) + far * math.sqrt(logs.var(axis=0, ddof=1).mean())))
-    elif not blocks:
-        found *= UNKNOWN[min(len(peaks), 3)]
+    elif len(peaks) == 2 and not blocks:
+        found *= UNKNOWN
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
 
 
