@@ -23,3 +23,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [_CHECKOUT, os.environ.g
 
 # Threads of OpenBLAS that wait for one another spin, and the tests already share the cores: four times as slow.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# As some containers set it: every process of the tests would compile numpy and scipy again, which doubles its start.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
