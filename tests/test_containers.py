@@ -15,9 +15,9 @@ import shutil
 import sqlite3
 import time
 from contextlib import closing
-from pathlib import Path
 
 import pytest
+from engine_bag import SIGNALS, engine_bag
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
@@ -31,9 +31,6 @@ from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.sampling.reading import check_paths
 from uncertain_lti.signals.signal_map import SignalMap
 
-ROOT = Path(__file__).resolve().parents[1]
-SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"
-SIGNALS = ROOT / "config/signals/turbofan.yaml"
 JAZZY = get_typestore(Stores.ROS2_JAZZY)
 NOETIC = get_typestore(Stores.ROS1_NOETIC)
 
@@ -71,7 +68,9 @@ def to_ros1(source, path, compression=None, chunk=1 << 18):
 @pytest.fixture(scope="module")
 def converted(tmp_path_factory):
     folder = tmp_path_factory.mktemp("converted")
-    made = {"db3": to_database(SHIPPED, folder / "run")}
+    (folder / "signals.yaml").write_text(SIGNALS)
+    made = {"signals": folder / "signals.yaml", "mcap": engine_bag(folder / "run.mcap", 400)}
+    made["db3"] = to_database(made["mcap"], folder / "run")
     made["folder"] = folder / "run"
     made["old db3"] = folder / "old.db3"  # as recorders before Iron wrote it
     shutil.copy(made["db3"], made["old db3"])
@@ -79,9 +78,9 @@ def converted(tmp_path_factory):
         database.execute("DROP TABLE message_definitions")
         database.execute("UPDATE schema SET ros_distro = 'humble', schema_version = 3")
         database.commit()
-    made["ROS 1"] = to_ros1(SHIPPED, folder / "plain.bag")
-    made["ROS 1 bz2"] = to_ros1(SHIPPED, folder / "bz2.bag", "BZ2")
-    made["ROS 1 lz4"] = to_ros1(SHIPPED, folder / "lz4.bag", "LZ4", 1 << 14)
+    made["ROS 1"] = to_ros1(made["mcap"], folder / "plain.bag")
+    made["ROS 1 bz2"] = to_ros1(made["mcap"], folder / "bz2.bag", "BZ2", 1 << 16)
+    made["ROS 1 lz4"] = to_ros1(made["mcap"], folder / "lz4.bag", "LZ4", 1 << 14)
     return made
 
 
@@ -90,26 +89,27 @@ EVERY = ("db3", "folder", "old db3", "ROS 1", "ROS 1 bz2", "ROS 1 lz4")
 
 @pytest.mark.parametrize("kind", EVERY)
 def test_the_same_bits_as_in_mcap(converted, kind):
-    (expected,) = read_transients(SHIPPED, SIGNALS)
-    (read,) = read_transients(converted[kind], SIGNALS)
-    assert len(read) > 1000 and read.t_ns.tobytes() == expected.t_ns.tobytes()
+    (expected,) = read_transients(converted["mcap"], converted["signals"])
+    (read,) = read_transients(converted[kind], converted["signals"])
+    assert len(read) == 400 and read.t_ns.tobytes() == expected.t_ns.tobytes()
     assert read.x.tobytes() == expected.x.tobytes() and read.u.tobytes() == expected.u.tobytes()
     assert [n.partition(": ")[2] for n in read.notes] == (
         ["the file does not hold the definitions of all its types; those of ROS 2 Humble are used"]
         if kind == "old db3"
         else []
     )
-    bag, signals = Bag(converted[kind]), SignalMap.load(SIGNALS)
+    bag, signals = Bag(converted[kind]), SignalMap.load(converted["signals"])
     columns = bag.columns(signals.topics, check_paths(bag, signals))
     assert columns.alone <= 4 < len(columns.topic)  # the rest was read in blocks, by its plan
 
 
 def test_an_annotated_copy_is_that_of_the_mcap(converted, tmp_path):
     model = str(tmp_path / "m.model.json")
-    assert main(["fit", str(SHIPPED), "--signals", str(SIGNALS), "--additive", "noise", "--output", model, "-q"]) == 0
+    command = ["fit", str(converted["mcap"]), "--signals", str(converted["signals"]), "--output", model, "-q"]
+    assert main([*command, "--additive", "noise", "--alarm", "containment"]) == 0
     copies = {}
-    for kind, path in {"mcap": SHIPPED, **{kind: converted[kind] for kind in ("db3", "ROS 1 lz4")}}.items():
-        assert main(["check", model, str(path), "--write", str(tmp_path / f"{kind}.mcap"), "-q"]) == 0
+    for kind in ("mcap", "db3", "ROS 1 lz4"):
+        assert main(["check", model, str(converted[kind]), "--write", str(tmp_path / f"{kind}.mcap"), "-q"]) == 0
         copies[kind] = Bag(tmp_path / f"{kind}.mcap")
     expected = copies.pop("mcap")
     below = [t for t in expected.topics if t.startswith("/envelope_monitor")]
@@ -127,12 +127,12 @@ def test_parts_of_a_split_database_are_one_recording(converted, tmp_path):
     for number, part in enumerate(parts):
         shutil.copy(converted["db3"], part)
         with closing(sqlite3.connect(part)) as database:
-            (middle,) = database.execute("SELECT timestamp FROM messages ORDER BY id LIMIT 1 OFFSET 1000").fetchone()
+            (middle,) = database.execute("SELECT timestamp FROM messages ORDER BY id LIMIT 1 OFFSET 300").fetchone()
             database.execute(f"DELETE FROM messages WHERE timestamp {'>=' if number == 0 else '<'} ?", (middle,))
             database.commit()
     (bag,) = group_recordings(parts)
     assert [p.name for p in bag.parts] == ["run_0.db3", "run_1.db3"]
-    assert [len(t) for t in read_transients(parts, SIGNALS)] == [len(read_transients(SHIPPED, SIGNALS)[0])]
+    assert [len(t) for t in read_transients(parts, converted["signals"])] == [400]
     assert Bag(tmp_path).parts == tuple(parts)
 
 
@@ -184,8 +184,8 @@ def test_messages_before_damage_count_and_the_rest_is_said(converted, tmp_path):
     path.write_bytes(data)
     (warning,) = Bag(path).warnings
     assert re.search(r"is cut or damaged .*; \d+ of [\d ]+ messages before that count", warning)
-    (cut,) = read_transients(path, SIGNALS)
-    (whole,) = read_transients(SHIPPED, SIGNALS)
+    (cut,) = read_transients(path, converted["signals"])
+    (whole,) = read_transients(converted["mcap"], converted["signals"])
     assert 100 < len(cut) < len(whole) and cut.x[:-1].tobytes() == whole.x[: len(cut) - 1].tobytes()
 
 
