@@ -47,7 +47,7 @@ def long_run(tmp_path_factory):
     """A recording whose fit, with the left-out ones, takes seconds."""
     folder = tmp_path_factory.mktemp("long")
     (folder / "signals.yaml").write_text(SIGNALS.replace("auto", "1.0"))
-    engine_bag(folder / "run.mcap", steps=3_000)
+    engine_bag(folder / "run.mcap", steps=1500)
     return folder
 
 

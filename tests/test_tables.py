@@ -133,7 +133,8 @@ def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
     assert main(["init", path, "--output", str(tmp_path / "init.yaml")]) == 0
     SignalMap.load(tmp_path / "init.yaml")
     signals.write_text(signals_of(names, len(shipped.signals.states)))
-    assert main(["fit", path, "--signals", str(signals), "--output", model, "--criterion", "lp"]) == 0
+    words = ["--signals", str(signals), "--output", model, "--criterion", "lp", "--alarm", "containment"]
+    assert main(["fit", path, *words]) == 0
     assert main(["check", model, path]) == 0
     assert "100.000% inside all bounds" in capsys.readouterr().out
     assert main(["validate", model]) == 0
@@ -229,9 +230,11 @@ def test_what_is_missing_is_nan_and_what_is_odd_is_reported(tmp_path):
 
 
 def test_a_matrix_is_an_array(tmp_path):
-    np.savez(tmp_path / "a.npz", t=np.arange(5.0), q=np.arange(10.0).reshape(5, 2), name=np.array("bench"))
+    q = np.arange(10.0).reshape(5, 2)
+    np.savez(tmp_path / "a.npz", t=np.arange(5.0), q=q, across=q.T, few=np.ones(3), name=np.array("bench"))
     table = open_recording(tmp_path / "a.npz")
-    assert [f.fields for f in table.facts()] == [("q[0..1]",)]
+    assert [f.fields for f in table.facts()] == [("q[0..1]", "across[0..1]")]
+    assert np.array_equal(table.columns_by_field["across"], q) and "'few' left out, it has 3" in table.warnings[0]
     signals = SignalMap.from_dict({"states": [{"name": "q1", "topic": "/table", "field": "q[1]"}]})
     (read,) = read_transients(tmp_path / "a.npz", signals)
     assert read.x[:, 0].tolist() == [1.0, 3.0, 5.0, 7.0, 9.0]
@@ -336,6 +339,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time x y\n1 2 3\n2 3 4\n", "apart by spaces alone"),
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
+        ("a.csv", b"time,y\n,2\n,3\n", "holds no time in any row"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
         ("a.csv", b'time,y\n"0,125","6,2"\n"0,250","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
@@ -452,9 +456,11 @@ def test_nanoseconds_with_a_gap_stay_exact(tmp_path):
     from pyarrow import parquet
 
     begin = 1_700_000_000_000_000_001
-    table = pa.table({"time": pa.array([begin, None, begin + 7], pa.int64()), "x": [1.0, 2.0, 3.0]})
-    parquet.write_table(table, tmp_path / "a.parquet")
-    assert Table(tmp_path / "a.parquet").times.tolist() == [begin, begin + 7]
+    times = pa.array([begin, None, begin + 7], pa.int64())
+    columns = {"time": times, "x": [1.0, 2.0, 3.0], "mode": ["a", "b", "c"]}
+    parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    table = Table(tmp_path / "a.parquet")
+    assert table.times.tolist() == [begin, begin + 7] and table.type_fields("/table")("table")["mode"].kind == "string"
 
 
 def test_equal_names_do_not_take_for_ever(tmp_path):
