@@ -729,6 +729,7 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
         speed += 0.9 * (target - speed) * (1 - 0.5 * brake) + 0.01 * rng.normal()
         load += 0.1 * (target - load) + 0.05 * brake + 0.01 * rng.normal()
     names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Angle_of_Attack", "Brake_IN", "Released", "Idle", "Label"]
+    names, rows = [*names, "class"], [[*row, "leak" if k % 500 == 9 else "normal"] for k, row in enumerate(rows)]
     path = tmp_path / "drive.csv"
     path.write_text(",".join(names) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
     proposal = propose([path])
@@ -738,4 +739,8 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
         assert re.search(words, proposal.text), words
     assert "max_hold" not in proposal.text  # what is in the row of the states is as old as they are
     assert any("Label looks like a label, and is not 0 in 20 rows" in w for w in proposal.warnings), proposal.warnings
+    assert any("class looks like a label, and is not normal in 3 rows" in w for w in proposal.warnings)
     assert propose([path], states=["/table:Label"]).states[0].path == "Label"
+    bag = save(tmp_path / "a.mcap", driven(), {})
+    with pytest.raises(BagError, match="/table: not in every recording.*; give recordings of one machine"):
+        propose([path, bag])

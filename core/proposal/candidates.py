@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
@@ -23,8 +24,8 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import plural, shortlist
-from uncertain_lti.recordings.recording import usual_step
-from uncertain_lti.recordings.table import TYPE
+from uncertain_lti.recordings.recording import Recording, usual_step
+from uncertain_lti.recordings.table import TYPE, Table
 from uncertain_lti.signals.field_path import FUNCTIONS, QUATERNION
 
 FEWEST = 20
@@ -343,22 +344,26 @@ TWO_VALUES = "takes two values only"
 """Why a measurement is no state; in a table it may be a switch."""
 
 
-def set_aside_labels(sources: Sequence[Source]) -> list[str]:
+def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> list[str]:
     """Leave out columns of tables that are labels by their names; a warning for each that does not stay the same."""
+    columns: dict[str, Counter[object]] = {}
+    for table in (bag for bag in bags if isinstance(bag, Table)):
+        for name, column in table.columns_by_field.items():
+            if _LABEL.search(name.lower()):
+                values = [v for v in column.ravel().tolist() if v not in ("", None) and v == v]
+                columns.setdefault(name, Counter()).update(values)
     warnings = []
-    for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
-        if not _LABEL.search(candidate.path.lower()):
+    for name, counts in columns.items():
+        if len(counts) > _LABELS:  # an angle of attack, for example
             continue
-        values = np.concatenate([np.empty(0), *candidate.values])
-        values = values[np.isfinite(values)]
-        if len(found := np.unique(values)) > _LABELS:  # an angle of attack, for example
-            continue
-        candidate.reason = "a label by its name, and no signal of the machine"
-        if len(found) > 1:
-            usual = found[np.argmax([np.count_nonzero(values == value) for value in found])]
+        for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
+            if candidate.path.partition("[")[0] == name:
+                candidate.reason = "a label by its name, and no signal of the machine"
+        if len(counts) > 1:
+            usual, number = counts.most_common(1)[0]
             warnings.append(
-                f"{candidate.path} looks like a label, and is not {usual:.6g} in "
-                f"{plural(int(np.count_nonzero(values != usual)), 'row')}: leave out of the recordings what was not "
+                f"{name} looks like a label, and is not {f'{usual:.6g}' if isinstance(usual, float) else usual} in "
+                f"{plural(counts.total() - number, 'row')}: leave out of the recordings what was not "
                 "healthy, as a fit takes all of them for healthy"
             )
     return warnings

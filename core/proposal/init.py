@@ -78,6 +78,9 @@ _RUN = re.compile(
 )  # name of a column that says which run a row is of
 
 
+_APART = "not in every recording"
+
+
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 
 
@@ -93,7 +96,7 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
     for topic, fact in facts.items():
         total = sum(bag.topics[topic].count for bag in bags if topic in bag.topics)
         if fact.info.type == TYPE:
-            sources += _of_table(fact, total)
+            sources += _of_table(fact, total, all(topic in b.topics for b in bags))
             continue
         stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
         source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
@@ -105,7 +108,7 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
         elif total < (3 if source.role == "control" else FEWEST):
             source.reason = f"{plural(total, 'message')} only"
         elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
-            source.reason = "not in every recording"
+            source.reason = _APART
         elif any(b.topics[topic].type != fact.info.type for b in bags):
             source.reason = "of different types in these recordings"
         else:
@@ -164,7 +167,7 @@ def _tells_runs(table: Table, name: str) -> bool:
     return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] <= 0).all())
 
 
-def _of_table(fact: TopicFacts, rows: int) -> list[Source]:
+def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
     """The columns of a table, those that are commands by their names apart from the others."""
     by_role: dict[str, list[str]] = {}
     for field in fact.fields:
@@ -174,6 +177,8 @@ def _of_table(fact: TopicFacts, rows: int) -> list[Source]:
         source = Source(fact.info.topic, TYPE, role, False, None)
         if rows < FEWEST:
             source.reason = f"{plural(rows, 'row')} only"
+        elif not everywhere:
+            source.reason = _APART
         else:
             source.candidates = _candidates(fact.info.topic, fields)
         sources.append(source)
@@ -275,7 +280,8 @@ def _judge(candidate: Candidate, source: Source) -> None:
     elif finite.min() == finite.max():
         candidate.reason = f"always {finite[0] + 0.0:.6g}"
     elif len(finite) < 0.5 * len(values):
-        candidate.reason = f"a number in {len(finite)} of {len(values)} messages only"
+        what = "rows only, so fill its empty cells with the number above" if source.type == TYPE else "messages only"
+        candidate.reason = f"a number in {len(finite)} of {len(values)} {what}"
     elif (moved := len(finite) - int(np.unique(finite, return_counts=True)[1].max())) < max(3, len(finite) // 500):
         candidate.reason = f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
     elif source.role == "state" and len(np.unique(finite)) < 3:
@@ -381,7 +387,7 @@ def propose(
     if runs:
         bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
     sources = read_sources(bags, progress)
-    labels = set_aside_labels(sources) if not states else []
+    labels = set_aside_labels(sources, bags) if not states else []
     if not (states or controls or like) and is_plant(sources):
         return _of_plant(bags, sources, runs, labels)
     if states or controls:
@@ -393,9 +399,11 @@ def propose(
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
+        remedy = "record the machine at work, and longer, or name the topics of its states in `uncertain-lti init --states`"
+        if any(s.reason == _APART for s in sources):
+            remedy = "give recordings of one machine, with the same topics"
         raise BagError(
-            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); record the "
-            f"machine at work, and longer, or name the topics of its states in `uncertain-lti init --states`"
+            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); {remedy}"
         )
     chosen, doubt = choose(measured, commands, like)
     doubt = doubt or ("" if commands else at_rest(sources))
