@@ -11,6 +11,7 @@
 
 import csv
 import math
+import shutil
 from collections import namedtuple
 from itertools import pairwise
 from pathlib import Path
@@ -104,11 +105,14 @@ def test_a_format_added_to_the_table_serves_every_command(run, tmp_path, capsys)
 
 
 @pytest.mark.usefixtures("tables")
-def test_recordings_of_several_formats_are_named_together(run):
+def test_recordings_of_several_formats_are_named_together(run, tmp_path):
     bag = ROOT / "bags" / "leibov_check.mcap"
     assert [type(r) for r in group_recordings([run, bag])] == [Table, Bag]
     with pytest.raises(BagError, match="named twice"):
         group_recordings([run, bag, run])
+    again = shutil.copy(bag, tmp_path / "again.mcap")  # it would vouch for itself in what is left out
+    with pytest.raises(BagError, match=r"again\.mcap: holds the samples of .*leibov_check\.mcap; name each"):
+        read_transients([bag, again], ROOT / "config" / "signals" / "engine.yaml")
 
 
 def test_without_an_entry_the_file_is_refused_in_a_sentence(run):

@@ -165,6 +165,7 @@ def lines(delimiter=",", point=".", time=lambda t: f"{t:.1f}"):
         "# made by a logger\n# 2026-11-22\ntime,speed,cmd\n" + lines(),
         "# time,speed,cmd\n" + lines(),
         "time,speed,cmd\ns,rpm,V\n" + lines(),
+        "drive,drive,drive\ntime,speed,cmd\ns,rpm,V\n" + lines(),
         "time,speed,cmd\n[us],rpm,V\n" + lines(time=lambda t: f"{t * 1e6:.0f}"),
         "time,speed,cmd\nms,rpm,V\n" + lines(time=lambda t: f"{t * 1000:.0f}"),
         "Bench 3, run 7\n\ntime,speed,cmd\n[s],[rpm],[V]\n" + lines(),
@@ -536,3 +537,29 @@ def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
         (bag,) = group_recordings([path])
         assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}
         assert f"is taken for {order}, year" in " ".join(bag.warnings)
+
+
+def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
+    """Newest rows first, whole seconds, days of a spreadsheet, the letters of Windows, a row for each number."""
+    path = tmp_path / "a.csv"
+
+    def said(text, encoding="utf-8"):
+        path.write_text(text, encoding=encoding)
+        (bag,) = group_recordings([path])
+        return bag, " ".join(bag.warnings)
+
+    for head in ("", "12/01/2014 "):
+        newest, words = said("time,x\n" + "".join(f"{head}00:{40 - k}:00,{k}\n" for k in range(30)))
+        assert set(np.diff(newest.times).tolist()) == {60 * 10**9} and "newest row comes first" in words
+        assert newest.columns_by_field["x"][0] == 29
+    assert (
+        "90 of 100 rows have the time of a row before"
+        in said("time,x\n" + "".join(f"{k // 10},{k}\n" for k in range(100)))[1]
+    )
+    assert (
+        "write days of a spreadsheet" in said("Date,x\n" + "".join(f"{45717 + k / 288:.6f},{k}\n" for k in range(9)))[1]
+    )
+    assert not said("time,x\n" + "".join(f"{45717 + k / 50:.3f},{k}\n" for k in range(9)))[1]  # since the boot
+    assert list(said("time,Größe °C\n0,1\n1,2\n", "cp1252")[0].columns_by_field) == ["Größe_C"]
+    rows, _ = said("time,signal,value\n" + "".join(f"{k},{('speed', 'load')[k % 2]},{k * k}\n" for k in range(90)))
+    assert "column 'signal' names the signal" in rows.topics["/table"].reason

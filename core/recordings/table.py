@@ -15,7 +15,6 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal, InvalidOperation
-from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -92,8 +91,9 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         words = " and ".join(part for part in (words, order) if part)
         return column, times, f"column '{column}': {words}" if order else words
     unit = layout.unit or _unit(column, values, table.units.get(column, ""))
-    if layout.unit is None and unit != "s":
-        words = f"{words}{' and ' if words else ''}its numbers are taken for {unit}"
+    days = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
+    if layout.unit is None and (unit != "s" or days):
+        words = f"{words}{' and ' if words else ''}its numbers are taken for {unit}{days}"
     return column, _of_numbers(where, table, column, UNITS[unit]), f"column '{column}': {words}" if words else ""
 
 
@@ -146,6 +146,14 @@ def _unit(name: str, values: Column, stated: str = "") -> str:
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     size = float(np.median(np.abs(finite.astype(np.float64)))) if len(finite) else 0.0
     return next((unit for least, unit in _EPOCHS if size > least), "s")
+
+
+def _like_days(values: Column) -> bool:
+    """Whether numbers with more than three decimals are such as Excel and MATLAB write for days of these decades."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    fine = bool((np.abs(1e3 * known - np.rint(1e3 * known)) > 1e-3).any())
+    return fine and any(least < low and high < most for least, most in ((20_000, 80_000), (690_000, 800_000)))
 
 
 def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:
@@ -241,7 +249,7 @@ def _as_iso(where: str, cells: Sequence[object]) -> tuple[Sequence[object], str]
             f"{m[5] or '00'}:{m[6] or '00'}"
             for m in found
         ]
-        if all(1 <= int(text[5:7]) <= 12 for text in texts) and all(a <= b for a, b in pairwise(texts)):
+        if all(1 <= int(text[5:7]) <= 12 for text in texts) and sorted(texts) in (texts, texts[::-1]):
             orders[order] = texts
     taken, note = list(orders), ""
     if len({tuple(texts) for texts in orders.values()}) == 2:
@@ -362,16 +370,28 @@ class Table(Recording):
             number = int(np.count_nonzero(~known))
             self._warnings.append(f"{path}: {plural(number, 'row')} without a time left out")
             kept = kept[known]
+        steps = np.diff(times[kept])
+        if (steps < 0).any() and (steps <= 0).all():
+            kept = kept[::-1]
+            self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
+        if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
+            self._warnings.append(
+                f"{path}: {equal} of {len(kept)} rows have the time of a row before, and only the first of such rows "
+                f"counts; write times with more decimals"
+            )
         self.times = times[kept]
         names = [name for name in raw.columns if name not in apart]
+        here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
         self.columns_by_field: dict[str, Column] = {
-            field: raw.columns[name] if len(kept) == len(times) else raw.columns[name][kept]
-            for field, name in zip(once(map(field_name, names), "_"), names, strict=True)
+            field: raw.columns[name][here] for field, name in zip(once(map(field_name, names), "_"), names, strict=True)
         }
         first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
         readable, reason = bool(self.columns_by_field), ""
         if not readable:
-            reason = f"there is no column but the time, '{time}'"
+            reason = f"there is no column but the time, '{time}'; choose another file"
+        elif names_signals := _names_signals(self.columns_by_field):
+            readable = False
+            reason = f"column '{names_signals}' names the signal of a row's one number; write a column for each signal"
         self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), file.suffix[1:].lower(), readable, reason, first, last)}
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -452,7 +472,7 @@ class Table(Recording):
             if topic != TOPIC:
                 raise BagError(f"{self.path}: there is no topic {topic}; a table has one, {TOPIC}")
         if wanted and not self.topics[TOPIC].readable:
-            raise BagError(f"{self.path}: cannot be used: {self.topics[TOPIC].reason}; choose another file")
+            raise BagError(f"{self.path}: cannot be used: {self.topics[TOPIC].reason}")
         return wanted
 
 
@@ -496,6 +516,16 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
         else:
             found[name] = pieces[i]
     return found
+
+
+def _names_signals(columns: Mapping[str, Column]) -> str:
+    """The column of text that changes from row to row among few values, beside a single column of numbers."""
+    numbers = [column for column in columns.values() if column.dtype.kind not in "OM"]
+    for name, column in columns.items() if len(numbers) == 1 else ():
+        if column.dtype.kind == "O" and 2 * np.count_nonzero(column[1:] != column[:-1]) > len(column):
+            if len(set(column.tolist())) <= len(column) // 20:
+                return name
+    return ""
 
 
 def _field_type(column: Column) -> FieldType:

@@ -87,6 +87,11 @@ def _read_csv(path: Path) -> RawTable:
     with open(path, "rb") as stream:
         head = stream.read(_LOOK)
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    try:
+        head[:-4].decode(encoding)
+    except UnicodeDecodeError as error:
+        if encoding != "utf-16" and error.start < len(head) - 8:
+            encoding = "cp1252"  # of Windows
     if encoding != "utf-16" and b"\0" in head:
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
     lines = re.split(r"\r\n|\r|\n", head.decode(encoding, errors="replace"))[:_LOOK_LINES]
@@ -251,17 +256,15 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
         raise BagError(f"{path}: has {wide} columns, more than {_MOST_COLUMNS}; write those that are needed")
     if delimiter == " ":
         raise BagError(f"{path}: its cells are apart by spaces alone; write commas, semicolons or tabs between them")
-    names: tuple[str, ...] = tuple(f"column {i + 1}" for i in range(wide))
-    units: tuple[str, ...] = ()
-    for number, line in enumerate(lines[:-begin], start=1):
-        cells = _split(line.lstrip("#% "), delimiter)
-        trimmed = cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells
-        if len(trimmed) == wide and len({c for c in trimmed if c}) > 1:
-            names = tuple(trimmed)
-            below = [_split(text.lstrip("#% "), delimiter) for text in lines[number:-begin]]
-            units = next((tuple(cells) for cells in below if len(cells) >= wide), ())
-            break
-    return _Shape(delimiter, -begin, names, units)
+    above = [_split(line.lstrip("#% "), delimiter) for line in lines[:-begin]]
+    above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
+    above = [cells for cells in above if len(cells) == wide]
+    kinds = [len(set(cells) - {""}) for cells in above]
+    named = [i for i, kind in enumerate(kinds) if kind > 1]
+    if not named:
+        return _Shape(delimiter, -begin, tuple(f"column {i + 1}" for i in range(wide)))
+    chosen = next((i for i in named if 2 * kinds[i] > wide), named[0])  # above the names there may be groups of them
+    return _Shape(delimiter, -begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
 
 
 def _split(line: str, delimiter: str) -> list[str]:
