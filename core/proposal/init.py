@@ -400,7 +400,8 @@ def propose(
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
-        remedy = "record the machine at work, and longer, or name the topics of its states in `init --states`"
+        remedy = "record the machine at work, and longer, or name the topics of its states in `uncertain-lti init"
+        remedy += " --states`"
         if any(s.reason == _APART for s in sources):
             remedy = "give recordings of one machine, with the same topics"
         raise BagError(
