@@ -482,7 +482,7 @@ def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp
     plant.u = np.full(2, 0.7)
     count = diagnostics.count
     plant.send(20)
-    diagnostics.reaches(WARN, saying="outside the fitted domain", since=count)
+    diagnostics.reaches(WARN, saying=" verdicts: p at 0.73 (fitted: -0.35 to 0.55), q at ", since=count)
     plant.u = np.full(2, 0.2)
     count = diagnostics.count
     plant.send(20, off=2.0)

@@ -24,8 +24,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
+from uncertain_lti.model.operating_point import recorded
 
 
 @dataclass(frozen=True)
@@ -170,6 +171,26 @@ class Domain:
         occupied = None if self.measure is None else self.measure.occupied
         columns = z.reshape(-1, z.shape[-1]).T
         return np.asarray(outside_domain(columns, self.least, self.greatest, occupied)).reshape(lead)
+
+
+def outside_in_words(model: Any, z: Array) -> str:
+    """Which signals of some samples [x; u; ...] (n + m + q, K), normalised, lie beyond what was fitted, and where.
+
+    Those that do most often come first; empty if none lies outside its range by itself.
+    """
+    point, found = model.operating_point, []
+    least, greatest = model.domain.least, model.domain.greatest
+    z = z[: len(least)]
+    beyond = (z < least[:, None]) | (z > greatest[:, None])
+    for i in np.argsort(-beyond.sum(axis=1), kind="stable")[: beyond.any(axis=1).sum()].tolist():
+        there = z[i, beyond[i]]
+        ends = recorded(
+            np.array([there.min(), there.max(), least[i], greatest[i]]), float(point.steady[i]), float(point.scale[i])
+        )
+        low, high, *fitted = (f"{value:.4g}" for value in ends.tolist())
+        at = " to ".join(dict.fromkeys((low, high)))
+        found.append(f"{model.signals.signals[i].name} at {at} (fitted: {' to '.join(fitted)})")
+    return shortlist(found, 3)
 
 
 def largest_steps(model: Any, found: Iterable[Any]) -> Array:

@@ -20,7 +20,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
-from uncertain_lti.model.domain import Domain
+from uncertain_lti.model.domain import Domain, outside_in_words
 from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbroken_over
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns, normalised
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
@@ -129,6 +129,12 @@ class Envelope(Elements):
         visited = places[(weights > 0) & (places >= 0)].tolist()
         found += [f"no recording visited {self.block_name(r)}" for r in visited if not self.block_data[r].known]
         return ", and ".join(found)
+
+    def why_outside(self, values: Sequence[float]) -> str:
+        """Which signals of a sample [x; u; s] in recorded units lie beyond what was fitted, in words."""
+        point = self.operating_point
+        z = normalised(np.asarray(values, dtype=np.float64), point.steady, point.scale)
+        return outside_in_words(self, z[:, None])
 
     def _places(self, values: Sequence[float]) -> list[tuple[Axis, Array, float, float]]:
         """Each axis with its knots or modes, and its signal in a sample, in recorded units and normalised."""

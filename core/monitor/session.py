@@ -85,7 +85,9 @@ class Session(Stream):
             why = self.model.why_unknown(period.last_unknown.before)
             complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
         if outside := period.outside - period.unknown:
-            complaints.append(f"outside the fitted domain in {outside} of {period.verdicts} verdicts")
+            where = period.last_outside and self.model.why_outside(period.last_outside.before)
+            text = f"outside the fitted domain in {outside} of {period.verdicts} verdicts"
+            complaints.append(f"{text}: {where}" if where else text)
         for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
             if period.statuses[status]:
                 which = ""

@@ -56,13 +56,13 @@ class Period:
     """What has happened since the last report.
 
     `began`: steady time, s; `verdicts`: verdicts given in it; `outside`: those from outside the fitted domain;
-    `unknown`: those of a regime that was not fitted; `last_unknown`: the last of these; `last_unlisted`: the last
-    in it on a mode that the model does not list; `alarm`: the alarm was raised at some time in it; `frozen,
-    repeating`: by number of the state, the last repeat of those that were frozen, and of others that repeat for
-    longer than ever in the fit; `withheld`: by number of the state, samples without a verdict on it as it needs a
-    frozen one; `violations`: by number of the state; `largest` (n,): largest |utilisation|; `jumps`: the first
-    jumps larger than any of the fit, in words; `statuses`: of the samples in it; `counters, late, unreadable,
-    future`: of the sampler, and of messages, when it began.
+    `unknown`: of these those of a regime that was not fitted; `last_unknown`: the last of them; `last_outside`: the
+    last of the others; `last_unlisted`: the last in it on a mode that the model does not list; `alarm`: the alarm
+    was raised at some time in it; `frozen, repeating`: by number of the state, the last repeat of those that were
+    frozen, and of others that repeat for longer than ever in the fit; `withheld`: by number of the state, samples
+    without a verdict on it as it needs a frozen one; `violations`: by number of the state; `largest` (n,): largest
+    |utilisation|; `jumps`: the first jumps larger than any of the fit, in words; `statuses`: of the samples in it;
+    `counters, late, unreadable, future`: of the sampler, and of messages, when it began.
     """
 
     began: float
@@ -75,6 +75,7 @@ class Period:
     outside: int = 0
     unknown: int = 0
     last_unknown: Verdict | None = None
+    last_outside: Verdict | None = None
     last_unlisted: Verdict | None = None
     frozen: dict[int, Moved] = field(default_factory=dict)
     withheld: Counter[int] = field(default_factory=Counter)
@@ -485,6 +486,8 @@ class Stream:
         if verdict.unknown_regime:
             period.unknown += 1
             period.last_unknown = verdict
+        elif verdict.outside_domain:
+            period.last_outside = verdict
         if verdict.violated:
             if len(period.jumps) < SHOWN:
                 period.jumps.extend(self.jumps_of(verdict))

@@ -34,7 +34,7 @@ from uncertain_lti.base.text import (
     text_of,
     times,
 )
-from uncertain_lti.model.domain import jump_words, jumps
+from uncertain_lti.model.domain import jump_words, jumps, outside_in_words
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -92,6 +92,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "inside": _inside(int(verdicts.violated.sum()), judged),
         "outside_domain": int(verdicts.outside_domain.sum()),
         "outside_domain_share": int(verdicts.outside_domain.sum()) / judged if judged else None,
+        "beyond": _beyond(model, verdicts),
         "unknown_regime": int(verdicts.unknown_regime.sum()),
         "unknown": unknown_in_words(model, verdicts),
         "regimes": check_regimes(model, verdicts),
@@ -319,10 +320,10 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
         )
     if (outside := data["outside_domain_share"]) > UNVOUCHED:
         ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
-        why = f" ({'; '.join(data['unknown'])})" if data["unknown"] else ""
+        why = "; ".join(filter(None, [data["beyond"], *data["unknown"]]))
         return (
             f"{outside:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; {ask}"
-            f"fit recordings that reach as far{why}"
+            f"fit recordings that reach as far{': ' * bool(why)}{why}"
         )
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, dict) and alarm.get("worth") == "none":
@@ -394,6 +395,12 @@ def _before(model: UncertainLTI, verdicts: Verdicts) -> Array:
     z = np.full((model.n + model.m + model.q, len(verdicts.transient)), math.nan)
     z[:, steps.k + 1] = model.normalised_columns(steps)
     return z
+
+
+def _beyond(model: UncertainLTI, verdicts: Verdicts) -> str:
+    """Which signals lie beyond what was fitted, and where; of regimes that are unknown `unknown_in_words` tells."""
+    rows = verdicts.outside_domain & ~verdicts.unknown_regime
+    return outside_in_words(model, _before(model, verdicts)[:, rows]) if rows.any() else ""
 
 
 def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
@@ -477,7 +484,8 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
             rows.append([r["regime"], str(r["verdicts"]), share(r["inside"]), str(r["unknown_regime"]), *widths])
         blocks.append(Table(header, rows))
     if data["verdicts"]:
-        blocks.append(f"outside the fitted domain: {data['outside_domain_share']:.2%} of the verdicts")
+        where = "" if data["beyond"] in data["reason"] else f": {data['beyond']}"
+        blocks.append(f"outside the fitted domain: {data['outside_domain_share']:.2%} of the verdicts{where}")
         if data["unknown_regime"]:
             unknown = data["unknown_regime"] / data["verdicts"]
             blocks.append(f"unknown regime: {unknown:.2%} of the verdicts, which nothing vouches for")

@@ -297,7 +297,9 @@ def _recording_reasons(
         text = f"{_percent(violated)} of the verdicts are violated, and {nothing}: such a verdict cannot tell a fault"
         yield NO, "recordings", text
     if outside > OUTSIDE_DOMAIN:
-        yield CARE, "recordings", f"{_percent(outside)} of the verdicts are outside the ranges seen in the fit"
+        where = "; ".join(dict.fromkeys(filter(None, (r["beyond"] for r in recordings))))
+        text = f"{_percent(outside)} of the verdicts are outside the ranges seen in the fit"
+        yield CARE, "recordings", f"{text}: {where}" if where else text
     for text in drift_in_words(model, recordings):
         yield CARE, "drift", text
     if silent > WITHOUT_VERDICT:
