@@ -113,7 +113,8 @@ def test_a_reader_that_goes_away_leaves_the_alarm_unknown(folder):
     for what, status in (("check", 141), ("topics", 0)):
         read, wrote = os.pipe()
         os.close(read)
-        done = run(commands(folder)[what], stdout=wrote, stderr=subprocess.PIPE)
+        env = {**os.environ, "PYTHONUNBUFFERED": ""}  # what was not written is there when Python ends
+        done = run(commands(folder)[what], stdout=wrote, stderr=subprocess.PIPE, env=env)
         os.close(wrote)
         assert done.returncode == status and done.stderr == "", what
 

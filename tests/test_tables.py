@@ -137,6 +137,10 @@ def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
     assert main(["fit", path, *words]) == 0
     assert main(["check", model, path]) == 0
     assert "100.000% inside all bounds" in capsys.readouterr().out
+    cut = tmp_path / "cut.csv"
+    cut.write_text(f"{tables['.csv'].read_text()}30.5,6")
+    assert main(["check", model, str(cut)]) == 0
+    assert "1 line with another number of cells left out" in capsys.readouterr().err
     assert main(["validate", model]) == 0
     assert main(["report", model, path, "--output", str(tmp_path / "r.html"), "-q"]) == 0
     assert main(["check", model, path, "--write", str(tmp_path / "out.mcap")]) == 2
