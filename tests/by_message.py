@@ -30,6 +30,8 @@ def read_stream_by_message(bag: Recording, signals: SignalMap) -> Stream:
     values = [array("d") for _ in topics]
     for name, log_time, message in bag.messages(topics):
         where = topics.index(name)
+        if all(path.absent(message).startswith("there is no '") for path in paths[where]):
+            continue  # of another publisher
         order.append(where)
         arrival.append(in_reach(bag.path, log_time))
         stamp.append(header_stamp_ns(message) or -1)

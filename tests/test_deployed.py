@@ -98,6 +98,24 @@ def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, optio
     assert report["rule"]["conditions"] == data["deployed"]
 
 
+@pytest.mark.parametrize("enable", ["", f"{STATE} position[fan_speed] > 0.01", f"{STATE} position[gripper] > 0.5"])
+def test_messages_of_another_publisher_with_other_names_do_not_count(machine, enable, tmp_path, capsys):
+    """A gripper on the topic of the joints, in turn with them, first and last."""
+    model, folder, messages = machine
+    rng, mixed = np.random.default_rng(2), []
+    for message in messages:
+        mixed += [message] if message.topic != STATE or mixed else []
+        t = message.log_time + int(rng.integers(0, 20_000_000))
+        mixed.append(Message(STATE, message.log_time, joint_state(["gripper"], [float(len(mixed) > 200)], t), t))
+    path = write(TOPICS, mixed).save(tmp_path / "two.mcap")
+    expected = live(model, mixed, Rule(enable=enable))
+    assert "gripper" in enable or expected == live(model, messages, Rule(enable=enable))
+    assert 0 < sum(alarm for _, alarm in expected) < len(expected) > 290
+    assert main(["check", str(folder / "m.model.json"), str(path), "--json", "--enable", enable]) == 1
+    found = json.loads(capsys.readouterr().out)["recordings"][0]["verdict_per_sample"]
+    assert [(v["t_ns"], v["alarm"]) for v in found] == expected
+
+
 @pytest.mark.parametrize("whole_model", [True, False])
 def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whole_model, tmp_path, capsys):
     model, folder, _ = machine

@@ -33,7 +33,7 @@ from uncertain_lti.monitor.likeness import Explainer
 from uncertain_lti.monitor.reason import QUIET, Reasons
 from uncertain_lti.monitor.verdict import Foreseen, Verdict
 from uncertain_lti.recordings.message_reader import MessageReader, UnreadableError
-from uncertain_lti.sampling.clock import LATE, Status, to_ns
+from uncertain_lti.sampling.clock import LATE, MISSING, Status, to_ns
 from uncertain_lti.sampling.sampler import Sampler, all_finite
 from uncertain_lti.signals.field_path import FieldPath, TypeFields
 
@@ -394,16 +394,21 @@ class Stream:
     def take(self, topic: str, arrival_ns: int, data: bytes, now: float) -> tuple[Sequence[Verdict], bool]:
         """Take one serialised message."""
         self.received[topic] = self.received.get(topic, 0) + 1
+        heard: cython.double = self._heard.get(topic, math.nan)
         self._heard[topic] = now
         if topic == self.enable_topic and self._reads_condition is not None:
             self._learn_condition(topic, data)
-        if topic not in self._readers:
+        reader = self._readers.get(topic)
+        if reader is None:
             return _NOTHING, False
         try:
-            stamp_ns, values = self._readers[topic].read(data)
+            stamp_ns, values = reader.read(data)
         except UnreadableError as error:
             self._note_unreadable(topic, error)
             return _NOTHING, False  # as in a recording: it is left out, and the values before it are kept
+        if reader.strange:
+            self._pass_over(topic, heard)
+            return _NOTHING, False
         if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
             self.future[topic] += 1
         sampler = self.sampler
@@ -436,9 +441,20 @@ class Stream:
             if topic not in self._readers:
                 self._note_unreadable(topic, error)
             return  # as in a recording: the value before it is kept
+        if self._reads_condition.strange:
+            return
         self.arming.learn(value)
         if not self.arming.on:
             self.monitor.reset()
+
+    @cython.cfunc
+    def _pass_over(self, topic: str, heard: cython.double) -> None:
+        """A message of another publisher, which names no signal of the model: as in a recording it does not count."""
+        if self.verdicts and heard == heard:
+            self._heard[topic] = heard
+        else:  # there may be nobody who names them
+            for i in self.model.signals.on(topic):
+                self.sampler.counters.add(MISSING, self.model.signals[i].name)
 
     @cython.cfunc
     def _note_unreadable(self, topic: str, error: UnreadableError) -> None:

@@ -54,7 +54,7 @@ class FieldReader:
     ) -> list[tuple[int, str]]:
         """Fill in a row of values and a stamp, ns, for each message data[begin:end].
 
-        Returns rows of messages that cannot be decoded, each with the reason.
+        Returns rows of messages that cannot be decoded, each with the reason, and of another publisher's, without one.
         """
         states = self.plan.read_all(data, begin, end, values, stamps)
         if not self.plan.able:
@@ -147,8 +147,9 @@ class ColumnReader:
                 for row, why in readers[key].read(batch.data, batch.begin[at], batch.end[at], read, stamps):
                     kept[at[row]] = False
                     name = self.topics[where]
-                    number, least = self.undecoded.get(name, (0, why))
-                    self.undecoded[name] = number + 1, min(least, why)
+                    if why:
+                        number, least = self.undecoded.get(name, (0, why))
+                        self.undecoded[name] = number + 1, min(least, why)
                 values[mine], stamp[at] = read, stamps
             begin = self.filled_of[where]
             if begin + len(rows) > len(self.values[where]):

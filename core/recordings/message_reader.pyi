@@ -29,6 +29,7 @@ class MessageReader:
     type_name: str
     decode: Callable[[bytes], Any]
     decoded: int
+    strange: bool
     def __init__(
         self,
         type_name: str,

@@ -43,7 +43,7 @@ cdef enum:
 cdef enum:  # what a node is
     NUMBER, TRUTH, TEXT, MESSAGE
 cdef enum:  # what a message is; from LONGER on by how many bytes
-    WHOLE, CUT, UNTRUE, OTHER, LONGER
+    WHOLE, CUT, UNTRUE, OTHER, STRANGE, LONGER
 NOT_PLAIN = OTHER
 NO_STAMP = -1
 _SHAPED_ODDLY = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
@@ -127,7 +127,8 @@ cdef class Plan:
     """How the wanted numbers of one type are read.
 
     `type_name`: as package/msg/Name; `paths`: checked against the type; `type_fields`: type name -> {field name:
-    FieldType}. Raises UnfitError if messages of the type cannot be walked. `able`: whether it can give all numbers.
+    FieldType}. Raises UnfitError if messages of the type cannot be walked. `able`: whether it can give all numbers;
+    `named`: all are looked up by name, so that a message in which no such name stands is of another publisher.
     """
 
     cdef _Node top
@@ -135,6 +136,7 @@ cdef class Plan:
     cdef dict unwanted
     cdef list codes, parts, every, functions
     cdef readonly bint able
+    cdef bint named, met
     cdef Py_ssize_t seconds, nanoseconds
     cdef const uint8_t* data
     cdef Py_ssize_t at, size, reserved
@@ -162,6 +164,8 @@ cdef class Plan:
         found = [parts[0] if path.function is None else -1 for path, parts in zip(paths, self.parts)]
         self.slot_of = np.array(found, dtype=np.intp)
         self.row, self.place = np.empty(len(self.codes)), np.empty(2 * len(self.every), np.int64)
+        by_name = [any(kind == "name" for kind, _ in path.steps) for path in paths]
+        self.named = self.able and bool(by_name) and all(by_name)
 
     def stamp(self, type_name, number):
         """What is wanted for the header stamp."""
@@ -267,12 +271,12 @@ cdef class Plan:
             return OTHER
         self.big = data[1] == 0
         self.data, self.size, self.at = data + ENCAPSULATION, size - ENCAPSULATION, 0
-        self.reserved, self.untrue = 0, False
+        self.reserved, self.untrue, self.met = 0, False, not self.named
         if not self.message(self.top):
             return CUT
         if self.size - self.at > PADDING + self.reserved:
             return LONGER + self.size - self.at
-        return UNTRUE if self.untrue else WHOLE
+        return UNTRUE if self.untrue else WHOLE if self.met else STRANGE
 
     cdef bint message(self, _Node node) except? False:
         cdef Py_ssize_t names = -1, number = 0, at = self.at, reserved = self.reserved, position
@@ -381,7 +385,7 @@ cdef class Plan:
             zero = memchr(self.data + self.at, 0, length)
             if (zero - <const void*>(self.data + self.at) if zero != NULL else length) == len(name):
                 if not memcmp(self.data + self.at, <const char*>name, len(name)):
-                    found = i
+                    found, self.met = i, True
                     break
             self.at += length
         self.at = back
@@ -435,7 +439,7 @@ cdef class Plan:
         """What a message is."""
         if what > LONGER:
             return f"it is {what - LONGER} bytes longer than its definition"
-        return ("", "it is cut", "it holds a truth value that is neither 0 nor 1", "it is no plain CDR")[what]
+        return ("", "it is cut", "it holds a truth value that is neither 0 nor 1", "it is no plain CDR", "")[what]
 
     cdef Py_ssize_t alone(self, bytes data) except -1:
         self.row[:] = NAN
@@ -448,7 +452,7 @@ cdef class Plan:
         """What a message is, and if it is whole, its stamp (ns or None) and values."""
         cdef Py_ssize_t what = self.alone(data)
         cdef Py_ssize_t slot, number
-        if what != WHOLE or not self.able:
+        if what not in (WHOLE, STRANGE) or not self.able:
             return what, None
         values = []
         for number in range(self.slot_of.shape[0]):
@@ -460,7 +464,7 @@ cdef class Plan:
         stamp = None
         if self.seconds >= 0:
             stamp = <int64_t>self.slots[self.seconds] * 1_000_000_000 + <int64_t>self.slots[self.nanoseconds] or None
-        return WHOLE, (stamp, values)
+        return what, (stamp, values)
 
     def read_all(self, buffer, int64_t[::1] begin, int64_t[::1] end, double[:, :] values, int64_t[::1] stamps):
         """Messages buffer[begin:end]; fills in a row of values and a stamp (`NO_STAMP` if none) of each.
@@ -528,10 +532,12 @@ cdef class MessageReader:
 
     `type_name`: as package/msg/Name; `paths`: checked against the type; `type_fields`: type name -> {field name:
     FieldType}; `decode`: serialised message -> message; may raise anything where that is not one; `decoded`: messages
-    that it was needed for; `largest`: bytes of a message that is read.
+    that it was needed for; `largest`: bytes of a message that is read; `strange`: the last one read names nothing of what
+    is wanted, so another publisher sent it, and it counts no more than one of another topic.
     """
 
     cdef readonly object type_name, decode, decoded
+    cdef readonly bint strange
     cdef object paths
     cdef Plan plan
     cdef Py_ssize_t largest
@@ -560,7 +566,8 @@ cdef class MessageReader:
                 )
             if what == UNTRUE:
                 raise UnreadableError("holds a truth value that is neither 0 nor 1")
-            if what == WHOLE and self.plan.able:
+            self.strange = what == STRANGE
+            if found is not None:
                 return found
         self.decoded += 1
         try:

@@ -100,16 +100,16 @@ def refuse_absent(
 
 
 def _refuse_absent(bag: Recording, topic: str, path: FieldPath, column: NDArray[np.float64]) -> None:
-    if not len(column):
-        raise BagError(f"{bag.path}: {topic} has no message; record it, or choose another topic or recording")
     looked_up = any(kind != "attribute" for kind, _ in path.steps)
-    if not looked_up or not np.isnan(column[:1]).any() or not np.isnan(column).all():
+    if len(column) and not (looked_up and np.isnan(column[:1]).any() and np.isnan(column).all()):
         return
     notes = bag.reading_notes
-    _, _, first = next(iter(bag.messages([topic])))
+    first = next((message for _, _, message in bag.messages([topic])), None) if looked_up else None
     bag.restore_notes(*notes)
-    if absent := path.absent(first):
+    if first is not None and (absent := path.absent(first)):
         raise SignalError(f"field '{path.text}' of {topic} in {bag.path}: {absent}")
+    if not len(column):
+        raise BagError(f"{bag.path}: {topic} has no message; record it, or choose another topic or recording")
 
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
@@ -333,15 +333,16 @@ def read_field(
         raise BagError(no_topic(recording, topic))
     field.check(topic, recording.topics[topic].type, recording.type_fields(topic))
     clock = signals.clock or ""
-    topics, paths = [topic], [[field]]
-    if clock != topic:
-        topics.append(clock)
-        paths.append([FieldPath(signals.signals[signals.on(clock)[0]].field)])
+    of_clock = [FieldPath(signals.signals[i].field) for i in signals.on(clock)]
+    topics, paths = ([topic], [[field]]) if clock == topic else ([topic, clock], [[field], of_clock])
     columns = recording.columns(topics, paths)
     _refuse_absent(recording, topic, field, columns.values[0][:, 0])
     of_field = columns.topic == 0
-    is_clock = of_field if clock == topic else ~of_field
-    came = np.cumsum(is_clock)[of_field] - (clock == topic)  # clock messages before it; it goes with its own
+    if clock == topic:  # clock messages before it; it goes with its own
+        own, its = recording.columns([clock], [of_clock]).arrival, columns.arrival
+        came = np.arange(len(its)) if len(own) == len(its) else np.searchsorted(own, its)
+    else:
+        came = np.cumsum(~of_field)[of_field]
     return np.searchsorted(decisions.by[~decisions.dropped], came), columns.values[0][:, 0]
 
 
