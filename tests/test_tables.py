@@ -344,7 +344,6 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time x y\n1 2 3\n2 3 4\n", "apart by spaces alone"),
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
-        ("a.csv", b"time,y\n,2\n,3\n", "holds no time in any row"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
         ("a.csv", b'time,y\n"0,125","6,2"\n"0,250","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
@@ -464,6 +463,9 @@ def test_nanoseconds_with_a_gap_stay_exact(tmp_path):
     times = pa.array([begin, None, begin + 7], pa.int64())
     columns = {"time": times, "x": [1.0, 2.0, 3.0], "mode": ["a", "b", "c"]}
     parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    parquet.write_table(pa.table(columns | {"time": pa.array([None] * 3, pa.string())}), tmp_path / "b.parquet")
+    with pytest.raises(BagError, match=r"b\.parquet: column 'time': holds no time in any row"):
+        Table(tmp_path / "b.parquet")
     table = Table(tmp_path / "a.parquet")
     assert table.times.tolist() == [begin, begin + 7] and table.type_fields("/table")("table")["mode"].kind == "string"
 

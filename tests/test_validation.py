@@ -461,7 +461,8 @@ def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     runs = uncertain_lti.read_transients(bags, folder / "signals.yaml")
     for by, said in ((None, "3 groups, by metadata=machine"), ("none", "one recording at a time")):
         assert said in validation_text(validate(UncertainLTI.load(model), runs, groups=by).to_dict())
-    assert group_names(runs, "folder") == ["day0", "day1", "day2"] * 2
+    outside = uncertain_lti.read_transients(folder / "run0.mcap", folder / "signals.yaml")
+    assert group_names([*outside, *runs], "folder") == [folder.name, *["day0", "day1", "day2"] * 2]
     assert group_names(runs, "name=_m(\\d)") == ["0", "1"] * 3 and group_names(runs, "name=_m") == ["_m"] * 6
     assert main([*command, "--group", "metadata=pilot"]) == 2
     said = capsys.readouterr().err
