@@ -208,6 +208,8 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, capsys):
     assert first.startswith("UNKNOWN: 4") or first.startswith("UNKNOWN: 5")
     assert "outside the fitted domain, where nothing vouches for the bounds" in first and "says nothing" in last
     assert re.search(r"that reach as far: \w+ at [\d.-]+ to [\d.-]+ \(fitted: [\d.-]+ to [\d.-]+\)$", first)
+    assert main(["report", str(path), str(folder / "run.mcap"), "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["recordings"][0]["outcome"] == "unknown"
     assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 3
     printed = json.loads(capsys.readouterr().out)
     assert (printed["outcome"], printed["exit_status"], printed["alarm"]) == ("unknown", 3, False)

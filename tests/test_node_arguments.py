@@ -231,3 +231,14 @@ def test_without_rclpy_a_program_says_what_to_install(tmp_path: Path, module: st
     for node, line in zip(NODES, done.stderr.splitlines(), strict=True):
         assert line.startswith(f"{node}: {says}")
         assert line.endswith("; source a ROS 2 Jazzy installation, or in the checkout: pip install '.[ros]'")
+
+
+@pytest.mark.parametrize("program", ["envelope_monitor", "uncertain-lti"])
+def test_a_middleware_that_is_not_installed_is_a_sentence(tmp_path: Path, program: str) -> None:
+    """The wheels have one; another is often in the environment of a shell."""
+    code = "from uncertain_lti_ros.nodes import envelope_monitor; raise SystemExit(envelope_monitor())"
+    if program == "uncertain-lti":
+        code = "from uncertain_lti.cli.main import main; raise SystemExit(main(['play', 'a.mcap']))"
+    code = f"import os; os.environ['RMW_IMPLEMENTATION'] = 'rmw_none_cpp'; {code}"
+    said = refusal(process(tmp_path, code), {"uncertain-lti": "uncertain-lti play"}.get(program, program))
+    assert "RMW_IMPLEMENTATION is rmw_none_cpp, which is not installed here; unset it" in said

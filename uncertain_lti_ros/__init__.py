@@ -8,3 +8,18 @@
 # specific language governing permissions and limitations under the License.
 
 """ROS 2 nodes around ``uncertain_lti``: parameters, QoS, clocks and messages; no numerics of their own."""
+
+import os
+import sys
+from pathlib import Path
+
+from uncertain_lti.base.errors import UncertainLTIError
+
+
+def hold_middleware() -> None:
+    """Refuse a middleware that is not installed, for which rcl would end the process with status 102."""
+    places = [Path(place) for place in (f"{sys.prefix}/lib", *os.environ.get("LD_LIBRARY_PATH", "").split(os.pathsep))]
+    wanted = os.environ.get("RMW_IMPLEMENTATION") or "rmw"
+    there = [any((place / f"lib{name}.so").exists() for place in places) for name in ("rmw", wanted)]
+    if there == [True, False]:
+        raise UncertainLTIError(f"RMW_IMPLEMENTATION is {wanted}, which is not installed here; unset it, or install it")

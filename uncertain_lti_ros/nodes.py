@@ -15,6 +15,9 @@ import sys
 import traceback
 from importlib import import_module
 
+from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti_ros import hold_middleware
+
 _BAD_USAGE, _FAULT, _INTERRUPTED = 2, 70, 130
 
 
@@ -36,7 +39,11 @@ def turbofan() -> int:
 def _run(module: str, function: str) -> int:
     name = module if function == "main" else function
     try:
+        hold_middleware()
         main = getattr(import_module(f"uncertain_lti_ros.{module}"), function)
+    except UncertainLTIError as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        return _BAD_USAGE
     except ImportError as error:
         package = (error.name or "").partition(".")[0]
         absent = isinstance(error, ModuleNotFoundError) and package

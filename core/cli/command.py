@@ -25,7 +25,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.text import printable
 from uncertain_lti.signals.values import CHOICES
 
@@ -292,7 +292,8 @@ class Command:
             declare(parser, self.options)
             parser.set_defaults(run=self.run)
         elif every or self.name == chosen:
-            with nullcontext() if self.name == chosen else suppress(ModuleNotFoundError):
+            with nullcontext() if self.name == chosen else suppress(ModuleNotFoundError, UncertainLTIError):
+                import_module("uncertain_lti_ros").hold_middleware()
                 module = import_module(f"uncertain_lti_ros.{self.of_ros}")
                 module.add_arguments(parser)
                 parser.set_defaults(run=module.run)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -108,6 +108,11 @@ class Judged:
         """Exit status of what was judged so far."""
         return ALARM if self.alarm else BAD_INPUT if self.refused else DONE
 
+    def status_of(self, recordings: Sequence[Mapping[str, Any]]) -> int:
+        """Exit status of what is known of each recording."""
+        nothing = self.status == DONE and any(r["outcome"] == "unknown" for r in recordings)
+        return UNKNOWN if nothing else self.status
+
 
 def _judged(options: argparse.Namespace) -> Judged:
     """Recordings judged by the model that is named first."""
@@ -144,9 +149,7 @@ def run_check(options: argparse.Namespace) -> Result:
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             messages = plural(made.messages, "message")
             options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
-    status = judged.status
-    if status == DONE and any(r["outcome"] == "unknown" for r in results):
-        status = UNKNOWN
+    status = judged.status_of(results)
     drift = drift_in_words(model, results)
     for text in drift:
         options.say(text)
@@ -178,7 +181,7 @@ def run_report(options: argparse.Namespace) -> Result:
 
         write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
         options.say(f"report written to {output}")
-    return Result(judged.status, {**facts, "not_checked": judged.refused})
+    return Result(judged.status_of(facts["recordings"]), {**facts, "not_checked": judged.refused})
 
 
 # --- plot ------------------------------------------------------------------------------------------------------------
