@@ -22,17 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import (
-    COMPRESSIONS,
-    Layout,
-    Message,
-    Topic,
-    cdr,
-    message,
-    metadata_yaml,
-    write,
-    write_folder,
-)
+from bag_writer import COMPRESSIONS, Layout, Message, Topic, cdr, message, metadata_yaml, write, write_folder
 from by_message import read_stream_by_message
 from fuzz import damaged
 from hypothesis import HealthCheck, given, settings
@@ -110,11 +100,7 @@ class Type:
 
 
 TIME = Type("builtin_interfaces/msg/Time", (Field("sec", "int32"), Field("nanosec", "uint32")))
-HEADER = Type(
-    "std_msgs/msg/Header",
-    (Field("stamp", "builtin_interfaces/Time"), Field("frame_id", "string")),
-    (TIME,),
-)
+HEADER = Type("std_msgs/msg/Header", (Field("stamp", "builtin_interfaces/Time"), Field("frame_id", "string")), (TIME,))
 
 
 @st.composite

@@ -182,8 +182,10 @@ def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> 
     rig.send(30, off=-2.0)
     (line,) = rig.lines[-1:]
     assert " below its bounds " in line and "b = " not in line and line.endswith("it lasts until ~/reset")
+    assert rig.session.report(rig.now, TIMEOUT)[0].message.startswith("alarm: at least 2 of 5 verdicts violated: a")
     rig.send(50)
     assert not rig.lines
+    assert rig.session.report(rig.now, TIMEOUT)[0].message.startswith("alarm: latched until ~/reset")
     rig.session.reset()
     rig.wait(0.1)
     assert [line[:21] for line in rig.lines] == ["the alarm is over aft"]

@@ -36,12 +36,7 @@ STEPS = (2, 5, 11)
 
 
 def runs(
-    seed: int = 0,
-    count: int = 3,
-    length: int = 160,
-    noise: float = 1e-3,
-    modes: bool = False,
-    bend: float = 3.0,
+    seed: int = 0, count: int = 3, length: int = 160, noise: float = 1e-3, modes: bool = False, bend: float = 3.0
 ) -> list[Transient]:
     """A damped, driven pair of states whose stiffness depends on the first."""
     rng = np.random.default_rng(seed)

@@ -687,9 +687,7 @@ def test_what_was_published_before_is_heard_and_quality_of_service_that_cannot_b
     assert not world.set(**{"qos.reliability": "match"})[0]
 
 
-def test_bounds_are_predicted_for_a_step_and_the_longest_horizon_while_somebody_listens(
-    bench: StartBench,
-) -> None:
+def test_bounds_are_predicted_for_a_step_and_the_longest_horizon_while_somebody_listens(bench: StartBench) -> None:
     arrays = {name: getattr(by_hand(), name) for name in ARRAYS}
     on = bench(by_hand(horizons=[Horizon(3, **arrays), Horizon(4, **arrays)]))
     on.plant.send(3)

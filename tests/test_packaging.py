@@ -38,12 +38,7 @@ LIVE = [
     for room in (ROOT / "core" / name for name in ("base", "signals", "model", "monitor"))
     for path in sorted(room.glob("*.py"))
     if path.stem not in ("__init__", "interchange", "progress")
-] + [
-    "sampling.sampler",
-    "sampling.transient",
-    "sampling.steady_state",
-    "recordings.message_reader",
-]
+] + ["sampling.sampler", "sampling.transient", "sampling.steady_state", "recordings.message_reader"]
 
 # Where the name to import is not the name to install.
 PIP_NAME = {"yaml": "pyyaml"}

@@ -84,11 +84,7 @@ def cut(transient, start, stop):
 
     part = slice(start, stop)
     return Transient(
-        transient.t_ns[part],
-        transient.x[part],
-        transient.u[part],
-        signals=transient.signals,
-        max_gap=transient.max_gap,
+        transient.t_ns[part], transient.x[part], transient.u[part], signals=transient.signals, max_gap=transient.max_gap
     )
 
 

@@ -39,11 +39,7 @@ STEP = 50_000_000  # ns
 COUNT = 240
 BESIDE = Axis("gear", modes=(1.0, 2.0))
 
-CASES = {
-    "knots": Schedule((SPEED,)),
-    "modes": Schedule((GEAR,)),
-    "two axes": Schedule((SPEED, BESIDE)),
-}
+CASES = {"knots": Schedule((SPEED,)), "modes": Schedule((GEAR,)), "two axes": Schedule((SPEED, BESIDE))}
 
 
 def signal_map(schedule: Schedule) -> SignalMap:

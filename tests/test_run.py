@@ -30,8 +30,7 @@ ROOT = Path(__file__).resolve().parent.parent
 VERSION = "{}.{}".format(*sys.version_info)
 
 pytestmark = pytest.mark.skipif(
-    (platform.system(), platform.machine()) != ("Linux", "x86_64"),
-    reason="the rclpy wheels are for x86_64 Linux",
+    (platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="the rclpy wheels are for x86_64 Linux"
 )
 
 LISTED = re.findall(r'^    "(\w+)\.(\w+)": "-O', (ROOT / "setup.py").read_text(), re.MULTILINE)

@@ -598,11 +598,7 @@ def test_what_is_as_new_as_the_chosen_message_comes_late_and_what_is_older_does_
         assert sampler.counters["late /u"] == late
 
 
-STEPS_BACK = [
-    "c105 u106 u101 c107 c108",
-    "c101 u101 u52 u103 c54 u55 c7",
-    "u50 u1 c6 u11 u12 u-33 u19 c21 c23 c28",
-]
+STEPS_BACK = ["c105 u106 u101 c107 c108", "c101 u101 u52 u103 c54 u55 c7", "u50 u1 c6 u11 u12 u-33 u19 c21 c23 c28"]
 """Stamps that tell a rule of a step back from its neighbour; so few streams do that drawn ones seldom show it."""
 
 

@@ -347,7 +347,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
         ("a.csv", b'time,y\n"0,125","6,2"\n"0,250","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
-        ("a.csv", b"time,y\n2026-13-22T06:28:00,2\n2026-11-22T06:28:01,3\n", "is no day or time that there is"),
+        ("a.csv", b"time,y\n2026-11-22T06:28:00,2\n2026-13-22T06:28:01,3\n", "'2026-13-22T06:28:01' is no day or"),
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),
         ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "is damaged or no .mat file|holds no column"),
