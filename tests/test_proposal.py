@@ -117,6 +117,18 @@ def test_real_recordings_fit_unedited(recordings, name):
         assert len(states) == 1
 
 
+def test_names_keep_the_letters_of_any_alphabet(tmp_path):
+    x, path = 0.0, tmp_path / "a.csv"
+    with open(path, "w", encoding="utf-8") as stream:
+        stream.write("Zeit,Größe [mm],油门\n")
+        for k in range(400):
+            u = math.copysign(1.0, math.sin(k / 17))
+            stream.write(f"{0.02 * k:.2f},{x:.5f},{u}\n")
+            x += 0.02 * (-2.0 * x + 3.0 * u) + 0.002 * math.sin(7 * k)
+    proposal = propose([path])
+    assert [c.name for c in (*proposal.states, *proposal.controls)] == ["größe_mm", "c_油门"]
+
+
 def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
     """Else no fit could read both; the others keep their places."""
 

@@ -30,7 +30,7 @@ from uncertain_lti.signals.field_path import FUNCTIONS
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.signals.values import CHOICES_TEXT
 
-_PARTS = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
+_PARTS = re.compile(r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+|\d+")  # letters of any alphabet
 
 
 _DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value", "quaternion", "accel", "wrench"}
