@@ -721,6 +721,7 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
                   "Level1_again: moves with Level1"):  # fmt: skip
         assert re.search(words, proposal.text), words
+    assert not any(c.steady for c in [*proposal.states, *proposal.controls]), "fit decides what to count from"
     model = fitted([path], proposal)
     assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0
     noise = [message for message in model.fit_summary["messages"] if "'Temp' moves like noise" in message]

@@ -181,7 +181,8 @@ def signals_file(
     if runs:
         lines += ["", "# Each value of this column is a recording of its own.", "table:", f"  runs: {_quoted(runs)}"]
     if plant:
-        lines += ["", "# Process data: every measurement is judged. steady: median; scale: range; in recorded units."]
+        lines += ["", "# Process data: every measurement is judged. fit takes the medians as steady states, where they"]
+        lines.append("# see clearly smaller faults. scale: range, in recorded units.")
     else:
         lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
         lines.append("# magnitude, or the range where that is small. Both in recorded units.")
