@@ -169,6 +169,9 @@ def test_a_panel_says_what_it_shows():
     assert len(axes) == 1 and axes[0].get_title("left") == r"x1 [\$kPa\$]"
     assert axes[0].get_title("right") == f"violated {int((verdicts.flags[:, 1] == 1).sum())}"
     assert axes[0].get_xlabel() == "time [s]"
+    x, (low, high) = verdicts.transient.x[:, 1], axes[0].get_ylim()
+    quiet = np.delete(x, 51)
+    assert low < quiet.min() and quiet.max() < high < x[51], "the jump is marked at the edge and flattens nothing"
     looped = checked(model, 200, back=[100])
     assert "2 passes" in envelope_figure(model, looped).axes[-1].get_xlabel()
 
