@@ -266,7 +266,8 @@ def read_transients(
     transients = [sample(stream, resolved)[0] for stream in streams]
     seen: dict[bytes, Transient] = {}
     for t in transients:
-        if len(t.t_ns) and (twin := seen.setdefault(sha256(t.t_ns.tobytes() + t.x.tobytes()).digest(), t)) is not t:
+        samples = t.t_ns.tobytes() + t.x.tobytes() + t.u.tobytes()
+        if samples and (twin := seen.setdefault(sha256(samples).digest(), t)) is not t:
             raise BagError(f"{t.name}: holds the samples of {twin.name}; name each recording once")
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
