@@ -153,6 +153,7 @@ def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
         "s": np.exp(logs.mean(axis=0)) * 4.0,
         "n": np.exp(logs.mean(axis=0) + scipy.stats.t.ppf(0.95 if what == "block" else 0.9, count - 1) * spread),
     }
+    limits["n"] = np.minimum(limits["n"], 2 * limits["a"])
     one, rule = Evidence(peaks, top, np.full(2, 0.5), verdicts, np.ones((2, 2)), 1, 1, DT), StatisticRule("mean", 1, 1)
     (found,) = one.thresholds([rule], 2, what)
     above = 1.0 + 1e-10  # so that no rounding passes it
@@ -160,6 +161,22 @@ def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
     np.testing.assert_allclose(found, unknown * above * np.max([limits[kind] for kind in taken], axis=0), rtol=1e-12)
     assert one.learnt([rule], what)[0].threshold == tuple(found)
     assert one.learnt([StatisticRule("energy", 1, 1)], what)[0].threshold == tuple(found**2)
+
+
+def test_what_never_moved_or_lies_far_outside_leaves_thresholds_alone():
+    """A part that the others do not cover has no size, a state at rest in one part none there."""
+    rng, rule = np.random.default_rng(0), StatisticRule("energy", 1, 1)
+    peaks = np.exp(0.1 * rng.standard_normal((6, 2)))
+    both = [*peaks, np.full(2, 1e-9)], np.vstack([peaks, [1e-9, peaks[0, 1]]])
+    for more in (np.array(both[0]), both[1]):
+        for what, verdicts in (("recording", 4000), ("block", 4000), ("block", 400)):
+            found = [
+                Evidence(p, peaks.max(axis=0), np.full(2, 0.2), verdicts, np.ones((2, 2)), 1, 1, DT).thresholds(
+                    [rule], 2, what
+                )[0]
+                for p in (peaks, more)
+            ]
+            np.testing.assert_allclose(found[1], found[0], rtol=0.05)
 
 
 def test_evidence_of_more_recordings_adds_up():

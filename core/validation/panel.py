@@ -23,7 +23,7 @@ p of each of G (TELLING at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
 
-of two recordings it is UNKNOWN times as large.
+at most MOST times the former; of two recordings it is UNKNOWN times as large.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -63,6 +63,8 @@ ALIKE = 0.95
 """As CONFIDENCE, of the largest size in one more block of a single recording."""
 TELLING = 4
 """Recordings, groups or blocks from which on the spread of their largest sizes is known well enough to reckon with."""
+MOST = 2.0
+"""That limit over the threshold without it at most: parts at rest and parts that move are not alike."""
 UNKNOWN = 1.5
 """Threshold over what it would be, of two recordings or groups, whose spread nobody knows."""
 UNLIKE = 1 / 3
@@ -345,16 +347,19 @@ def _threshold(
     """Threshold (n,) or (1,) of one rule; as `Evidence` has them, of its sizes alone."""
     windows = max(3.0, verdicts / 2.0 / max(1, round(rule.window_s / dt)))
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
-    if windows < FEW:
-        typical = np.exp(np.log(peaks).mean(axis=0))
-        found = np.maximum(found, typical * (top / typical).max())
-    if len(peaks) >= TELLING and not (blocks and windows < FEW):
+    peaks = peaks[(peaks > _NOTHING).any(axis=1)]  # one that lies far outside what the others show says nothing
+    logs, count = np.ma.log(np.ma.masked_less_equal(peaks, _NOTHING)), len(peaks)  # nor does a state at rest
+    if count and windows < FEW:
+        typical = np.ma.exp(logs.mean(axis=0))
+        found = np.maximum(found, (typical * (top / typical).max()).filled(0.0))
+    if count >= TELLING and not (blocks and windows < FEW):
         from scipy.special import stdtrit
 
-        logs, count = np.log(peaks), len(peaks)
         far = stdtrit(count - 1, ALIKE if blocks else CONFIDENCE) * math.sqrt(1.0 + 1.0 / count)
-        found = np.maximum(found, np.exp(logs.mean(axis=0) + far * math.sqrt(logs.var(axis=0, ddof=1).mean())))
-    elif len(peaks) == 2 and not blocks:
+        spread = math.sqrt(float(np.ma.filled(logs.var(axis=0, ddof=1).mean(), 0.0)))
+        limit = np.ma.exp(logs.mean(axis=0) + far * spread).filled(0.0)
+        found = np.maximum(found, np.minimum(limit, MOST * found))
+    elif count == 2 and not blocks:
         found *= UNKNOWN
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
 
