@@ -157,8 +157,19 @@ def test_state_of_a_slower_topic_is_named_with_its_period(period):
         x[:, 1] = x[np.arange(len(x)) // period * period, 1]
         return x, u
 
-    (message,) = [m for m in messages(run(change=slower)) if WORDS["held"] in m]
-    assert "'flow'" in message and f"every {period} samples" in message
+    def said_of(**judged):
+        states = [Signal("speed", "/a", "x"), Signal("flow", "/a", "y", **judged)]
+        controls = [Signal("valve", topic, "u"), Signal("pump", topic, "v")]
+        found = messages(run(change=slower, signals=SignalMap(states, controls)))
+        (message,) = [m for m in found if WORDS["held"] in m]
+        assert "'flow'" in message and f"every {period} samples" in message
+        return message.rsplit("; ")[-1]
+
+    topic = "/b"
+    assert said_of() == "make its topic the clock, or leave it out"
+    assert said_of(judged=True) == "take `judged: true` away"  # of a control
+    topic = "/a"  # as of a table
+    assert said_of() == "leave it out"
 
 
 @pytest.mark.parametrize(("lag", "noise"), [(1, 1e-2), (7, 1e-4)])

@@ -396,10 +396,13 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
         period = float(np.median(np.diff(instants)))
         # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
         if period >= 2 and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
+            alone = len({other.topic for other in signals}) == 1
+            remedy = f"{'' if alone else 'make its topic the clock, or '}leave it out"
+            remedy = "take `judged: true` away" if signal.judged else remedy
             messages.append(
                 f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
                 f"new about every {period:.0f} samples: its topic or its sensor is slower than the clock, and its row "
-                f"is fitted to jumps; make its topic the clock, or leave it out"
+                f"is fitted to jumps; {remedy}"
             )
     return messages
 
