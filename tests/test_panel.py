@@ -133,6 +133,7 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
 @pytest.mark.parametrize(
     ("what", "count", "verdicts", "taken"),
     [
+        ("recording", 1, 4000, "a"),
         ("recording", 2, 4000, "a"),
         ("recording", 3, 4000, "a"),
         ("recording", 3, 400, "as"),
@@ -147,17 +148,18 @@ def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
     peaks, top, windows = np.ones((count, 2)), np.array([4.0, 8.0]), verdicts / 2 / 10
     peaks[1::2, 1] = 8.0
     logs = np.log(peaks)
-    spread = math.sqrt((1 + 1 / count) * logs.var(axis=0, ddof=1).mean())
+    spread = math.sqrt((1 + 1 / count) * logs.var(axis=0, ddof=min(1, count - 1)).mean())
+    far = scipy.stats.t.ppf(0.95 if what == "block" else 0.9, max(1, count - 1)) * spread
     limits = {
         "a": 0.5 + math.sqrt(math.log(2 * windows) / math.log(windows)) * (top - 0.5),
         "s": np.exp(logs.mean(axis=0)) * 4.0,
-        "n": np.exp(logs.mean(axis=0) + scipy.stats.t.ppf(0.95 if what == "block" else 0.9, count - 1) * spread),
+        "n": np.exp(logs.mean(axis=0) + far),
     }
     limits["n"] = np.minimum(limits["n"], 2 * limits["a"])
     one, rule = Evidence(peaks, top, np.full(2, 0.5), verdicts, np.ones((2, 2)), 1, 1, DT), StatisticRule("mean", 1, 1)
     (found,) = one.thresholds([rule], 2, what)
     above = 1.0 + 1e-10  # so that no rounding passes it
-    unknown = 1.5 if count == 2 else 1.0  # how far two recordings differ
+    unknown = 1.5 if count <= 2 else 1.0  # how far two recordings differ
     np.testing.assert_allclose(found, unknown * above * np.max([limits[kind] for kind in taken], axis=0), rtol=1e-12)
     assert one.learnt([rule], what)[0].threshold == tuple(found)
     assert one.learnt([StatisticRule("energy", 1, 1)], what)[0].threshold == tuple(found**2)

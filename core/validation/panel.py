@@ -23,7 +23,7 @@ p of each of G (TELLING at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
 
-at most MOST times the former; of two recordings it is UNKNOWN times as large.
+at most MOST times the former; of one or two recordings it is UNKNOWN times as large.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -66,7 +66,7 @@ TELLING = 4
 MOST = 2.0
 """That limit over the threshold without it at most: parts at rest and parts that move are not alike."""
 UNKNOWN = 1.5
-"""Threshold over what it would be, of two recordings or groups, whose spread nobody knows."""
+"""Threshold over what it would be, of one or two recordings or groups, whose spread nobody knows."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
@@ -359,7 +359,7 @@ def _threshold(
         spread = math.sqrt(float(np.ma.filled(logs.var(axis=0, ddof=1).mean(), 0.0)))
         limit = np.ma.exp(logs.mean(axis=0) + far * spread).filled(0.0)
         found = np.maximum(found, np.minimum(limit, MOST * found))
-    elif count == 2 and not blocks:
+    elif count <= 2 and not blocks:
         found *= UNKNOWN
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
 
