@@ -43,7 +43,7 @@ from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import unused
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, Transitions
 
 UNVOUCHED, STRANGE = 0.2, 0.5
 """Share of the verdicts outside the fitted domain from which on their quiet says nothing; there, or in alarm from early
@@ -399,8 +399,9 @@ def _before(model: UncertainLTI, verdicts: Verdicts) -> Array:
 
 def _beyond(model: UncertainLTI, verdicts: Verdicts) -> str:
     """Which signals lie beyond what was fitted, and where; of regimes that are unknown `unknown_in_words` tells."""
-    rows = verdicts.outside_domain & ~verdicts.unknown_regime
-    return outside_in_words(model, _before(model, verdicts)[:, rows]) if rows.any() else ""
+    rows = np.flatnonzero(verdicts.outside_domain & ~verdicts.unknown_regime)
+    before = Transitions(verdicts.transient, rows - 1)
+    return outside_in_words(model, model.normalised_columns(before)) if len(rows) else ""
 
 
 def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
