@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Index
+from uncertain_lti.base.arrays import WORTH_THREADS, Array, Index, on_cores
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Moments, moments, scan
@@ -253,14 +253,16 @@ def remembered(
             left &= problem.z_columns.any(axis=0)
         chosen = problem.subset(kept)
         share = min(max(room - most * each, room // 5) // box / (first + problem.N - len(kept)), 1.0)
-        parts = [] if boxes is None else [boxes.fewer(0, share)]
+        tasks = []
         for block in problem.blocks():
             part = slice(block.start, block.start + len(block))
             numbers, of = np.full(len(block), -1), np.flatnonzero(left[part])
             numbers[of] = _numbers(problem.source[part][of], first, share)
             first += len(of)
             if len(of):
-                parts.append(Boxes.of(model, block, problem.source[part], widest, numbers))
+                tasks.append((model, block, problem.source[part], widest, numbers))
+        parts = [] if boxes is None else [boxes.fewer(0, share)]
+        parts += on_cores(Boxes.of, tasks, problem.N > WORTH_THREADS)
         others = sums - moments(chosen)[0]
         problem, rest, boxes = chosen, others if rest is None else rest + others, Boxes.join(parts)
     return Memory(problem, rest, boxes, tuple(recordings)).to_dict(model)
