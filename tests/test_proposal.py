@@ -11,6 +11,8 @@
 
 import math
 import re
+import time
+from itertools import combinations, permutations
 from pathlib import Path
 
 import numpy as np
@@ -24,8 +26,8 @@ from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification.diagnosis import remedies
-from uncertain_lti.proposal.candidates import Candidate, Source
-from uncertain_lti.proposal.choosing import choose
+from uncertain_lti.proposal.candidates import Candidate, Source, Steps
+from uncertain_lti.proposal.choosing import _function, _may_follow, _may_move_with, _moves_with, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
@@ -322,6 +324,61 @@ def test_nothing_to_propose_is_said(tmp_path):
         BagError, match="looks like the state of a machine .*; record .* in `uncertain-lti init --states`"
     ):
         propose([path])
+
+
+# --- many columns ------------------------------------------------------------------------------------------------
+
+
+def test_a_table_of_many_columns_takes_seconds(tmp_path):
+    rng = np.random.default_rng(3)
+    rows, commands, measured = 1000, 30, 270
+    u = np.repeat(rng.normal(size=(rows // 25, commands)), 25, axis=0)
+    tau, gain = (
+        rng.uniform(3, 40, measured),
+        rng.normal(size=(measured, commands)) * (rng.random((measured, commands)) < 0.1),
+    )
+    x = np.zeros((rows, measured))
+    for k in range(rows - 1):
+        x[k + 1] = x[k] + (gain @ u[k] - x[k]) / tau
+    x += 0.005 * rng.normal(size=x.shape)
+    x[:, 3], x[:, 7] = 2 * x[:, 4] + 3, x[:, 8] ** 2
+    names = [f"cmd_{j}" for j in range(commands)] + [f"temp_{j}" for j in range(measured)]
+    table = np.column_stack([0.1 * np.arange(rows), u, x])
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.6g")
+    began = time.process_time()
+    text = propose([tmp_path / "a.csv"]).text
+    assert time.process_time() - began < 60  # 400 columns took 442 s
+    assert "temp_4: moves with temp_3" in text and "temp_7: says what temp_8 says already" in text
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6), missing=st.booleans())
+def test_what_is_looked_for_at_once_leaves_out_nothing(seed, missing):
+    rng = np.random.default_rng(seed)
+    z = np.cumsum(rng.normal(size=(120, 3)), axis=0) * 10.0 ** rng.integers(-3, 4, 3) + rng.choice([0.0, 1e5])
+    some = rng.choice([0.0, 1e-4, 0.1]) * z.std(axis=0) * rng.normal(size=z.shape)
+    held = np.round(z[:, :1] / z[:, 0].std())
+    X = np.column_stack([z, (z - z.mean(axis=0)) ** 2 + some, np.roll(z, 1, axis=0), 3 * z + some, held, held * 0])
+    may = _may_follow(X)
+    found = [(i, j) for i, j in permutations(range(X.shape[1]), 2) if _function(X[:, i], X[:, j])]
+    assert found and all(may[pair] for pair in found)
+    X[rng.random(X.shape) < 0.1 * missing] = rng.choice([np.nan, np.inf])
+    pool = [Candidate("/table", f"c{j}", [column[:50], column[50:]]) for j, column in enumerate(X.T)]
+    pairs = [(a, b) for a, b in combinations(pool, 2) if _moves_with(b, a)]
+    assert {(id(a), id(b)) for a, b in pairs} <= _may_move_with(pool)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 10**6))
+def test_effects_that_are_found_at_once_are_those_one_by_one(seed):
+    rng = np.random.default_rng(seed)
+    X, U = rng.normal(size=(80, 5)) * 10.0 ** rng.integers(-4, 5, 5) + 100, rng.normal(size=(80, 3))
+    dX = X @ rng.normal(size=(5, 5)) * 0.1 + U @ rng.normal(size=(3, 5)) + rng.normal(size=(80, 5))
+    steps, kept, rest = Steps(X, U, dX), [1, 3], [4, 0, 2]
+    each = [Steps(np.hstack([X, np.delete(U, j, 1)]), U[:, [j]], dX).effect(range(5)) for j in range(3)]
+    np.testing.assert_allclose(steps.effect_of_each(), each, rtol=1e-6)
+    coupled = [max(*steps.effect(kept, of=[j], given=kept), *steps.effect([j], of=kept, given=[j])) for j in rest]
+    np.testing.assert_allclose(steps.coupling(kept, rest), coupled, rtol=1e-6)
 
 
 # --- the command ------------------------------------------------------------------------------------------------

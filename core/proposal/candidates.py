@@ -172,15 +172,58 @@ class Steps:
         if freedom < 5 or not tested:
             return np.zeros(len(on))
         without, full = residual(Z[:, known], Y), residual(Z[:, [*known, *tested]], Y)
-        floor = 1e-12 * (Y**2).sum(axis=0) + 1e-300
-        gain = np.maximum(without - full, 0.0) / len(tested)
-        return np.asarray(gain / ((full + floor) / freedom))
+        return _statistic(without, full, Y, len(tested), freedom)
 
     def effect_of_each(self) -> Array:
         """F statistic of each control, given the others, in the next step of each state (m, n)."""
         n, m = self.X.shape[1], self.U.shape[1]
-        each = [replace(self, X=np.hstack([self.X, np.delete(self.U, j, 1)]), U=self.U[:, [j]]) for j in range(m)]
-        return np.array([alone.effect(range(n)) for alone in each]).reshape(m, n)
+        freedom = len(self.X) - n - m - 1
+        if freedom < 5:
+            return np.zeros((m, n))
+        U, Y = left(self.X, self.U, self.dX)  # given the states once, not for each control
+        without, full = [residual(np.delete(U, j, 1), Y) for j in range(m)], residual(U, Y)
+        return np.array([_statistic(one, full, self.dX, 1, freedom) for one in without]).reshape(m, n)
+
+    def coupling(self, kept: Sequence[int], rest: Sequence[int]) -> Array:
+        """Larger F statistic of `effect(kept, of=[j], given=kept)` and `effect([j], of=kept, given=[j])`.
+
+        Returns (len(rest),): of each j of them.
+        """
+        known, more = len(kept) + self.U.shape[1], list(rest)
+        freedom = len(self.X) - known - 2
+        if freedom < 5:
+            return np.zeros(len(more))
+        X = self.X / np.maximum(np.abs(self.X).max(axis=0, initial=0.0), 1e-300)
+        x, y = left(np.hstack([X[:, kept], self.U]), X[:, more], self.dX[:, kept])
+        without = (y**2).sum(axis=0)
+        gain = (x.T @ y) ** 2 / np.maximum((x**2).sum(axis=0), 1e-300)[:, None]
+        on_kept = _statistic(without, np.maximum(without - gain, 0.0), self.dX[:, kept], 1, freedom)
+        x, y, others = left(self.U, X[:, more], self.dX[:, more], X[:, kept])
+        without, full = _without(x, y), _without(*left(others, x, y))
+        on_rest = _statistic(without, full, self.dX[:, more], len(kept), freedom)
+        return np.asarray(np.maximum(on_kept.max(axis=1, initial=0.0), on_rest))
+
+
+def _statistic(without: Array, full: Array, Y: Array, tested: int, freedom: int) -> Array:
+    """F statistic of regressors from the sums of squares that are left of Y (N, k) without and with them."""
+    floor = 1e-12 * (Y**2).sum(axis=0) + 1e-300
+    return np.asarray(np.maximum(without - full, 0.0) / tested / ((full + floor) / freedom))
+
+
+def _without(x: Array, y: Array) -> Array:
+    """Sum of squares that each column of x (N, k) leaves of the same column of y (N, k)."""
+    rest = y - x * ((x * y).sum(axis=0) / np.maximum((x**2).sum(axis=0), 1e-300))
+    return np.asarray((rest**2).sum(axis=0))
+
+
+def left(Z: Array, *of: Array) -> tuple[Array, ...]:
+    """What a least-squares fit on [1, Z] leaves of some columns, (N, k) each.
+
+    `Z` (N, j): regressors; Returns (N, k): one array for each that is given.
+    """
+    size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
+    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size]))
+    return tuple(Y - Q @ (Q.T @ Y) for Y in of)
 
 
 def residual(Z: Array, Y: Array) -> Array:
@@ -188,11 +231,7 @@ def residual(Z: Array, Y: Array) -> Array:
 
     `Z` (N, j): regressors; `Y` (N, k): targets; Returns (k,): units of Y squared.
     """
-    size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
-    design = np.hstack([np.ones((len(Z), 1)), Z / size])
-    Q, _ = np.linalg.qr(design)
-    rest = Y - Q @ (Q.T @ Y)
-    return np.asarray((rest**2).sum(axis=0))
+    return np.asarray((left(Z, Y)[0] ** 2).sum(axis=0))
 
 
 def steps_of(

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.evidence import FASTEST, LONGEST_DELAY, NOISE, lags, predicted
@@ -52,12 +53,17 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     n = len(pool)
     shows = steps.effect(range(n)) if steps.U.shape[1] else np.zeros(n)
     kept: list[int] = []
+    may = _may_follow(steps.X)
+
+    def function(of: int, which: int) -> bool:
+        return bool(may[of, which]) and _function(steps.X[:, of], steps.X[:, which])
+
     for i in np.argsort(-np.log(np.maximum(shows, 1.0)).round(1), kind="stable").tolist():
-        source = next((j for j in kept if _function(steps.X[:, j], steps.X[:, i])), None)
+        source = next((j for j in kept if function(j, i)), None)
         if source is not None:
             pool[i].reason = f"says what {_place(pool[source], pool[i])} says already"
             continue
-        for j in [j for j in kept if _function(steps.X[:, i], steps.X[:, j])]:  # x stays, its square goes
+        for j in [j for j in kept if function(i, j)]:  # x stays, its square goes
             kept.remove(j)
             pool[j].reason = f"says what {_place(pool[i], pool[j])} says already"
         kept.append(i)
@@ -68,10 +74,36 @@ def _place(candidate: Candidate, other: Candidate) -> str:
     return candidate.path if candidate.topic == other.topic else f"{candidate.topic} {candidate.path}"
 
 
+_SHIFTS = (0, 1, -1)
+"""Samples by which a function of a candidate may be off."""
+FOLLOWS = 0.15
+"""Standard deviation around a smooth function, as a share, from which on it is none."""
+
+
+def _shifted(of: Array, values: Array, shift: int) -> tuple[Array, Array]:
+    return of[max(shift, 0) : len(of) + min(shift, 0)], values[max(-shift, 0) : len(values) - max(shift, 0)]
+
+
+def _may_follow(X: Array) -> NDArray[np.bool_]:
+    """For which [of, values] `_function` may hold, (n, n): of all the others its many small fits are not needed."""
+    spread = X.std(axis=0)
+    z = (X - X.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
+    may = np.zeros((z.shape[1], z.shape[1]), dtype=bool)
+    for j, a in enumerate(z.T):
+        basis = np.linalg.qr(np.column_stack([np.ones_like(a), a, a**2, a**3]))[0]
+        for shift in _SHIFTS:
+            q, b = _shifted(basis, z, shift)
+            q = q if shift == 0 else np.linalg.qr(q)[0]
+            size = np.einsum("ki,ki->i", b, b)
+            rest = size - np.einsum("ji,ji->i", told := q.T @ b, told)
+            may[j] |= rest <= 1.1 * FOLLOWS**2 * (size - len(b) * b.mean(axis=0) ** 2)
+    return may
+
+
 def _function(of: Array, values: Array) -> bool:
     """Whether these values (N,) are a smooth function of others at the same instants, or one sample off, but noise."""
-    for shift in (0, 1, -1):
-        a, b = of[max(shift, 0) : len(of) + min(shift, 0)], values[max(-shift, 0) : len(values) - max(shift, 0)]
+    for shift in _SHIFTS:
+        a, b = _shifted(of, values, shift)
         if np.ptp(a) == 0 or np.ptp(b) == 0:
             return False
         a = (a - a.mean()) / a.std()
@@ -80,7 +112,7 @@ def _function(of: Array, values: Array) -> bool:
         share = float(rest.std() / b.std())
         memory = float(np.corrcoef(rest[1:], rest[:-1])[0, 1]) if rest.std() > 0 else 0.0
         moves = float(np.diff(b).std() / b.std())
-        if share < 0.02 or (share < 0.15 and memory < 0.3 and moves < 0.7):  # white around what it follows
+        if share < 0.02 or (share < FOLLOWS and memory < 0.3 and moves < 0.7):  # white around what it follows
             return True
     return False
 
@@ -156,15 +188,50 @@ def prefer_rates(source: Source) -> None:
                     candidate.reason = reason
 
 
+_ROWS = 1 << 14
+"""Rows of which correlations are taken at once."""
+_NEARLY = 0.999
+"""Correlation from which on it is looked at closer."""
+
+
 def drop_copies(pool: Sequence[Candidate]) -> list[Candidate]:
     """Leave out what moves as another candidate of the same topic does; returns the rest."""
     kept: list[Candidate] = []
+    may = _may_move_with(pool)
     for candidate in pool:
-        if twin := next((other for other in kept if _moves_with(candidate, other)), None):
+        if twin := next((c for c in kept if (id(c), id(candidate)) in may and _moves_with(candidate, c)), None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
     return [c for c in kept if not c.reason]
+
+
+def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
+    """Pairs of which `_moves_with` may hold, each the one before the other: all correlations of a topic at once."""
+    may: set[tuple[int, int]] = set()
+    of_topic: dict[tuple[str, int], list[Candidate]] = {}
+    for candidate in pool:
+        of_topic.setdefault((candidate.topic, sum(map(len, candidate.values))), []).append(candidate)
+    for (_, rows), group in of_topic.items():
+        n = len(group)
+        columns = [np.concatenate(c.values) for c in group] if n > 1 else []
+        known = [column[np.isfinite(column)] for column in columns]
+        middle = np.array([k.mean() if len(k) else 0.0 for k in known])
+        spread = np.array([max(float(k.std()), 1e-300) if len(k) else 1.0 for k in known])
+        del known
+        both, s, ss, st = np.zeros((4, n, n))  # of the rows that two have: number, and sums of z, z z and z z'
+        for begin in range(0, rows if columns else 0, _ROWS):
+            z = (np.column_stack([c[begin : begin + _ROWS] for c in columns]) - middle) / spread
+            there = np.isfinite(z).astype(np.float64)
+            z = np.where(there > 0, z, 0.0)
+            both += there.T @ there
+            s += z.T @ there
+            ss += (z**2).T @ there
+            st += z.T @ z
+        own = np.maximum(both * ss - s**2, 0.0)
+        together = (both * st - s * s.T) ** 2 >= _NEARLY**2 * own * own.T
+        may |= {(id(group[i]), id(group[j])) for i, j in zip(*np.nonzero(np.triu(together, 1)), strict=True)}
+    return may
 
 
 def _moves_with(one: Candidate, other: Candidate) -> bool:
@@ -316,11 +383,12 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
     A family, such as the axes of a body or its motors, is taken or left as one, unless it has no room alone.
     """
     order = [int(i) for i in np.argsort(-driven, kind="stable")]
+    families = [candidate.family for candidate in pool]
     kept: list[int] = []
     full: set[int] = set()
 
     def take(strongest: int) -> None:
-        family = [j for j in order if pool[j].family == pool[strongest].family and j not in kept]
+        family = [j for j in order if families[j] == families[strongest] and j not in kept]
         if len(family) > room.most:
             family = [strongest]
         (kept.extend if len(kept) + len(family) <= room.most else full.update)(family)
@@ -330,13 +398,14 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
             take(i)
     if not kept:
         return _first(pool, room)
+    counted, strength = 0, dict[int, float]()
     while rest := [j for j in order if j not in kept and j not in full]:
-        strength = [
-            max(steps.effect(kept, of=[j], given=kept).max(), steps.effect([j], of=kept, given=[j]).max()) for j in rest
-        ]
-        if max(strength) <= SHOWS:
+        if len(kept) > counted:
+            counted, strength = len(kept), dict(zip(rest, steps.coupling(kept, rest).tolist(), strict=True))
+        strongest = max(rest, key=strength.__getitem__)
+        if strength[strongest] <= SHOWS:
             break
-        take(rest[int(np.argmax(strength))])
+        take(strongest)
     for j, candidate in enumerate(pool):
         if j not in kept:
             candidate.ready = "state"
