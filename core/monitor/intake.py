@@ -28,7 +28,7 @@ from uncertain_lti.monitor.stream import Stream
 from uncertain_lti.monitor.verdict import Verdict
 
 _AT_ONCE, _PAUSE = 200, 0.01  # messages that had waited are taken so many at once, with so many s in between
-_SLOW = 0.0001  # s of processor time for one message; 3 to 40 µs, unless Fast DDS makes the way to a reader anew
+_SLOW = 0.0002  # s of processor time for one message; 3 to 40 µs, to 200 beside others, unless its way is made anew
 _PATIENCE = 60  # messages of one topic that are sent so slowly, less those that are not
 _REST_OF_FLAGS, _REST = 1.5, 6.0  # times its processor time pass after a slow message; of others, for each slow topic
 _FORGET = 1.0  # s without a message of a topic, and how slow it was is found out again
