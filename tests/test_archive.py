@@ -11,6 +11,7 @@
 
 import json
 import os
+import re
 import signal
 import threading
 from contextlib import contextmanager
@@ -21,7 +22,7 @@ from engine_bag import SIGNALS, engine_bag
 
 import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, read_transients
-from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive, write_cache
@@ -86,6 +87,40 @@ def test_an_archive_has_the_alarm_of_a_fit(bags, tmp_path, monkeypatch):
     by_hand = public_fit.fit_many(paths, signals, "qp", alarm="containment", cache=tmp_path / "hand")
     equal(by_hand, fit(read_transients(paths, signals), "qp"))
     assert [rule.kind for rule in by_hand.alarm] == ["containment"]
+
+
+def test_a_copy_among_the_recordings_is_refused(bags, tmp_path, monkeypatch):
+    """Also where it is not among those that the alarm is learnt on."""
+    signals, paths = bags
+    copy = tmp_path / "copied.mcap"
+    copy.write_bytes(paths[5].read_bytes())
+    message = f"^{re.escape(str(copy))}: holds the samples of {re.escape(str(paths[5]))}; name each recording once"
+    with pytest.raises(BagError, match=message):
+        public_fit.fit_many([*paths, copy], signals, cache=tmp_path / "cache")
+    monkeypatch.setattr(public_fit, "SAMPLE", sum(t.x.size + t.u.size for t in read_transients(paths[:3], signals)))
+    with pytest.raises(BagError, match=message):
+        public_fit.fit_many([*paths, copy], signals, cache=tmp_path / "cache")
+    assert not (tmp_path / "cache").exists()
+
+
+def test_each_run_of_a_table_is_one_recording(tmp_path):
+    """Each run was taken as often as the table has runs, and the rate of false alarms stated from all of these."""
+    rng, rows, x = np.random.default_rng(0), ["run,t,x,u"], 0.0
+    for run in range(5):
+        for k in range(200):
+            u = float(np.sign(np.sin(k / (9 + run))))
+            rows.append(f"{run},{0.1 * k:.1f},{x},{u}")
+            x += 0.1 * (u - x) + 0.01 * rng.normal()
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    entries = (
+        f"{kind}: [{{name: {of}, topic: /table, field: {of}}}]" for kind, of in (("states", "x"), ("controls", "u"))
+    )
+    (tmp_path / "signals.yaml").write_text("\n".join(["table: {runs: run}", *entries]))
+    for name, paths in (("all", [tmp_path / "a.csv"]), ("some", [tmp_path / f"a.csv[{run}]" for run in range(4)])):
+        model = uncertain_lti.fit(read_transients(paths, tmp_path / "signals.yaml"))
+        same = public_fit.fit_many(paths, tmp_path / "signals.yaml", cache=tmp_path / name)
+        assert same.fit_summary["alarm"]["limit_per_hour"] == model.fit_summary["alarm"]["limit_per_hour"]
+        assert same.validation["parts"] == model.validation["parts"] == (5 if name == "all" else 4)
 
 
 def random_problem(seed, N, n=3, m=2, noise=1e-3):

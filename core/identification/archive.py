@@ -15,6 +15,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,7 @@ from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.sampling.reading import (
     Stream,
     Times,
+    copy_of,
     load_signals,
     read_stream,
     resolved_by,
@@ -166,7 +168,10 @@ def fit_archive(
             results.append(function(recording, *more))
         return results
 
-    signals = resolved_by(visit("looking at", survey, signals), signals)
+    looked = visit("looking at", survey, signals)
+    _refuse_copies(recordings, [mark for _, mark in looked])
+    signals = resolved_by([times for times, _ in looked], signals)
+    del looked
     additive = additive or signals.additive or "none"
     scheduled = scheduled_by(schedule, signals)
     regimes = None if scheduled is None else Regimes.of(scheduled, signals)
@@ -240,9 +245,20 @@ def _sampled(recording: Recording, signals: SignalMap) -> Transient:
     return sample(_stream(recording, signals), signals)[0]
 
 
-def survey(recording: Recording, signals: SignalMap) -> Times:
-    """First look at one recording."""
-    return times_of(_stream(recording, signals), signals)
+def survey(recording: Recording, signals: SignalMap) -> tuple[Times, bytes]:
+    """First look at one recording, and a mark that its copies have: of times and values of all messages."""
+    stream, mark = _stream(recording, signals), sha256()
+    times = stream.stamp if (stream.stamp > 0).any() else stream.arrival
+    for array in (stream.topic, times, *stream.values):
+        mark.update(np.ascontiguousarray(array).data)
+    return times_of(stream, signals), mark.digest()
+
+
+def _refuse_copies(recordings: Sequence[Recording], marks: Sequence[bytes]) -> None:
+    named: dict[bytes, str] = {}
+    for (name, _), mark in zip(recordings, marks, strict=True):
+        if (twin := named.setdefault(mark, name)) is not name:
+            raise copy_of(name, twin)
 
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:

@@ -31,7 +31,8 @@ from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.search import choose_horizons, choose_knots, knots_of, lengths_of
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.sampling.reading import load_signals, read_transients
+from uncertain_lti.recordings.recording import Recording
+from uncertain_lti.sampling.reading import load_signals, read_transients, refuse_copies
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.values import Additive, HorizonRule, WidthChoice
@@ -266,7 +267,7 @@ def fit_many(
     taken, some = None, list[Transient]()
     if alarm == "panel":
         bags = group_recordings(paths, indexed=True, layout=signals.table)
-        some = _some([list(bag.parts) for bag in bags], signals)
+        some = _some(bags, signals)
         ways, said = _ways(criterion, additive, bool(asked)), {"describe_data": False, "progress": progress}
         own = {"schedule": asked, "operating_point": point_of(some[0]), "false_alarms": false_alarms}
         taken = choose_monitored(some, ways, **own, **said)
@@ -276,8 +277,8 @@ def fit_many(
     )
     if taken is None:
         return model if isinstance(alarm, str) else model.replace(alarm=alarm)
-    count = len({run.sources for run in some})
-    note = f"learnt on {count} of {plural(len(bags), 'recording')}, as many as memory is for" * (count < len(bags))
+    note = f"learnt on {len(some)} of {plural(len(bags), 'recording')}, as many as memory is for"
+    note *= len(some) < len(bags)
     return monitored_like(taken, model, some, false_alarms, note).finished()
 
 
@@ -289,19 +290,21 @@ def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> Non
         raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")
 
 
-def _some(bags: Sequence[Sequence[os.PathLike[str]]], signals: SignalMap) -> list[Transient]:
+def _some(bags: Sequence[Recording], signals: SignalMap) -> list[Transient]:
     """Recordings spread over the whole row, with SAMPLE numbers together."""
     order = sorted(range(len(bags)), key=lambda i: int(f"{i:064b}"[::-1], 2))
-    found: dict[int, list[Transient]] = {}
+    found: dict[int, Transient] = {}
     left = SAMPLE
     for i in order:
-        for run in read_transients(list(bags[i]), signals):
-            size = run.x.size + run.u.size + run.s.size
-            if size > left and found:
-                return [run for i in sorted(found) for run in found[i]]
-            found.setdefault(i, []).append(run if size <= left else run.replace(slice(0, int(len(run) * left / size))))
-            left -= size
-    return [run for i in sorted(found) for run in found[i]]
+        (run,) = read_transients(bags[i].parts if len(bags[i].parts) > 1 else bags[i].path, signals)
+        size = run.x.size + run.u.size + run.s.size
+        if size > left and found:
+            break
+        found[i] = run if size <= left else run.replace(slice(0, int(len(run) * left / size)))
+        left -= size
+    some = [found[i] for i in sorted(found)]
+    refuse_copies(some)
+    return some
 
 
 def _ways(criterion: str | None, additive: str | None, scheduled: bool) -> list[dict[str, Any]]:

@@ -263,14 +263,7 @@ def read_transients(
     streams = read_streams(bags, signals, progress, processes)
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
     transients = [sample(stream, resolved)[0] for stream in streams]
-    seen: dict[tuple[int, ...], list[Transient]] = {}
-    for t in filter(len, transients):
-        alike = seen.setdefault((len(t), int(t.t_ns[0]), int(t.t_ns[-1])), [])
-        for twin in alike:
-            pairs = (t.t_ns, twin.t_ns), (t.x, twin.x), (t.u, twin.u)
-            if all(np.array_equal(one, other, equal_nan=True) for one, other in pairs):
-                raise BagError(f"{t.name}: holds the samples of {twin.name}; name each recording once")
-        alike.append(t)
+    refuse_copies(transients)
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
         return transients
@@ -280,6 +273,23 @@ def read_transients(
     numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
     note = f"operating point from {words}: {numbers}"
     return [t.replace(signals=resolved, notes=(*t.notes, note) if t is transients[0] else t.notes) for t in transients]
+
+
+def refuse_copies(transients: Iterable[Transient]) -> None:
+    """A recording that is named together with its copy would count twice, and vouch for itself."""
+    seen: dict[tuple[int, ...], list[Transient]] = {}
+    for t in filter(len, transients):
+        alike = seen.setdefault((len(t), int(t.t_ns[0]), int(t.t_ns[-1])), [])
+        for twin in alike:
+            pairs = (t.t_ns, twin.t_ns), (t.x, twin.x), (t.u, twin.u)
+            if all(np.array_equal(one, other, equal_nan=True) for one, other in pairs):
+                raise copy_of(t.name, twin.name)
+        alike.append(t)
+
+
+def copy_of(name: str, twin: str) -> BagError:
+    """The error for a recording that is named together with its copy."""
+    return BagError(f"{name}: holds the samples of {twin}; name each recording once")
 
 
 def read_as_fitted(
