@@ -11,6 +11,7 @@
 
 import random
 import time
+from datetime import datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
 
@@ -543,6 +544,50 @@ def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
         (bag,) = group_recordings([path])
         assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}
         assert f"is taken for {order}, year" in " ".join(bag.warnings)
+
+
+WRITTEN = (  # over noon; %I %p as English has it
+    "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y  %I:%M:%S.000 %p", "%Y-%m-%d %I:%M:%S%p", "%I:%M:%S %p", "%d-%b-%y %I.%M.%S %p",
+    "%m/%d/%Y %I:%M:%S A.M.", "%d-%b-%Y %H:%M:%S", "%d %B %Y, %H:%M:%S", "%b %d, %Y %I:%M:%S %p",
+    "%a %b %d %H:%M:%S %Y", "%a, %d %b %Y %H:%M:%S GMT",
+    "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d-%m-%Y %H:%M:%S", "%Y%m%dT%H%M%S",
+    "%Y%m%d%H%M%S", "%Y-%m-%d %H:%M:%S:000",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("form", WRITTEN)
+def test_times_as_spreadsheets_and_controllers_write_them(form, tmp_path):
+    """A temperature beside them was taken for the time (`temp` for French), or one hour after noon for one at night."""
+    start, path = datetime(2024, 3, 13, 11, 59, 30), tmp_path / "a.csv"
+    instants = [start + timedelta(seconds=k) for k in range(60)]
+    cells = [t.strftime(form.replace("A.M.", "a.m." if t.hour < 12 else "p.m.")) for t in instants]
+    path.write_text("Timestamp;x;Temp\n" + "".join(f'"{cell}";{k};{20 + k % 7}\n' for k, cell in enumerate(cells)))
+    (bag,) = group_recordings([path])
+    day = start if "%d" in form else datetime(1970, 1, 1, 11, 59, 30)
+    assert bag.times[0] == np.datetime64(day, "ns").astype(np.int64)
+    assert set(np.diff(bag.times).tolist()) == {10**9} and list(bag.columns_by_field) == ["x", "Temp"]
+
+
+def test_noon_and_midnight_of_twelve_hours(tmp_path):
+    path = tmp_path / "a.csv"
+    hours = ["12:00 AM", "1:30 am", "12:00 PM", "1:30 pm", "11:59 p.m."]
+    path.write_text("time,x\n" + "".join(f"{hour},{k}\n" for k, hour in enumerate(hours)))
+    (bag,) = group_recordings([path])
+    assert (bag.times // (60 * 10**9)).tolist() == [0, 90, 720, 810, 1439]
+
+
+def test_a_time_that_cannot_be_read_is_named_and_no_temperature_taken_for_it(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text(
+        "Timestamp,x,T\n" + "".join(f"2024-03-13 11:55:{k:02} CET,{k % 5},{20 + k % 7}\n" for k in range(60))
+    )
+    with pytest.raises(
+        BagError, match="column 'Timestamp': '2024-03-13 11:55:00 CET' in row 1 is neither a number nor"
+    ):
+        group_recordings([path])
+    path.write_text("Timestamp,t,x\n" + "".join(f"shift {k % 3},{0.1 * k},{k % 5}\n" for k in range(60)))
+    (bag,) = group_recordings([path])
+    assert set(np.diff(bag.times).tolist()) == {10**8}
 
 
 def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):

@@ -37,8 +37,8 @@ NO_TIME = -(2**63)
 
 _NAMES = (
     r"(__|%)?time(_?stamp)?", r"t", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
-    r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"zeit", r"tempo?s?", r"date",
-    r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
+    r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
+    r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|millis(econds?)?", "us": r"us|µs|usecs?|micros(econds?)?",
@@ -47,6 +47,18 @@ _UNIT = {
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
 _DAY = re.compile(r"(\d{1,2})[/.](\d{1,2})[/.](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
+_HALF = re.compile(r"(|.*[T\s])(\d{1,2})(?:[:.](\d\d))?(?:[:.](\d\d(?:[.,:]\d+)?))?\s*([AaPp])\.?\s?[Mm]\.?")  # 1:05 PM
+_NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
+    re.compile(
+        r"(?:[A-Z][a-z]+,?\s+)?(?P<d>\d{1,2})[-\s/](?P<m>[A-Za-z]{3})[a-z]*\.?[-\s/,]+(?P<y>\d{4}|\d\d)\b(?P<t>.*)"
+    ),
+    re.compile(r"(?:[A-Z][a-z]+,?\s+)?(?P<m>[A-Za-z]{3})[a-z]*\.?\s+(?P<d>\d{1,2}),?\s+(?P<y>\d{4})\b(?P<t>.*)"),
+    re.compile(r"(?:[A-Z][a-z]+\s+)?(?P<m>[A-Z][a-z]{2})\s+(?P<d>\d{1,2})(?P<t>\s[\d:.]+)\s(?P<y>\d{4})"),
+)
+_MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
+_YEAR_FIRST = re.compile(r"(\d{4})([-/.])(\d{1,2})\2(\d{1,2})(?:[T,\s]+(\d{1,2}))?((?::\d\d)*)(.*)")
+_DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-(\d{4}.*)")
+_COMPACT = re.compile(r"((?:19|20)\d\d)([01]\d)([0-3]\d)[T_ ]?([0-2]\d)([0-5]\d)([0-5]\d(?:\.\d+)?)(.*)")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _LARGEST_ZONE = 14  # hours
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
@@ -90,6 +102,9 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         times, order = _of_text(where, values.tolist())
         words = " and ".join(part for part in (words, order) if part)
         return column, times, f"column '{column}': {words}" if order else words
+    if layout.unit is None and _compact(values):
+        times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
+        return column, times, words
     unit = layout.unit or _unit(column, values, table.units.get(column, ""))
     days = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
     if layout.unit is None and (unit != "s" or days):
@@ -107,7 +122,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
             if re.fullmatch(pattern, bare) and table.columns[name].ndim == 1:
                 called.append(name)
     if likely := [name for name in called if _may_be(table.columns[name])] or called:
-        return likely[0], ""
+        words_first = table.columns[called[0]].dtype.kind == "O" and not _may_be(table.columns[called[0]])
+        return called[0] if words_first and not _goes_forward(table.columns[likely[0]]) else likely[0], ""
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and _may_be(table.columns[name])]
     if len(dated) == 1:
         return dated[0], ""
@@ -128,8 +144,42 @@ def _may_be(column: Column) -> bool:
     """Numbers, instants, or text that reads as one."""
     if column.dtype.kind != "O":
         return True
-    first = next((str(cell) for cell in column if cell), "")
-    return bool(_ISO.match(first) or _CLOCK.match(first) or _DAY.fullmatch(first.strip()))
+    return _is_instant(next((str(cell) for cell in column if cell), ""))
+
+
+def _goes_forward(column: Column) -> bool:
+    """Whether it may be a time beside another that cannot be read: a temperature is none."""
+    return column.dtype.kind not in "iuf" or bool(abs(np.mean(np.sign(np.diff(column)))) > 0.8)
+
+
+def _is_instant(text: str) -> bool:
+    text = _spelt(text)
+    return bool(_ISO.match(text) or _CLOCK.match(text) or _DAY.fullmatch(text))
+
+
+def _spelt(text: str) -> str:
+    """An instant as people and controllers write it, such as 13-Mar-24 1:05:03 PM, as ISO does; else as it is."""
+    text = text.strip()
+    if _ISO.match(text) or _CLOCK.match(text):
+        return text
+    if half := _HALF.fullmatch(text):
+        day, hour, minutes, seconds, letter = half.groups("00")
+        of = int(hour) % 12 + 12 * (letter in "Pp") if int(hour) <= 12 else int(hour)
+        text = f"{day}{of:02}:{minutes}:{seconds}"
+    if named := next((m for m in (pattern.fullmatch(text) for pattern in _NAMED) if m), None):
+        if (month := named["m"].lower()) in _MONTHS:
+            year = named["y"] if len(named["y"]) == 4 else f"20{named['y']}"
+            text = f"{year}-{_MONTHS.index(month) + 1:02}-{int(named['d']):02} {named['t'].lstrip(', T')}".strip()
+    text = re.sub(r"(:\d\d):(\d{3,6})$", r"\1.\2", text)  # milliseconds of a controller
+    if dashed := _DASHED.fullmatch(text):
+        text = "/".join(dashed.groups())
+    if compact := _COMPACT.fullmatch(text):
+        text = "{}-{}-{} {}:{}:{}{}".format(*compact.groups())
+    if dated := _YEAR_FIRST.fullmatch(text):
+        year, _, month, day, hour, minutes, rest = dated.groups()
+        clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
+        text = f"{year}-{int(month):02}-{int(day):02}{clock}"
+    return re.sub(r"\s+(GMT)$", "Z", text)
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
@@ -146,6 +196,14 @@ def _unit(name: str, values: Column, stated: str = "") -> str:
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     size = float(np.median(np.abs(finite.astype(np.float64)))) if len(finite) else 0.0
     return next((unit for least, unit in _EPOCHS if size > least), "s")
+
+
+def _compact(values: Column) -> bool:
+    """Whether numbers are days and times such as 20240313115503."""
+    known = values[np.isfinite(values)]
+    if not len(known) or known.min() < 19e12 or known.max() > 21e12:
+        return False
+    return all(_COMPACT.fullmatch(f"{value:.0f}") for value in known[:1000].tolist())
 
 
 def _like_days(values: Column) -> bool:
@@ -194,11 +252,11 @@ def _too_late(where: str) -> BagError:
 def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
     """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted."""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
-    cells, order = _as_iso(where, cells)
+    iso, order = _as_iso(where, [_spelt(str(cell)) for cell in cells])
     plain: list[str] = []
     rows: list[int] = []
     shifts: list[int] = []
-    for row, cell in enumerate(cells):
+    for row, cell in enumerate(iso):
         text = str(cell).strip()
         if not text:
             continue
@@ -212,8 +270,9 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
             fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
             times[row] = (int(hours) * 60 + int(minutes)) * 60 * 10**9 + int(fraction)
         else:
+            given = str(cells[row]).strip()[:40]
             raise BagError(
-                f"{where}: '{text[:40]}' in row {row + 1} is neither a number nor an ISO time such as "
+                f"{where}: '{given}' in row {row + 1} is neither a number nor an ISO time such as "
                 f"2026-11-22T06:28:01.25Z; write all of them as one or the other"
                 + ", with a point before decimals"
                 * bool(re.fullmatch(r"-?\d+,\d+", text))

@@ -36,7 +36,10 @@ _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|nan$", re.IGNORECASE)
 _WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
 _THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}$")
-_INSTANT = re.compile(r"\d{4}-\d\d-\d\d([T ]|$)|\d{1,2}:\d\d(:\d\d|$)|\d{1,2}[./]\d{1,2}[./]\d{2,4}")
+_INSTANT = re.compile(
+    r"\d{4}[-/]\d\d?[-/]\d\d?([T ]|$)|\d{1,2}:\d\d(:\d\d|$|\s*[AaPp])|\d{1,2}[./]\d{1,2}[./]\d{2,4}|"
+    r"\d{1,2}-(\d{1,2}|[A-Za-z]{3})-\d{2,4}|\d{8}[T_ ]\d{6}"
+)
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
 _ODD_SHARE = 0.1  # of lines with another number of cells, above which the file is no table
