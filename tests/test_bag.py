@@ -38,12 +38,16 @@ from bag_writer import (
     Message,
     Topic,
     cdr,
+    channel_record,
+    chunk_record,
     float64,
     header,
     message,
     metadata_yaml,
     places,
     ramp,
+    raw_file,
+    schema_record,
     write,
     write_folder,
 )
@@ -398,7 +402,14 @@ BAD_SCHEMAS = {
     "no name": (Topic("/bad", "x/msg/Y", schema_name="", schema="float64 y\n"), "cannot be used"),
     "protobuf": (Topic("/bad", "x/msg/Y", schema="float64 y\n", schema_encoding="protobuf"), "written in 'protobuf'"),
     "no schema": (Topic("/bad", "x/msg/Y", schema_encoding=""), "does not say what type"),
-    "json": (Topic("/bad", "std_msgs/msg/Float64", encoding="json"), "its messages are in json"),
+    "json": (
+        Topic("/bad", "std_msgs/msg/Float64", encoding="json"),
+        "in json, and cdr is what can be decoded: write its numbers into",
+    ),
+    "ros1": (
+        Topic("/bad", encoding="ros1"),
+        "in ros1, and cdr is what can be decoded: take the .bag",
+    ),
 }
 
 
@@ -420,6 +431,16 @@ def test_a_topic_that_cannot_be_decoded_disturbs_no_other(case: str, tmp_path: P
         bag.messages(["/good", "/bad"])
     assert reason in str(caught.value) and "\n" not in str(caught.value)
     assert {item.info.topic for item in bag.facts()} == {"/good", "/bad"}
+
+
+def test_a_chunk_that_is_too_large_is_told_how_to_make_smaller(tmp_path: Path) -> None:
+    chunk = chunk_record(channel_record(1, GOOD, 0), stated=300 << 20)
+    (tmp_path / "a.mcap").write_bytes(raw_file(schema_record(1, GOOD), chunk, summary=b""))
+    with pytest.raises(
+        BagError, match="at most 256 MiB are taken: write smaller ones with `mcap compress a.mcap -o"
+    ) as caught:
+        Bag(tmp_path / "a.mcap")
+    assert "record or copy it again" not in str(caught.value)
 
 
 def test_a_topic_that_is_not_there(tmp_path: Path) -> None:

@@ -326,6 +326,31 @@ def test_nothing_to_propose_is_said(tmp_path):
         propose([path])
 
 
+def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, capsys):
+    """`init` proposed one of them without a word, and `fit` of all said to check the signals file."""
+    messages, x = [], np.zeros(2)
+    rng = np.random.default_rng(0)
+    for k in range(300):
+        u = float(np.sign(np.sin(k / 15)))
+        for i, name in enumerate(("arm", "hand")):
+            messages.append(
+                Message("/joint_states", 20 * MS * k + i * MS, joint_state(20 * MS * k + i * MS, [x[i]], [name]))
+            )
+        messages.append(f64("/cmd", 20 * MS * k + 2 * MS, u))
+        x += 0.1 * (np.array([u, -u]) - x) + 0.01 * rng.normal(size=2)
+    path = save(tmp_path / "a.mcap", messages, {"/joint_states": JOINT, "/cmd": FLOAT64})
+    apart = (
+        f"{path}: /joint_states: position[arm] come in other messages than position[hand], and the states of a model "
+        "in one; fit a model for each, or publish all together, as joint_state_publisher with source_list does"
+    )
+    proposal = propose([path])
+    assert [state.path for state in proposal.states] == ["position[hand]"] and proposal.warnings == (apart,)
+    assert main(["topics", str(path)]) == 0 and apart in capsys.readouterr().err
+    entries = [{"name": name, "topic": "/joint_states", "field": f"position[{name}]"} for name in ("arm", "hand")]
+    with pytest.raises(FitError, match="no message of /joint_states has all of arm, hand; fit a model for those that"):
+        fit(read_transients(path, SignalMap.from_dict({"states": entries})))
+
+
 # --- many columns ------------------------------------------------------------------------------------------------
 
 

@@ -13,10 +13,13 @@ import json
 
 import numpy as np
 import pytest
+from bag_writer import Message, Topic, write
 from engine_bag import engine_bag
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.cli.main import main
+from uncertain_lti.plants.leibov import STATE_TOPIC
+from uncertain_lti.recordings.bag import Bag
 
 
 @pytest.fixture
@@ -93,6 +96,23 @@ def test_what_is_to_note_of_a_recording_is_said_once(folder, capsys):
     (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])
     assert main(["start", *HEALTHY]) == 0
     assert capsys.readouterr().err.count(f"{HEALTHY[0]}: cut after ") == 1
+
+
+def test_what_is_not_used_of_a_recording_is_said_as_fit_says_it(folder, capsys):
+    """Also where the signals file is there already, so that `init` does not read the recordings."""
+    messages = [Message(raw.topic, raw.log_time_ns, raw.data) for raw in Bag(folder / HEALTHY[1]).raw_messages()]
+    of_state = next(m for m in messages[100:] if m.topic == STATE_TOPIC)
+    topics = [Topic(topic, "sensor_msgs/msg/JointState") for topic in dict.fromkeys(m.topic for m in messages)]
+    write(topics, sorted([*messages, of_state], key=lambda m: m.log_time)).save(folder / HEALTHY[1])
+    whole = (folder / HEALTHY[0]).read_bytes()
+    (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])
+    assert main(["start", *HEALTHY]) == 0
+    said = capsys.readouterr()
+    assert main(["start", *HEALTHY, "--force"]) == 0
+    again = capsys.readouterr()
+    for one in (said, again):
+        assert f"{HEALTHY[1]}: " in one.out and "1 dropped (equal stamp))" in one.out
+        assert one.err.count(f"{HEALTHY[0]}: cut after ") == 1
 
 
 @pytest.mark.parametrize(

@@ -83,8 +83,7 @@ def _read(options: argparse.Namespace, signals: str | SignalMap) -> list[Transie
 
     transients = read_transients(options.bags, signals, options.progress.iterate("reading"), processes=None)
     for transient in transients:
-        if not options.json:
-            options.progress.note(*transient.notes)
+        options.progress.note(*transient.notes)
         options.say(recording_text(transient))
     return transients
 

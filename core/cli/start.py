@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from uncertain_lti.cli.command import RECORDINGS, Command, Result, helped, model
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000
+_LOSS = re.compile(r"usable transitions? \(.+\)$")  # of what `fit` says of a recording, where some are not used
 
 
 # --- topics ----------------------------------------------------------------------------------------------------------
@@ -130,7 +132,8 @@ def run_start(options: argparse.Namespace) -> Result:
         options.say(_proposed(parts["init"]))
         options.say(f"signals file written to {signals}: it says why; edit it and start again with --force")
     forced = ["--force"] * options.force
-    parts["fit"] = _part(options, ["fit", *options.bags, "--signals", signals, "--output", model, *forced]).data
+    fit = ["fit", *options.bags, "--signals", signals, "--output", model, *forced]
+    parts["fit"] = _part(options, fit, lambda text: options.say(text) if _LOSS.search(text) else None).data
     report = _part(options, ["report", model, *(options.check or options.bags), "--output", page])
     if report.data is None:  # no recording could be checked, which is said
         return report
@@ -142,10 +145,10 @@ def run_start(options: argparse.Namespace) -> Result:
     return Result(report.status, {**parts, "findings": report.data, "exit_status": report.status})
 
 
-def _part(options: argparse.Namespace, words: list[str]) -> Result:
-    """Run a command of this program as with --json; what it comes to."""
+def _part(options: argparse.Namespace, words: list[str], say: Callable[[str], None] = lambda text: None) -> Result:
+    """Run a command of this program as with --json, but for what `say` takes of its words; what it comes to."""
     command = options.build_parser(words[0]).parse_args([*words, "--json"])
-    command.progress, command.say = options.progress, lambda text: None
+    command.progress, command.say = options.progress, say
     return command.run(command)  # type: ignore[no-any-return]
 
 

@@ -151,6 +151,14 @@ def _without_values(transients: Sequence[Transient]) -> str:
             f"{', '.join(never)} {'have' if many else 'has'} no value in any of them (missing, not finite or too old, "
             f"see max_hold and max_skew), so check {'their fields' if many else 'its field'} in the signals file"
         )
+    signals = first.signals
+    of_one = [i for i, s in enumerate(signals.states) if s.topic == signals.clock] if signals is not None else []
+    if len(of_one) > 1 and not any(f[:, of_one].all(axis=1).any() for f in finite):
+        return (
+            f"no message of {signals.clock if signals else ''} has all of {', '.join(names[i] for i in of_one)}; fit a "
+            f"model for those that come together, or publish all in one message, as joint_state_publisher with "
+            f"source_list does"
+        )
     seldom = [f"{name} in {count}" for name, count in counts.items() if count < total]
     if seldom and not any((whole[1:] & whole[:-1]).any() for whole in (f.all(axis=1) for f in finite)):
         return (

@@ -86,7 +86,9 @@ class Bag(Recording):
         self._warnings += damage
         if (damage or not self._contents) and not any(part.count for part in self._contents):
             why = self._warnings[0].removeprefix(f"{self.path}: ")
-            raise BagError(f"{self.path}: no message can be read ({why}); record or copy it again")
+            raise BagError(
+                f"{self.path}: no message can be read ({why}){'' if '`' in why else '; record or copy it again'}"
+            )
         self._channels = [_channels(part) for part in self._contents]
         self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
         self.topics = self._topics()
@@ -156,7 +158,15 @@ class Bag(Recording):
         messages: Iterable[Any] = self.raw_messages(topic for topic in self.topics if topic not in self._too_late)
         if progress is not None:
             messages = progress(messages, sum(info.count for info in self.topics.values()))
-        return topic_facts(self.topics, messages)
+        facts = topic_facts(self.topics, messages)
+        for fact in facts:
+            note = (
+                f"{self.path}: {fact.info.topic}: {shortlist(list(fact.elsewhere), 6)} come in other messages than "
+                f"{shortlist(list(fact.fields), 6)}, and the states of a model in one; fit a model for each, or "
+                f"publish all together, as joint_state_publisher with source_list does"
+            )
+            self._warnings += [note] * bool(fact.elsewhere and note not in self._warnings)
+        return facts
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
         """Messages as recorded, of these topics or of all, also those that cannot be decoded; same order."""
@@ -296,7 +306,9 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
         type_name = full_name(schema.name) if schema else ""
         if channel.message_encoding != "cdr":
             encoding = channel.message_encoding or "no stated encoding"
-            definition = undefined(type_name, f"its messages are in {encoding}, and cdr is what can be decoded")
+            remedy = "take the .bag that it was made of" if encoding == "ros1" else "write its numbers into a CSV file"
+            why = f"its messages are in {encoding}, and cdr is what can be decoded: {remedy}"
+            definition = undefined(type_name, why)
         elif schema is None:
             definition = undefined(type_name, "the file does not say what type it has")
         else:

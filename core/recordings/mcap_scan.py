@@ -250,7 +250,8 @@ class _Scanner:
         if compression and stated > LARGEST_CHUNK and not cut:
             self._leave_out(
                 where,
-                f"it states {count(stated, 'byte')} decompressed, and at most {LARGEST_CHUNK >> 20} MiB are taken",
+                f"it states {count(stated, 'byte')} decompressed, and at most {LARGEST_CHUNK >> 20} MiB are taken: "
+                f"write smaller ones with `mcap compress {self.found.path.name} -o smaller.mcap`",
             )
             return
         stated = min(stated, max(LARGEST_CHUNK, len(data)))

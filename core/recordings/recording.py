@@ -15,6 +15,7 @@ import itertools
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -27,7 +28,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import RawMessage
-from uncertain_lti.signals.field_path import FieldPath, TypeFields, signal_paths
+from uncertain_lti.signals.field_path import FieldPath, TypeFields, has_names, signal_paths
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class TopicFacts:
     messages come in bursts; None where there is no step or it is 0; `largest_gap`: longest log-time step, s; None where
     there is no step; `fields`: paths that can be signals; `data[0..99]` means `data[0]` to `data[99]`; `stamps`:
     whether header stamps can be used; `stamp_offset`: median of log time less header stamp, s; None without a stamp;
-    `bursts`: whether messages come in bursts, with most steps far shorter than the mean.
+    `bursts`: whether messages come in bursts, with most steps far shorter than the mean; `elsewhere`: entries that only
+    other messages of the topic name than the one that `fields` are of.
     """
 
     info: TopicInfo
@@ -68,6 +70,7 @@ class TopicFacts:
     stamps: Literal["none", "usable", "zero", "mixed"]
     stamp_offset: float | None
     bursts: bool = False
+    elsewhere: tuple[str, ...] = ()
 
 
 @dataclass
@@ -145,6 +148,7 @@ class Recording(ABC):
         """Rates, gaps, stamps and fields of every topic, for a person who looks for signals."""
 
 
+_FIRST = 50  # messages of a topic that are looked at for the names of its entries
 _BURSTS = 10  # times that the mean step is longer than the median one where messages come in bursts
 
 
@@ -157,6 +161,8 @@ def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage])
     offsets: dict[str, array[float]] = {topic: array("d") for topic in topics}
     zeros = dict.fromkeys(topics, 0)
     longest: dict[str, RawMessage] = {}
+    first: dict[str, list[RawMessage]] = {}
+    rest: dict[str, int] = {}
     for raw in messages:
         channel, topic = raw.channel, raw.channel.topic
         if not channel.counted:
@@ -166,29 +172,43 @@ def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage])
             continue
         if topic not in longest or len(raw.data) > len(longest[topic].data):
             longest[topic] = raw
+        if topic not in first:
+            definition = channel.definition
+            first[topic], rest[topic] = [], _FIRST * has_names(definition.fields, definition.type_name)
+        if rest[topic]:
+            rest[topic] -= 1
+            first[topic].append(raw)
         if channel.definition.has_header:
             if stamp := channel.definition.stamp_ns(raw.data):
                 offsets[topic].append((raw.log_time_ns - stamp) * 1e-9)
             else:
                 zeros[topic] += 1
     return [
-        _facts(info, times[topic], offsets[topic], zeros[topic], longest.get(topic)) for topic, info in topics.items()
+        _facts(info, times[topic], offsets[topic], zeros[topic], longest.get(topic), first.get(topic, ()))
+        for topic, info in topics.items()
     ]
 
 
 def _facts(
-    info: TopicInfo, times: array[int], offsets: array[float], zeros: int, longest: RawMessage | None
+    info: TopicInfo,
+    times: array[int],
+    offsets: array[float],
+    zeros: int,
+    longest: RawMessage | None,
+    first: Sequence[RawMessage],
 ) -> TopicFacts:
     steps = [b - a for a, b in itertools.pairwise(times)]
     step, bursts = usual_step(median(steps), times[-1] - times[0], len(steps)) if steps else (0.0, False)
     fields: tuple[str, ...] = ()
+    elsewhere: dict[str, None] = {}
     if longest:
         definition = longest.channel.definition
-        try:
+        with suppress(BagError):  # `messages` tells it
             message = definition.decode(longest.data)
             fields = tuple(signal_paths(definition.fields, definition.type_name, message))
-        except BagError:
-            pass  # `messages` tells it
+            for raw in first:
+                message = definition.decode(raw.data)
+                elsewhere |= dict.fromkeys(signal_paths(definition.fields, definition.type_name, message))
     return TopicFacts(
         info,
         rate=1e9 / step if step else None,
@@ -197,6 +217,7 @@ def _facts(
         stamps="mixed" if zeros and offsets else "usable" if offsets else "zero" if zeros else "none",
         stamp_offset=median(offsets) if offsets else None,
         bursts=bursts,
+        elsewhere=tuple(path for path in elsewhere if path not in fields and ".." not in path),
     )
 
 

@@ -394,7 +394,7 @@ def signal_paths(
             if field.kind == "message":
                 yield from _inside(type_fields, field, value[0], every, depth)
             elif field.kind in ("number", "bool"):
-                names = _names(fields, message) if field.kind == "number" else []
+                names = _names(type_fields, type_name, message) if field.kind == "number" else []
                 yield from [f"{path}[{n}]" for n in names] if len(names) == len(value) else [every]
         elif field.kind == "message":
             yield from _inside(type_fields, field, value, path, depth)
@@ -409,10 +409,15 @@ def _inside(type_fields: TypeFields, field: FieldType, value: Any, path: str, de
     yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1)
 
 
-def _names(fields: Mapping[str, FieldType], message: Any) -> list[str]:
+def has_names(type_fields: TypeFields, type_name: str) -> bool:
+    """Whether messages of a type name the entries of their arrays, as a JointState does."""
+    field = type_fields(type_name).get("name")
+    return field is not None and field.kind == "string" and field.array is not None
+
+
+def _names(type_fields: TypeFields, type_name: str, message: Any) -> list[str]:
     """Entries of a message's own `name` array, quoted where they would read as an index; [] without a usable one."""
-    field = fields.get("name")
-    if field is None or field.kind != "string" or field.array is None:
+    if not has_names(type_fields, type_name):
         return []
     names = [str(name) for name in message.name]
     if len(set(names)) < len(names) or len(names) > _MOST_NAMES or any('"' in n or not n.strip() for n in names):
