@@ -569,6 +569,20 @@ def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(bench
     until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without")
 
 
+def test_a_snapshot_of_an_alarm_that_cannot_be_written_is_logged(bench: StartBench, tmp_path: Path) -> None:
+    """The log said that it is written, and nothing else."""
+    folder = tmp_path / "snapshots"
+    options: dict[str, Any] = {"snapshot.on_alarm": True, "snapshot.after": 0.1, "snapshot.folder": str(folder)}
+    on = bench(by_hand(), **options)
+    on.plant.send(20)
+    on.flags.count(20)
+    folder.rmdir()
+    folder.write_text("no folder any more")
+    on.plant.send(3, off=2.0)
+    on.process.says(f"snapshot {folder}/envelope_monitor-")
+    on.process.says(".mcap: not written: Not a directory; make room or choose another snapshot.folder")
+
+
 def test_without_a_folder_there_are_no_snapshots(bench: StartBench, tmp_path: Path) -> None:
     said = (
         "parameter snapshot.on_alarm is true, and snapshot.folder is empty; set the one to false, or start the node "

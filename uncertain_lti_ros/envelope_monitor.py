@@ -444,12 +444,12 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems += self.outputs.sender.problems
         if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
             problems.append("use_sim_time is true, and no time has come on /clock")
-        return problems
+        return problems + self.snapshots.problems
 
     def _problems(self) -> list[str]:
         """Why messages are missing, other than silence, and what went wrong in the node since the last report."""
         problems = self._diagnostics.problems(self.inputs) + self._lasting_problems()
-        return problems + self.snapshots.problems + self.failures.problems()
+        return problems + self.failures.problems()
 
     def report(self) -> None:
         """Publish diagnostics."""

@@ -219,7 +219,8 @@ class Album:
             self.last = str(path)
             self.written += 1
         except (OSError, UncertainLTIError) as error:
-            why = error.strerror if isinstance(error, OSError) else str(error)
+            remedy = "make room or choose another snapshot.folder"
+            why = f"{error.strerror}; {remedy}" if isinstance(error, OSError) else str(error)
             self.problem = f"snapshot {path}: not written: {why}"
         except Exception as error:  # the node goes on, and reports it
             self.problem = f"snapshot {path}: not written: {error!r}"
