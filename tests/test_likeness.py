@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from test_event_log import Rig
 
+import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
@@ -71,6 +72,17 @@ def taught(model: UncertainLTI) -> UncertainLTI:
     assert not learnt.alike and all(label == found for _, label, found in learnt.named)
     assert "left out in turn, 8 of 8 recordings named as labelled" in signature_text(learnt)
     return model.replace(signatures=learnt.signatures)
+
+
+def test_a_frozen_state_has_no_signature() -> None:
+    """It had one of zeros, of no verdict, which nothing looks like."""
+    model, healthy = uncertain_lti.fit([run(seed) for seed in range(6)]), run(50)
+    x = healthy.x.copy()
+    x[ONSET:, 1] = x[ONSET, 1]
+    verdicts = EnvelopeMonitor(model).check(healthy.replace(x=x))
+    assert verdicts.alarm[ONSET + 100 :].all()
+    with pytest.raises(ModelError, match="of the verdicts of its alarm 0 have every state, as a frozen one has none"):
+        learn_signatures(model, [("stuck", verdicts)])
 
 
 def explained(model: UncertainLTI, transient: Transient) -> list[dict[str, Any]]:

@@ -568,6 +568,13 @@ def test_times_as_spreadsheets_and_controllers_write_them(form, tmp_path):
     assert set(np.diff(bag.times).tolist()) == {10**9} and list(bag.columns_by_field) == ["x", "Temp"]
 
 
+def test_what_is_read_alike_in_many_columns_is_noted_once(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("t;a;b;c\n" + "".join(f"{k};{k},5;{k};{k % 7},25\n" for k in range(40)))
+    (bag,) = group_recordings([path])
+    assert bag.warnings == [f"{path}: columns 'a', 'c': decimal commas read as points"]
+
+
 def test_noon_and_midnight_of_twelve_hours(tmp_path):
     path = tmp_path / "a.csv"
     hours = ["12:00 AM", "1:30 am", "12:00 PM", "1:30 pm", "11:59 p.m."]

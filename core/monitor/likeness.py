@@ -264,7 +264,7 @@ def learn_signatures(model: UncertainLTI, labelled: Sequence[tuple[str, Verdicts
     Raises
     ------
     ModelError
-        The alarm was on for fewer than `LEAST` verdicts of a recording, or the model has the label.
+        The alarm was on for fewer than `LEAST` verdicts on every state of a recording, or the model has the label.
     """
     known = {signature.label for signature in model.signatures}
     alone: list[Signature] = []
@@ -302,6 +302,11 @@ def _of_recording(model: UncertainLTI, label: str, verdicts: Verdicts) -> Signat
     table, zeros = verdicts.horizon_utilisation[rows], np.zeros(model.n)
     for row in table:
         pattern.add(row, zeros)
+    if pattern.verdicts < LEAST:
+        raise ModelError(
+            f"{verdicts.transient.name}: of the verdicts of its alarm {pattern.verdicts} have every state, as a "
+            f"frozen one has none, so it has no signature; leave it out: a check names what is frozen by itself"
+        )
     return pattern.signature(label)
 
 

@@ -252,7 +252,7 @@ def _too_late(where: str) -> BagError:
 def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
     """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted."""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
-    iso, order = _as_iso(where, [_spelt(str(cell)) for cell in cells])
+    iso, order = _as_iso(where, [_spelt(str(cell)) for cell in cells], cells)
     plain: list[str] = []
     rows: list[int] = []
     shifts: list[int] = []
@@ -292,7 +292,7 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
     return times, order
 
 
-def _as_iso(where: str, cells: Sequence[object]) -> tuple[Sequence[object], str]:
+def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
     """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day and goes forward.
 
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
@@ -314,7 +314,8 @@ def _as_iso(where: str, cells: Sequence[object]) -> tuple[Sequence[object], str]
     if len({tuple(texts) for texts in orders.values()}) == 2:
         even = [order for order, texts in orders.items() if _is_even(texts)]
         taken = even if len(even) == 1 else taken * (len({m.group(1, 2, 3) for m in found}) == 1)
-        note = f"'{found[0][0][:40]}' is taken for {(taken or even or [''])[0]}"
+        first = next(str(cell).strip() for cell in given if str(cell).strip())
+        note = f"'{first[:40]}' is taken for {(taken or even or [''])[0]}"
     if not taken:
         raise BagError(
             f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times "

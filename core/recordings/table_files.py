@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, absent
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"
@@ -170,12 +170,15 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
         cut = " (the file ends in it)" if odd == 1 and first_odd == last_line else ""
         notes.append(f"{plural(odd, 'line')} with another number of cells left out, the first is line {first_odd}{cut}")
     found: dict[str, Column] = {}
+    noted: dict[str, list[str]] = {}
     for name, texts_of in zip(names, columns, strict=True):
         if name.startswith("column ") and not any(texts_of):
             continue  # a delimiter at the end of each line
         found[name], note = _column(texts_of, shape.delimiter)
         if note:
-            notes.append(f"column '{name}': {note}")
+            noted.setdefault(note, []).append(name)
+    for note, of in noted.items():
+        notes.append(f"column{'s' * (len(of) > 1)} {shortlist([repr(name) for name in of], 6)}: {note}")
     table = RawTable(found, notes, units=_units(shape, names))
     texts = dict(zip(names, columns, strict=True))
     table.exact = lambda name: [cell.strip() for cell in texts[name]]
