@@ -39,6 +39,8 @@ TURBOFAN = {
     "turbofan_pulses_up_large_noise": {"manoeuvre": "pulses", "amplitude": LARGE, "noise": NOISE, "seed": 1},
     "turbofan_pulses_down_large_noise": {"manoeuvre": "pulses", "amplitude": -LARGE, "noise": NOISE, "seed": 2},
     "turbofan_levels_noise": {"manoeuvre": "levels", "noise": NOISE, "seed": 3},
+    "turbofan_pulses_up_again_noise": {"manoeuvre": "pulses", "amplitude": LARGE, "noise": NOISE, "seed": 4},
+    "turbofan_pulses_down_again_noise": {"manoeuvre": "pulses", "amplitude": -LARGE, "noise": NOISE, "seed": 5},
     **{
         f"turbofan_{kind}": {
             "manoeuvre": "levels", "noise": NOISE, "seed": 10 + i, "fault": kind, "fault_at": 24.0, "samples": 1401,

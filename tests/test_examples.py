@@ -38,15 +38,15 @@ def test_arrays_are_fitted_with_none_outside_and_only_the_changed_run_alarms(tmp
 
 def test_bags_are_fitted_and_the_figure_is_an_image_where_it_was_asked_for(tmp_path):
     said = said_by("fit_bag.py", tmp_path, "damage.png")
-    assert "3 recordings fitted, 0 transitions outside" in said
-    assert "first alarm at 24.025 s" in said
+    assert "5 recordings fitted, 0 transitions outside" in said
+    assert "first alarm at 27.300 s" in said
     assert (tmp_path / "damage.png").read_bytes().startswith(b"\x89PNG")
     assert [path.name for path in tmp_path.iterdir()] == ["damage.png"]
 
 
 def test_a_session_without_ros_gives_the_bits_of_a_check(tmp_path):
     said = said_by("live_session.py", tmp_path)
-    assert said.startswith("alarm at 24.025 s\n")
+    assert said.startswith("alarm at 27.150 s\n")
     assert "monitor: alarm: at lea" in said
     assert said.endswith("1401 samples, the same bits as a check of the bag\n")
 
@@ -83,7 +83,7 @@ def test_the_notebook_runs_from_its_folder_and_every_result_can_be_shown(monkeyp
     said = capsys.readouterr().out
     assert shown.count("figure") == 4
     assert all(part == "figure" or "<table>" in part for part in shown)
-    assert "first alarm at 24.025 s" in said
+    assert "first alarm at 24.050 s" in said
     healthy, damaged = (float(share) for share in re.findall(r"(?:healthy|damaged): (\S+)% violated", said))
     assert healthy < 1.0 < damaged
 

@@ -135,8 +135,8 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
     [
         ("recording", 1, 4000, "a"),
         ("recording", 2, 4000, "a"),
-        ("recording", 3, 4000, "a"),
-        ("recording", 3, 400, "as"),
+        ("recording", 3, 4000, "an"),
+        ("recording", 3, 400, "asn"),
         ("recording", 4, 4000, "an"),
         ("recording", 4, 400, "asn"),
         ("block", 5, 4000, "an"),
@@ -155,7 +155,7 @@ def test_thresholds_follow_from_the_evidence(what, count, verdicts, taken):
         "s": np.exp(logs.mean(axis=0)) * 4.0,
         "n": np.exp(logs.mean(axis=0) + far),
     }
-    limits["n"] = np.minimum(limits["n"], 2 * limits["a"])
+    limits["n"] = np.minimum(limits["n"], 1.5 * np.max([limits[kind] for kind in taken if kind != "n"], axis=0))
     one, rule = Evidence(peaks, top, np.full(2, 0.5), verdicts, np.ones((2, 2)), 1, 1, DT), StatisticRule("mean", 1, 1)
     (found,) = one.thresholds([rule], 2, what)
     above = 1.0 + 1e-10  # so that no rounding passes it

@@ -35,7 +35,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
-FITTED = [BAGS / f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels")]
+FITTED = sorted(BAGS.glob("turbofan_*_noise.mcap"))
 DAMAGED = BAGS / "turbofan_fan_damage.mcap"
 
 
@@ -64,7 +64,7 @@ def numbers(packed: dict[str, Any]) -> np.ndarray:
 
 
 def test_the_page_draws_what_the_monitor_said(world, tmp_path):
-    model = fit(read_transients(FITTED, turbofan_signals()), "lp", additive="noise")
+    model = fit(read_transients(FITTED, turbofan_signals()), "qp", additive="noise")
     model.save(tmp_path / "model.json")
     watch = world.command("watch", "--port", "0")
     address = address_of(watch)

@@ -38,7 +38,8 @@ from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti_ros.process import Life, living, speed
 from uncertain_lti_ros.topics import stamp_ns
 
-FIT = tuple(f"turbofan_{run}_noise.mcap" for run in ("pulses_up_large", "pulses_down_large", "levels"))
+RUNS = ("pulses_up_large", "pulses_down_large", "pulses_up_again", "pulses_down_again", "levels")
+FIT = tuple(f"turbofan_{run}_noise.mcap" for run in RUNS)
 CHECK = "turbofan_fan_damage.mcap"
 SHOWN = ["fan_speed", "compressor_exit_total_pressure", "turbine_exit_total_pressure"]
 _FLAGS = "/envelope_monitor/flags"

@@ -19,11 +19,11 @@ sizes of n states reach beyond those of one as the quantiles of a normal distrib
 Where windows are few, the largest of one state is chance, and the states share what is relative to their typical peak.
 Elsewhere, and of recordings, which differ by more than their blocks, a threshold is also the limit below which the
 largest size of one more of them lies with CONFIDENCE (of a block with ALIKE), where the logarithms of the largest sizes
-p of each of G (TELLING at least) are normal,
+p of each of G (three at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
 
-at most MOST times the former; of one or two recordings it is UNKNOWN times as large.
+at most MOST times the former, and MOST times it of one or two recordings.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -62,11 +62,9 @@ CONFIDENCE = 0.9
 ALIKE = 0.95
 """As CONFIDENCE, of the largest size in one more block of a single recording."""
 TELLING = 4
-"""Recordings, groups or blocks from which on the spread of their largest sizes is known well enough to reckon with."""
-MOST = 2.0
-"""That limit over the threshold without it at most: parts at rest and parts that move are not alike."""
-UNKNOWN = 1.5
-"""Threshold over what it would be, of one or two recordings or groups, whose spread nobody knows."""
+"""Recordings or groups from which on slow rules know how far they differ."""
+MOST = 1.5
+"""That limit over the threshold without it at most, as parts at rest and parts that move are not alike."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 NEARBY = 0.75
@@ -352,7 +350,7 @@ def _threshold(
     if count and windows < FEW:
         typical = np.ma.exp(logs.mean(axis=0))
         found = np.maximum(found, (typical * (top / typical).max()).filled(0.0))
-    if count >= TELLING and not (blocks and windows < FEW):
+    if count > 2 and not (blocks and windows < FEW):
         from scipy.special import stdtrit
 
         far = stdtrit(count - 1, ALIKE if blocks else CONFIDENCE) * math.sqrt(1.0 + 1.0 / count)
@@ -360,7 +358,7 @@ def _threshold(
         limit = np.ma.exp(logs.mean(axis=0) + far * spread).filled(0.0)
         found = np.maximum(found, np.minimum(limit, MOST * found))
     elif count <= 2 and not blocks:
-        found *= UNKNOWN
+        found *= MOST
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
 
 
