@@ -112,6 +112,7 @@ def test_what_is_not_used_of_a_recording_is_said_as_fit_says_it(folder, capsys):
     again = capsys.readouterr()
     for one in (said, again):
         assert f"{HEALTHY[1]}: " in one.out and "1 dropped (equal stamp))" in one.out
+        assert f"{HEALTHY[2]}: " not in one.out.partition("may I rely")[0]
         assert one.err.count(f"{HEALTHY[0]}: cut after ") == 1
 
 

@@ -25,7 +25,8 @@ from uncertain_lti.cli.command import RECORDINGS, Command, Result, helped, model
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000
-_LOSS = re.compile(r"usable transitions? \(.+\)$")  # of what `fit` says of a recording, where some are not used
+_USED = re.compile(r": (\d+) samples? over .*, (\d+) usable transitions? \((.+)\)$")  # of what `fit` says
+_FEW = 0.01  # share of the samples without a transition that is not worth a line: before the first command, a pause
 
 
 # --- topics ----------------------------------------------------------------------------------------------------------
@@ -133,7 +134,7 @@ def run_start(options: argparse.Namespace) -> Result:
         options.say(f"signals file written to {signals}: it says why; edit it and start again with --force")
     forced = ["--force"] * options.force
     fit = ["fit", *options.bags, "--signals", signals, "--output", model, *forced]
-    parts["fit"] = _part(options, fit, lambda text: options.say(text) if _LOSS.search(text) else None).data
+    parts["fit"] = _part(options, fit, lambda text: options.say(text) if _loses(text) else None).data
     report = _part(options, ["report", model, *(options.check or options.bags), "--output", page])
     if report.data is None:  # no recording could be checked, which is said
         return report
@@ -143,6 +144,12 @@ def run_start(options: argparse.Namespace) -> Result:
         then = f"not on the robot yet: mend what is said above, in {signals} or by recording, and start with --force"
     options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{then}")
     return Result(report.status, {**parts, "findings": report.data, "exit_status": report.status})
+
+
+def _loses(text: str) -> bool:
+    """Whether `fit` says of a recording that samples were dropped, or that more than a few are not used."""
+    used = _USED.search(text)
+    return bool(used and ("dropped" in used[3] or int(used[1]) - 1 - int(used[2]) > _FEW * int(used[1])))
 
 
 def _part(options: argparse.Namespace, words: list[str], say: Callable[[str], None] = lambda text: None) -> Result:
