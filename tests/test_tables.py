@@ -9,6 +9,7 @@
 
 """Tables as recordings: the bits that the same data gives in MCAP, headers and times of every kind, and bad files."""
 
+import math
 import random
 import time
 from datetime import datetime, timedelta
@@ -566,6 +567,35 @@ def test_times_as_spreadsheets_and_controllers_write_them(form, tmp_path):
     day = start if "%d" in form else datetime(1970, 1, 1, 11, 59, 30)
     assert bag.times[0] == np.datetime64(day, "ns").astype(np.int64)
     assert set(np.diff(bag.times).tolist()) == {10**9} and list(bag.columns_by_field) == ["x", "Temp"]
+
+
+@pytest.mark.parametrize(
+    ("day", "clock"), [("%d/%m/%Y", "%I:%M:%S %p"), ("%Y-%m-%d", "%H:%M:%S.%f"), ("%d.%m.%y", "%H:%M")]
+)
+def test_days_beside_times_of_day_are_theirs(day, clock, tmp_path, capsys):
+    """`init` took the day for the name of a run, as the time steps back at midnight, and ended in a traceback."""
+    path, start = tmp_path / "a.csv", datetime(2024, 3, 13, 22)
+    instants = [start + timedelta(minutes=k) for k in range(400)]
+    x, rows = 0.0, ["Date,Time,cmd,x"]
+    for k, t in enumerate(instants):
+        u = float(k // 20 % 2)
+        rows.append(f"{t.strftime(day)},{t.strftime(clock)},{u},{x + 0.01 * math.sin(7 * k):.4f}")
+        x += 0.2 * (u - x)
+    path.write_text("\n".join(rows))
+    (bag,) = group_recordings([path])
+    assert bag.times[0] == np.datetime64(start, "ns").astype(np.int64) and set(np.diff(bag.times).tolist()) == {
+        60 * 10**9
+    }
+    assert bag.warnings[0].startswith(f"{path}: column 'Time': its days are those of column 'Date'")
+    assert main(["init", str(path)]) == 0 and "runs:" not in capsys.readouterr().out
+
+
+def test_runs_that_are_named_as_no_file_is(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("lot,t,x\n" + "".join(f"7/{k // 40}[b],{k % 40},{k}\n" for k in range(80)))
+    bags = group_recordings([path], layout=TableLayout(runs="lot"))
+    assert [bag.path.name for bag in bags] == ["a.csv[7-0(b)]", "a.csv[7-1(b)]"]
+    assert len(open_recording(tmp_path / "a.csv[7-1(b)]", layout=TableLayout(runs="lot")).times) == 40
 
 
 def test_what_is_read_alike_in_many_columns_is_noted_once(tmp_path):

@@ -99,9 +99,13 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
     if values.dtype.kind == "M":
         return column, values.astype("datetime64[ns]").astype(np.int64), words
     if values.dtype.kind == "O":
-        times, order = _of_text(where, values.tolist())
+        cells = values.tolist()
+        if layout.time is None and (days := _days_beside(table, column)):
+            cells = [f"{day} {cell}".strip() for day, cell in zip(table.columns[days].tolist(), cells, strict=True)]
+            words = f"its days are those of column '{days}'"
+        times, order = _of_text(where, cells)
         words = " and ".join(part for part in (words, order) if part)
-        return column, times, f"column '{column}': {words}" if order else words
+        return column, times, f"column '{column}': {words}" if words else ""
     if layout.unit is None and _compact(values):
         times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
         return column, times, words
@@ -138,6 +142,17 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
         f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
         f"{shortlist(names, 50)}"
     )
+
+
+def _days_beside(table: RawTable, column: str) -> str:
+    """The one column of days alone, where this one has times of day alone; else nothing."""
+    first = {
+        name: _spelt(next((str(cell) for cell in cells.tolist() if cell), ""))
+        for name, cells in table.columns.items()
+        if cells.dtype.kind == "O"
+    }
+    days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
+    return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
 
 
 def _may_be(column: Column) -> bool:
@@ -361,6 +376,7 @@ _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _SECOND = 10**9
 _INEXACT = 2**53  # above which a float does not keep each integer
+_IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
 
 
@@ -568,7 +584,7 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
     pieces = np.split(order, np.cumsum(np.bincount(rows, minlength=len(names)))[:-1])
     found: dict[str, NDArray[np.intp]] = {}
     for i in np.argsort(first, kind="stable").tolist():
-        name = str(names[i]).replace("[", "(").replace("]", ")")
+        name = str(names[i]).translate(_IN_A_NAME)
         if name in _NO_RUN:
             raw.notes.append(f"{plural(len(pieces[i]), 'row')} without a run left out")
         elif name in found:
