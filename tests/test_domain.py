@@ -24,6 +24,7 @@ from hypothesis import strategies as st
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.structure import Structure
 from uncertain_lti.kernel.arithmetic import Judge
 from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for, jumps
 
@@ -67,6 +68,30 @@ def test_nothing_that_was_fitted_is_outside() -> None:
     assert model.domain.measure is not None
     assert outside(model, runs[0]) == 0.0
     assert fit([Transient(np.arange(101) * 1_000_000, x[:101], u[:101])], additive="noise").domain.measure is None
+
+
+def arms(seed: int, poses: list[tuple[float, float]]) -> Transient:
+    """Two joints, each driven by its own command."""
+    rng, u = np.random.default_rng(seed), np.repeat(poses, 40, axis=0)
+    x = np.zeros_like(u)
+    for k in range(len(u) - 1):
+        x[k + 1] = x[k] + 0.2 * (u[k] - x[k])
+    return Transient(np.arange(len(u)) * 10_000_000, x + 1e-3 * rng.normal(size=x.shape), u)
+
+
+def test_levels_of_two_that_no_row_has_both_are_no_combination() -> None:
+    """An arm of six joints was outside in every pose that it had not been in with all of them."""
+    ways = [-1.0, 0.0, 1.0, 0.0] * 10
+    together, apart = arms(1, [(a, a) for a in ways]), arms(2, [(a, -a) for a in ways])
+    own = np.where(np.eye(2, dtype=bool), np.nan, 0.0)
+    structure = Structure(2, 2, fixed={name: own for name in ("A", "B", "dA", "dB")})
+    assert outside(fit([together], additive="noise"), apart) > 0.4
+    model = fit([together], additive="noise", structure=structure)
+    assert outside(model, together) == 0.0 and outside(model, apart) < 0.05
+    slow = apart.replace(u=apart.u * [1.0, 0.5], x=apart.x * [1.0, 0.5])  # levels of the second that were not fitted
+    assert outside(model, slow) > 0.4
+    again = model.update([arms(3, [(a, a) for a in ways])])
+    assert outside(again, apart) < 0.05
 
 
 @settings(max_examples=30, deadline=None)

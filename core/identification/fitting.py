@@ -240,9 +240,10 @@ def fit_fleet(
                 f"'{signal.name}' never exceeds {largest:.3g} over its scale, less than the arithmetic can carry "
                 f"({1.0 / LARGEST:g}); give it a smaller scale or another unit, or leave it out"
             )
-    domain = Domain(low[:n], high[:n], low[n:], high[n:], fleet.occupancy(low, high))
-
-    regimes = fleet.columns.regimes
+    regimes, measure = fleet.columns.regimes, fleet.occupancy(low, high)
+    if measure is not None and structure is not None and regimes is None:
+        measure = measure.among(structure.together)
+    domain = Domain(low[:n], high[:n], low[n:], high[n:], measure)
     scheduled: dict[str, Any] = {}
     if regimes is not None:
         each = enumerate(zip(sums.visits.tolist(), engine.tied, strict=True))

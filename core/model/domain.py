@@ -79,6 +79,14 @@ class Occupancy:
         near = [wide[:, i : i + cells, j : j + cells] for i in range(3) for j in range(3)]
         return cls(cells, np.logical_or.reduce(near))
 
+    def among(self, together: NDArray[np.bool_]) -> Occupancy:
+        """The same, but that any combination counts as seen of two signals that no row of the model has both.
+
+        `together` (n + m, n + m): which two some row has.
+        """
+        apart = [not together[pair] for pair in combinations(range(len(together)), 2)]
+        return Occupancy(self.cells, self.occupied | np.array(apart or [False])[:, None, None])
+
     def within(self, before: Domain, low: Array, high: Array) -> NDArray[np.bool_]:
         """The same combinations on a grid of as many cells over larger ranges; every cell that a cell lies in.
 
