@@ -351,6 +351,23 @@ def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, capsys):
         fit(read_transients(path, SignalMap.from_dict({"states": entries})))
 
 
+def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path, capsys):
+    """Nothing before tells of its changes: `fit` said to take away the `judged: true` that `init` wrote."""
+    rng, x, rows = np.random.default_rng(0), 0.0, ["time,Pump_speed_cmd,Valve_cmd,Flow"]
+    for k, speed in enumerate(np.repeat(rng.uniform(0.2, 1.0, 15), 60).tolist()):
+        valve = 0.5 + 0.1 * (1.0 - x)  # by a controller
+        rows.append(f"{k},{speed:.3f},{valve:.4f},{x + 0.01 * rng.normal():.4f}")
+        x += 0.2 * (speed + valve - x)
+    (tmp_path / "a.csv").write_text("\n".join(rows))
+    proposal = propose([tmp_path / "a.csv"])
+    assert {c.path: c.judged for c in proposal.controls} == {"Pump_speed_cmd": False, "Valve_cmd": True}
+    assert "not judged, as it changes in 1.6% of the rows only" in proposal.text
+    assert [c.path for c in proposal.states] == ["Flow"]
+    (tmp_path / "s.yaml").write_text(proposal.text)
+    model = fit(read_transients(tmp_path / "a.csv", tmp_path / "s.yaml"))
+    assert "Pump_speed_cmd" not in model.state_names and "Valve_cmd" in model.state_names
+
+
 # --- many columns ------------------------------------------------------------------------------------------------
 
 
@@ -397,13 +414,13 @@ def test_what_is_looked_for_at_once_leaves_out_nothing(seed, missing):
 @given(seed=st.integers(0, 10**6))
 def test_effects_that_are_found_at_once_are_those_one_by_one(seed):
     rng = np.random.default_rng(seed)
-    X, U = rng.normal(size=(80, 5)) * 10.0 ** rng.integers(-4, 5, 5) + 100, rng.normal(size=(80, 3))
+    X, U = (rng.normal(size=(80, 5)) + 3) * 10.0 ** rng.integers(-4, 5, 5), rng.normal(size=(80, 3))
     dX = X @ rng.normal(size=(5, 5)) * 0.1 + U @ rng.normal(size=(3, 5)) + rng.normal(size=(80, 5))
     steps, kept, rest = Steps(X, U, dX), [1, 3], [4, 0, 2]
     each = [Steps(np.hstack([X, np.delete(U, j, 1)]), U[:, [j]], dX).effect(range(5)) for j in range(3)]
-    np.testing.assert_allclose(steps.effect_of_each(), each, rtol=1e-6)
+    np.testing.assert_allclose(steps.effect_of_each(), each, rtol=1e-6, atol=1e-6)
     coupled = [max(*steps.effect(kept, of=[j], given=kept), *steps.effect([j], of=kept, given=[j])) for j in rest]
-    np.testing.assert_allclose(steps.coupling(kept, rest), coupled, rtol=1e-6)
+    np.testing.assert_allclose(steps.coupling(kept, rest), coupled, rtol=1e-6, atol=1e-6)
 
 
 # --- the command ------------------------------------------------------------------------------------------------
