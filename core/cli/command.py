@@ -301,7 +301,7 @@ class Command:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command of parsed options and print what came of it."""
-    options.say = partial(_print_summary, options)
+    options.say = options.say_losses = partial(_print_summary, options)
     result: Result = options.run(options)
     if getattr(options, "json", False):
         if result.data is not None:

@@ -80,11 +80,12 @@ def _read(options: argparse.Namespace, signals: str | SignalMap) -> list[Transie
     """The recordings that are named, each with a line that says what was read."""
     from uncertain_lti import read_transients
     from uncertain_lti.reports.model_text import recording_text
+    from uncertain_lti.sampling.reading import loses_much
 
     transients = read_transients(options.bags, signals, options.progress.iterate("reading"), processes=None)
     for transient in transients:
         options.progress.note(*transient.notes)
-        options.say(recording_text(transient))
+        (options.say_losses if loses_much(transient) else options.say)(recording_text(transient))
     return transients
 
 

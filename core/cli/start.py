@@ -13,9 +13,8 @@ from __future__ import annotations
 
 import argparse
 import os
-import re
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -25,8 +24,6 @@ from uncertain_lti.cli.command import RECORDINGS, Command, Result, helped, model
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000
-_USED = re.compile(r": (\d+) samples? over .*, (\d+) usable transitions? \((.+)\)$")  # of what `fit` says
-_FEW = 0.01  # share of the samples without a transition that is not worth a line: before the first command, a pause
 
 
 # --- topics ----------------------------------------------------------------------------------------------------------
@@ -134,7 +131,7 @@ def run_start(options: argparse.Namespace) -> Result:
         options.say(f"signals file written to {signals}: it says why; edit it and start again with --force")
     forced = ["--force"] * options.force
     fit = ["fit", *options.bags, "--signals", signals, "--output", model, *forced]
-    parts["fit"] = _part(options, fit, lambda text: options.say(text) if _loses(text) else None).data
+    parts["fit"] = _part(options, fit).data
     report = _part(options, ["report", model, *(options.check or options.bags), "--output", page])
     if report.data is None:  # no recording could be checked, which is said
         return report
@@ -146,16 +143,10 @@ def run_start(options: argparse.Namespace) -> Result:
     return Result(report.status, {**parts, "findings": report.data, "exit_status": report.status})
 
 
-def _loses(text: str) -> bool:
-    """Whether `fit` says of a recording that samples were dropped, or that more than a few are not used."""
-    used = _USED.search(text)
-    return bool(used and ("dropped" in used[3] or int(used[1]) - 1 - int(used[2]) > _FEW * int(used[1])))
-
-
-def _part(options: argparse.Namespace, words: list[str], say: Callable[[str], None] = lambda text: None) -> Result:
-    """Run a command of this program as with --json, but for what `say` takes of its words; what it comes to."""
+def _part(options: argparse.Namespace, words: list[str]) -> Result:
+    """Run a command of this program as with --json, but for what it says of recordings that lose much."""
     command = options.build_parser(words[0]).parse_args([*words, "--json"])
-    command.progress, command.say = options.progress, say
+    command.progress, command.say, command.say_losses = options.progress, lambda text: None, options.say
     return command.run(command)  # type: ignore[no-any-return]
 
 

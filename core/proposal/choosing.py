@@ -451,6 +451,7 @@ TOLD = 0.9
 """Share of a measurement that the controls of the same row tell from which on it answers within a row."""
 RARE = 0.05
 """Share of the rows in which a set point changes, up to which nothing before tells of its changes."""
+_BY_NAME = "set by a controller or a person, by its name; "
 HELD = 0.8
 """Share of an analyser's changes that come after the same number of rows, two or more."""
 GATED = 0.99
@@ -490,11 +491,16 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for candidate in free:
         if candidate not in controls and (rows := _held_for(candidate)):
             candidate.reason, candidate.ready = f"an analyser: holds each value for {rows} rows", "state"
-    known = [c for c in controls if not c.why.startswith("set by")]
+    known = [c for c in controls if not c.judged]
     for candidate in free:
         if candidate not in controls and not candidate.reason and (share := _told(candidate, known)) >= TOLD:
             candidate.reason = f"answers within a row: the controls of the same row tell {share:.0%} of it"
             candidate.ready = "state"
+    for candidate in (c for c in controls if c.judged):
+        moves = np.concatenate([np.diff(v) != 0 for v in candidate.values])
+        if moves.mean() <= RARE:
+            candidate.judged = False
+            candidate.why = f"{_BY_NAME}not judged, as it changes in {moves.mean():.1%} of the rows only"
     states = [c for c in free if c not in controls and not c.reason]
     for candidate in states:
         told = _known(candidate)
@@ -529,13 +535,7 @@ def _is_set(candidate: Candidate) -> bool:
     elif len(values) <= 2 or (len(values) <= MOST_VALUES and (values == np.rint(values)).all()):
         candidate.why = f"switched between {', '.join(f'{v + 0.0:.6g}' for v in values)}"
     elif by_name:
-        moves = np.concatenate([np.diff(v) != 0 for v in candidate.values])
-        candidate.judged = bool(moves.mean() > RARE)
-        candidate.why = "set by a controller or a person, by its name; " + (
-            "judged as well"
-            if candidate.judged
-            else f"not judged, as it changes in {moves.mean():.1%} of the rows only"
-        )
+        candidate.why, candidate.judged = f"{_BY_NAME}judged as well", True
     else:
         return False
     return True

@@ -413,6 +413,15 @@ def unused(transient: Transient) -> list[str]:
     return parts + [f"{count} {kind} {name}" for kind, name, count in kinds]
 
 
+_FEW = 0.01  # share of the samples without a transition that is not worth a line: before the first command, a pause
+
+
+def loses_much(transient: Transient) -> bool:
+    """Whether messages were dropped, or more than a few samples are not used."""
+    dropped = any(transient.counters[s.value] for s in Status if s.dropped)
+    return dropped or len(transient) - 1 - int(transient.usable.sum()) > _FEW * len(transient)
+
+
 WORTH_IT = 1 << 28
 """Bytes of recordings from which on processes that have to be started first save time."""
 
