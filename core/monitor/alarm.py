@@ -214,6 +214,7 @@ class Alarm:
 
     def over(
         self,
+        spans: Sequence[tuple[int, int]],
         dt: Array,
         violated: NDArray[np.bool_],
         rows: Sequence[Any],
@@ -221,32 +222,34 @@ class Alarm:
         each: NDArray[np.bool_] | None = None,
         values: Array | None = None,
     ) -> NDArray[np.bool_]:
-        """Many verdicts from a cleared alarm; after each what `push` gives.
+        """Many verdicts, those of each span [start, stop) from a cleared alarm; after each what `push` gives.
 
         `dt` (K,): steps, s; `violated` (K,): as for `push`; `rows`: of the table of `push`, (K, n) each, None for one
         that no rule looks at; `judged` (K,): where there is a verdict, default everywhere; without one the alarm stays
         as it was; `each` (K, rules): takes which rules raise the alarm after each; `values` (K, statistics): takes
-        `values` after each, NaN without a verdict. Returns (K,): the alarm after each.
+        `values` after each, NaN without a verdict. Returns (K,): the alarm after each; none outside the spans.
         """
-        self.reset()
         count = len(dt)
         judged = np.ones(count, dtype=bool) if judged is None else judged
-        each = np.empty((count, len(self.rules)), dtype=bool) if each is None else each
+        each = np.zeros((count, len(self.rules)), dtype=bool) if each is None else each
         values = np.empty((count, 0)) if values is None else values
 
         def push_all(part: Window | Statistic, row: int, after: NDArray[np.bool_], own: Array) -> None:
-            if isinstance(part, Window):
-                part.push_all(violated, rows[row], judged, after)
-            else:
-                part.push_all(dt, rows[row], judged, after, own)
+            for start, stop in spans:
+                on, table = slice(start, stop), rows[row]
+                table = None if table is None else table[on]
+                part.reset()
+                if isinstance(part, Window):
+                    part.push_all(violated[on], table, judged[on], after[on])
+                else:
+                    part.push_all(dt[on], table, judged[on], after[on], own[on])
+            part.reset()
 
         owns = np.split(values, self._begins[1:], axis=1)
-        on_cores(push_all, list(zip(self._parts, self._rows, each.T, owns, strict=True)), count >= WORTH_THREADS)
-        self.reset()
-        raised = np.zeros(count, dtype=bool)
-        for column in each.T:
-            raised |= column
-        return raised
+        long = count >= WORTH_THREADS * len(spans)
+        on_cores(push_all, list(zip(self._parts, self._rows, each.T, owns, strict=True)), long)
+        self.alarm = False
+        return np.asarray(each.any(axis=1))
 
 
 _OPERATORS: Mapping[str, Callable[[float, float], bool]] = {

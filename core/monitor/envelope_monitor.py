@@ -466,26 +466,19 @@ class EnvelopeMonitor:
             for values, one in zip((longer, longer_residual), found, strict=True):
                 values[:, arrival] = one.transpose(1, 0, 2)
         outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (OUTSIDE, UNKNOWN))
-        alarm, each = np.zeros(count, dtype=bool), np.zeros((count, len(self.alarms.rules)), dtype=bool)
-        dt = np.zeros(count)
+        each, dt = np.zeros((count, len(self.alarms.rules)), dtype=bool), np.zeros(count)
         dt[steps.k + 1] = steps.dt
         rows_of = [seen[UTILISATION], *longer, seen[RESIDUAL], *longer_residual]
-        spans = _alarm_spans(transient.t_ns, armed)
-
-        def over(alarm: NDArray[np.bool_], each: NDArray[np.bool_], values: Array) -> None:
-            alarms = Alarm(self.alarms.rules, model, self._counted)
-            for start, stop in spans:
-                on = slice(start, stop)
-                some = [None if row is None else row[on] for row in rows_of]
-                alarm[on] = alarms.over(dt[on], violated[on], some, judged[on], each[on], values[on])
+        alarms = Alarm(self.alarms.rules, model, self._counted)
+        over = partial(alarms.over, _alarm_spans(transient.t_ns, armed), dt, violated, rows_of, judged)
 
         @cache
         def statistics() -> Array:
             values = np.full((count, len(self.alarms.names)), np.nan)
-            over(np.empty(count, dtype=bool), np.empty_like(each), values)
+            over(values=values)
             return values
 
-        over(alarm, each, np.empty((count, 0)))
+        alarm = over(each)
         if why:
             alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
         return Verdicts(

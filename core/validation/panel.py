@@ -257,10 +257,7 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     model = part.judged_by
     alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
     values = np.zeros((part.judged, len(alarm.names)))
-    for start, stop in part.spans:
-        span = slice(start, stop)
-        nothing = np.zeros(stop - start, dtype=bool)
-        alarm.over(part.dt[span], nothing, part.rows(span), values=values[span])
+    alarm.over(part.spans, part.dt, np.zeros(part.judged, dtype=bool), part.rows, values=values)
     sizes = np.abs(values, out=values)
     sizes[np.isnan(sizes)] = 0.0
     np.minimum(sizes, LARGEST, out=sizes)

@@ -144,10 +144,11 @@ class Part:
         """[start, stop) of the verdicts over which the alarm goes on from a cleared one."""
         return list(zip(self.starts, [*self.starts[1:], self.judged], strict=True))
 
-    def rows(self, span: slice) -> list[Array]:
+    @property
+    def rows(self) -> list[Array]:
         """For `Alarm.over`: utilisation for one step and for each horizon, then the residuals."""
         longer, far = self.longer.transpose(1, 0, 2), self.longer_residual.transpose(1, 0, 2)
-        return [row[span] for row in (self.utilisation, *longer, self.residual, *far)]
+        return [self.utilisation, *longer, self.residual, *far]
 
 
 def judge(

@@ -36,12 +36,7 @@ def raised_on(rules: Sequence[Rule], part: Part) -> NDArray[np.bool_]:
     one_step = containment(rules)
     margin = 1.0 if one_step is None else one_step.margin
     violated = ~(np.nan_to_num(np.abs(settled(part.utilisation, ~part.outside)).max(axis=1)) <= margin)
-    found = np.zeros(part.judged, dtype=bool)
-    for start, stop in part.spans:
-        span = slice(start, stop)
-        alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
-        found[span] = alarm.over(part.dt[span], violated[span], part.rows(span))
-    return found
+    return Alarm(rules, model, np.ones(model.n, dtype=bool)).over(part.spans, part.dt, violated, part.rows)
 
 
 def false_alarms(parts: Sequence[Part], rules: Sequence[Rule], confidence: float) -> dict[str, Any]:
