@@ -323,6 +323,7 @@ def models(draw: st.DrawFn) -> UncertainLTI:
     )
 
 
+@settings(max_examples=40)
 @given(models())
 def test_a_saved_model_is_the_same_to_the_last_bit(
     tmp_path_factory: pytest.TempPathFactory, model: UncertainLTI
