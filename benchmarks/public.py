@@ -63,7 +63,7 @@ class Signals:
 
     def recording(self, rows: Array, t: Array) -> Transient:
         """The rows at times t, s."""
-        at = "both" if self.both_ends else "departure"
+        at = "both" if self.both_ends else None
         return Transient(t, rows[:, list(self.states)], rows[:, list(self.controls)], at=at)
 
 

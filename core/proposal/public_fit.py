@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any, Literal
 
 from numpy.typing import ArrayLike
@@ -29,7 +30,7 @@ from uncertain_lti.model.horizon import Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.search import choose_horizons, choose_knots, knots_of, lengths_of
+from uncertain_lti.proposal.search import choose_ends, choose_horizons, choose_knots, knots_of, lengths_of
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.reading import load_signals, read_transients, refuse_copies
@@ -166,6 +167,15 @@ def fit(
         "discard": discard,
         "method": method,
     }
+    messages: list[str] = []
+    for_controls_as_they_are = (weights, transient_weights, operating_point, structure)
+    if alarm == "panel" and method == "working-set" and all(given is None for given in for_controls_as_they_are):
+        way = {name: options[name] for name in ("criterion", "additive", "count")}
+        at, why = choose_ends(transients, groups=groups, **way)
+        if why:
+            transients = [t.controls_at(at) for t in transients]
+            messages.append(why)
+            first, signals = transients[0], transients[0].signals
     asked = schedule
     if asked is None:
         asked = {} if signals is None else asked_by(signals)
@@ -186,7 +196,6 @@ def fit(
         _no_knots_named(signals, automatic[0])
     resolved: Schedule | None = None
     facts: list[dict[str, Any]] = []
-    messages: list[str] = []
     for number, name in enumerate(automatic):
         others = {other: knots for other, knots in chosen.items() if other not in automatic[number:]}
         best, table = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
@@ -235,10 +244,17 @@ def fit(
     added: dict[str, Any] = {"schedule": facts} if facts else {}
     if choice_of_horizons:
         added["horizon_choice"] = choice_of_horizons
-    if added or messages:
-        there = model.fit_summary.get("messages", [])
-        model = model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
-    return model
+    return _saying(model, messages, added)
+
+
+def _saying(
+    model: UncertainLTI, messages: Sequence[str], added: Mapping[str, Any] = MappingProxyType({})
+) -> UncertainLTI:
+    """The model with further sentences, and facts, in its summary."""
+    if not (added or messages):
+        return model
+    there = model.fit_summary.get("messages", [])
+    return model.replace(fit_summary={**model.fit_summary, **added, "messages": [*there, *messages]})
 
 
 def fit_many(
@@ -264,11 +280,16 @@ def fit_many(
     additive = additive or signals.additive
     asked = asked_by(signals) if schedule is None else schedule
     refuse_auto(signals.scheduled_on(signals_of(asked, [s.name for s in signals.signals])))
-    taken, some = None, list[Transient]()
+    taken, some, messages = None, list[Transient](), list[str]()
     if alarm == "panel":
         bags = group_recordings(paths, indexed=True, layout=signals.table)
         some = _some(bags, signals)
         ways, said = _ways(criterion, additive, bool(asked)), {"describe_data": False, "progress": progress}
+        at, why = choose_ends(some, criterion=criterion or "lp", additive=additive or "noise")
+        if why:
+            some, messages = [t.controls_at(at) for t in some], [why]
+            free = [replace(c, at=at) if not (c.delay or c.memory) else c for c in signals.controls]
+            signals = replace(signals, controls=tuple(free))
         own = {"schedule": asked, "operating_point": point_of(some[0]), "false_alarms": false_alarms}
         taken = choose_monitored(some, ways, **own, **said)
         criterion, additive = (taken.model.fit_summary[name] for name in ("criterion", "additive"))
@@ -279,7 +300,7 @@ def fit_many(
         return model if isinstance(alarm, str) else model.replace(alarm=alarm)
     note = f"learnt on {len(some)} of {plural(len(bags), 'recording')}, as many as memory is for"
     note *= len(some) < len(bags)
-    return monitored_like(taken, model, some, false_alarms, note).finished()
+    return _saying(monitored_like(taken, model, some, false_alarms, note).finished(), messages)
 
 
 def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> None:

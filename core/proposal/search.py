@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Search: fits compared on the same parts left out of each, which decide on knots, horizons and memories."""
+"""Search: fits compared on the same parts left out of each, which decide on knots, horizons, memories and ends."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.proposal.candidates import left
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.monitor_fit import CLEARLY
+from uncertain_lti.validation.monitor_fit import ALONE, CLEARLY, fit_monitored
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import by_unit, fitted_parts
 from uncertain_lti.validation.result import Validation
@@ -41,7 +43,10 @@ SLACK, EXCESS = 0.25, 0.005
 of all that is left out that may be outside beyond that, times as many as the jumps seen are smaller: what resembles no
 other recording is outside of any envelope, the more the narrower it is."""
 PAYS = 0.8
-"""Width of a horizon, or size of the jumps seen with a memory, over those without, from which on it is worth having."""
+"""Width of a horizon, or size of the jumps seen with a memory or with controls at the arrival, over those without, from
+which on it is worth having."""
+PIECE = 200
+"""Transitions of a piece of a larger recording."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +113,98 @@ def _what(left: Validation) -> dict[str, Any]:
         "left_out": f"{FOLDS}th part of the {left.what}s" if many else left.what,
         "units": FOLDS if many else left.units,
     }
+
+
+ENOUGH, COMPARED = 20, 20_000
+"""Transitions per signal from which on ends of steps are compared, and transitions on which they are."""
+ALIGNED = 0.5
+"""Least cosine between what a control does to a state from either end of a step, where it is no controller's answer."""
+
+
+def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, str]:
+    """At which end of a step the controls act, as far as nobody has said so, and why, in words, if not the departure.
+
+    The arrival is taken, or both ends, if the jumps seen on what was left out are smaller by PAYS (both only if clearly
+    smaller still). It is not tried where that may be a controller's answer: a command that follows from the state at
+    the arrival tells that state, and a fault that it follows hides. `options`: of `fit_monitored`.
+    """
+    if any(t.ends_given for t in transients):
+        return "departure", ""
+    few = thinned(transients, COMPARED)
+    try:
+        tried = {at: [t.controls_at(at) for t in few] for at in ("arrival", "both")}
+        options |= {"schedule": {}, "describe_data": False}
+        figures: dict[At, float] = {}
+        for at in _promising_ends(few, tried["arrival"]):
+            panel = fit_monitored(tried.get(at, few), **options).panel
+            if panel is None or len(panel.unlike) > ALONE * panel.units:
+                return "departure", ""
+            figures[at] = panel.figure
+    except UncertainLTIError:  # a control is a state, or too little is left
+        return "departure", ""
+    base, least = figures.get("departure", 0.0), min(figures.values(), default=0.0)
+    if least >= PAYS * base:
+        return "departure", ""
+    chosen = next(at for at, figure in figures.items() if CLEARLY * figure <= least)
+    where = "the arrival" if chosen == "arrival" else "both ends"
+    return chosen, (
+        f"controls are taken at {where} of each step: on left-out data the alarm sees jumps x "
+        f"{figures[chosen] / base:.2g} of those with controls at the departure; `at: departure` in the signals file "
+        f"keeps them there"
+    )
+
+
+def _promising_ends(transients: Sequence[Transient], arrival: Sequence[Transient]) -> list[At]:
+    """Ends with which least squares leaves clearly less, unless the controls may answer to the state at the arrival.
+
+    A command in force during the step moves the states as it does from the departure on, while a controller opposes
+    them: the effects of what is new in the command are compared.
+    """
+    at = [np.flatnonzero(now.usable & end.usable) for now, end in zip(transients, arrival, strict=True)]
+    X, U, after, V = (
+        np.concatenate([getattr(t, name)[k + later] for t, k in zip(runs, at, strict=True)])
+        for runs, name, later in ((transients, "x", 0), (transients, "u", 0), (transients, "x", 1), (arrival, "u", 0))
+    )
+    free = np.array([a != b for a, b in zip(transients[0].ends, arrival[0].ends, strict=True)], dtype=bool)
+    if not free.any() or len(X) < ENOUGH * (X.shape[1] + 2 * U.shape[1]):
+        return []
+    size = np.maximum(np.abs(U).max(axis=0, initial=0.0), 1e-300)
+    U, V, dX = U / size, (V / size)[:, free], after - X
+    move, fresh = left(np.hstack([X, U]), dX, V)  # what nothing before the arrival tells
+    own, change = left(X, U, dX)
+    early = fresh @ np.linalg.lstsq(own, change, rcond=None)[0][free]
+    late = fresh @ np.linalg.lstsq(fresh, move, rcond=None)[0]
+    rest = {"arrival": left(np.hstack([X, U[:, ~free], V]), dX)[0], "both": move - late}
+    floor = 1e-9 * np.ptp(after, axis=0) + 1e-300
+    ratio = {at: (_rms(values) + floor) / (_rms(move) + floor) for at, values in rest.items()}
+    gains = ratio["both"] < CLEARLY
+    aligned = (early * late).mean(axis=0) >= ALIGNED * _rms(early) * _rms(late)
+    if not aligned[gains].all():
+        return []
+    better = [at for at in get_args(At) if at in ratio and _geometric(ratio[at]) < CLEARLY]
+    return ["departure", *better] if better else []
+
+
+def _rms(values: Array) -> Array:
+    return np.asarray(np.sqrt((values**2).mean(axis=0)))
+
+
+def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
+    """Pieces of each recording, evenly spread, so that about this many transitions are left in total."""
+    share = most / max(sum(len(t) for t in transients), 1)
+    return list(transients) if share >= 1 else [_pieces(t, share) for t in transients]
+
+
+def _pieces(transient: Transient, share: float) -> Transient:
+    length = min(PIECE, max(20, int(share * len(transient))))
+    count = max(1, round(share * len(transient) / length))
+    if count * (length + 2) >= len(transient):
+        return transient
+    starts = np.linspace(0, len(transient) - length - 2, count).astype(int)
+    keep = np.unique((starts[:, None] + np.arange(length + 2)).ravel())
+    x = transient.x[keep]
+    x[np.isin(keep, starts + length + 1)] = np.nan  # no transition from one piece to the next
+    return transient.replace(keep, x=x)
 
 
 COUNTS = (2, 3, 5)

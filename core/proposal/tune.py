@@ -32,8 +32,8 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.proposal.public_fit import fit
-from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of, thinned
+from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 from uncertain_lti.signals.values import Additive
@@ -43,9 +43,7 @@ from uncertain_lti.validation.panel import worth
 PROMISING, SIGNALS = 0.9, 2
 """Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
 TRANSITIONS = 4000
-"""Transitions by which promising signals are found, about; of larger recordings pieces are taken, ..."""
-PIECE = 200
-"""... of so many transitions."""
+"""Transitions by which promising signals are found, about; of larger recordings pieces are taken."""
 FOLDS = 5
 """Times that something is left out to choose memories, at most."""
 FEWEST_STEPS, MOST_STEPS = 3, 0.05
@@ -103,7 +101,7 @@ def delays(transients: Sequence[Transient], best: Setting) -> Iterator[list[Sett
     low = np.min([np.nanmin(t.u, axis=0) for t in transients], axis=0)
     high = np.max([np.nanmax(t.u, axis=0) for t in transients], axis=0)
     moving = {name: 1 for j, name in enumerate(names) if name not in remembered and high[j] > low[j]}
-    if not moving:
+    if not moving or "arrival" in first.ends:
         return
     sets = [moving]
     try:
@@ -200,24 +198,6 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
                 if after.holds(before) and after.figure < PAYS * best.figure:
                     best, chosen = after, (*beside, *some)
     return chosen, best.width / before.width
-
-
-def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
-    """Pieces of each recording, evenly spread, so that about this many transitions are left in total."""
-    share = most / max(sum(len(t) for t in transients), 1)
-    return list(transients) if share >= 1 else [_pieces(t, share) for t in transients]
-
-
-def _pieces(transient: Transient, share: float) -> Transient:
-    length = min(PIECE, max(20, int(share * len(transient))))
-    count = max(1, round(share * len(transient) / length))
-    if count * (length + 2) >= len(transient):
-        return transient
-    starts = np.linspace(0, len(transient) - length - 2, count).astype(int)
-    keep = np.unique((starts[:, None] + np.arange(length + 2)).ravel())
-    x = transient.x[keep]
-    x[np.isin(keep, starts + length + 1)] = np.nan  # no transition from one piece to the next
-    return transient.replace(keep, x=x)
 
 
 def promise(transients: Sequence[Transient]) -> dict[str, float]:
@@ -335,6 +315,7 @@ def tune(
         raise FitError(f"budget is {budget}; give a positive number of seconds")
     until = time.monotonic() + budget
     model = fit(transients, false_alarms=false_alarms, groups=groups)
+    transients = [controls_as(t, model.signals.controls) for t in transients]
     alarm = model.fit_summary["alarm"]
     if "biases" not in alarm:
         raise FitError(f"fit alone cannot learn an alarm, so nothing can be compared: {alarm['not_learnt']}")

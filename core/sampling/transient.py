@@ -157,7 +157,7 @@ class Transient:
         u: ArrayLike,
         *,
         s: ArrayLike | None = None,
-        at: At | Mapping[str, At] = "departure",
+        at: At | Mapping[str, At] | None = None,
         name: str = "transient",
         signals: SignalMap | None = None,
         state_names: Sequence[str] | None = None,
@@ -207,7 +207,9 @@ class Transient:
         self.t_ns = t_ns
         if len(kept) < len(t_ns):
             self.t_ns, self.x, self.u, self.s = t_ns[kept], self.x[kept], self.u[kept], self.s[kept]
-        self._take_controls(_ends_of(at, self))
+        given = at is not None or (signals is not None and signals.ends_given)
+        self.ends_given = given or "arrival" in self.ends
+        self._take_controls(_ends_of(at or "departure", self))
         for array in (self.t_ns, self.x, self.u, self.s, self.segment):
             array.flags.writeable = False
 
@@ -249,6 +251,7 @@ class Transient:
             controls = [replace(c, at=end) for c, end in zip(self.signals.controls, wanted, strict=True)]
             changed.signals = replace(self.signals, controls=tuple(controls))
         changed._take_controls(wanted)
+        changed.ends_given = True
         changed.u.flags.writeable = False
         return changed
 
@@ -286,6 +289,7 @@ class Transient:
             for which in ("state_names", "control_names", "scheduling_names"):
                 arguments[which] = changes.get(which)
         changed = Transient(self.t_ns[part], x, u, **arguments)
+        changed.ends_given = self.ends_given
         if changed.signals is None:
             changed.ends = tuple(
                 dict(zip(self.control_names, self.ends, strict=True)).get(n, "departure") for n in changed.control_names

@@ -188,7 +188,9 @@ def map_arguments(data: Any, source: str, need_topics: bool) -> dict[str, Any]:
     top = expand(checked_mapping(data, source, {*readers}), source)
     top |= _with_memories(top)
     found = {key: readers[key](value, f"{source}: {key}") for key, value in top.items() if value is not None}
-    return {"states": (), "time": found.pop("topics", {}), "source": source, **found}
+    listed = (entry for entry in top.get("controls") or () if isinstance(entry, dict))
+    given = {"source": source, "ends_given": any(entry.get("at") is not None for entry in listed)}
+    return {"states": (), "time": found.pop("topics", {}), **given, **found}
 
 
 def _signals(need_topics: bool, data: Any, where: str) -> tuple[Signal, ...]:

@@ -94,6 +94,8 @@ class SignalMap:
         Which columns of tables are time and run; None to look for them.
     source : str, default "signals"
         What errors call the map: the path of its file.
+    ends_given : bool, default False
+        A person has said of some control at which end of a step it is taken, so `fit` leaves all of them there.
 
     Raises
     ------
@@ -116,6 +118,7 @@ class SignalMap:
     structure: Any = None
     table: TableLayout | None = None
     source: str = "signals"
+    ends_given: bool = field(default=False, compare=False)
 
     def __post_init__(self) -> None:
         for kind in LISTS:
