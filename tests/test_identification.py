@@ -149,7 +149,7 @@ def test_a_row_without_a_proof_by_multipliers_is_proven_by_the_simplex_method(mo
     """And by that alone: it is not solved a third time, in refined coordinates."""
     refined = []
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
-    monkeypatch.setattr(programmes, "linear_bound", lambda *_: -np.inf)
+    monkeypatch.setattr(programmes, "linear_bound", lambda *_: (-np.inf, np.empty(0)))
     monkeypatch.setattr(programmes.Programmes, "refine", refined.append)
     model = fit(drawn(small_plant(8), 3000, 8, noise=1e-3), "lp", additive="noise")
     assert not refined and 0.0 <= model.fit_summary["optimality_gap"] < 1e-7

@@ -12,9 +12,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
@@ -29,6 +30,7 @@ from uncertain_lti.identification.solvers import (
     dual_bound,
     linear_bound,
     solve_near,
+    solve_on_face,
     solve_qp,
 )
 
@@ -49,25 +51,34 @@ REGULARISATION = 1e-4
 """Weight of the squared widths relative to δ in (11), for a solver of strictly convex programmes.
 
 With a weight that is small enough, and a small one is, the minimum of the sum is that of δ, and among its optima that
-of the squared widths. Whether it was is seen from the optimum of δ alone, at the end. With the unknowns of many blocks
-it seldom is small enough, so they are left to the simplex method at once.
+of the squared widths. Whether it was is seen from the optimum of δ alone, at the end.
 """
 _ATTEMPTS = ((1.0, 1e-10), (10.0, 1e-8), (100.0, 1e-6))  # factor on the tie-break's weight, ridge of the centre
 _ROWS = {"quadratic": 2, "nominal": 2, "regularised": 3}
 """Rows of a sample in each kind of programme."""
 _LIKE = 1e4
 """Factor on the tie-break's weight with which an interior point looks for what is active."""
-INDEPENDENT = 1e-6
-"""Least relative singular value of the sizes of samples that leave the half-widths no choice."""
+_POSITIVE = 1e-9
+"""Relative multiplier of (11) above which it is none of rounding."""
 _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
-_HOLD = (1e-2, 1e-4, 1e-6)
-"""Shares of the largest weight with which the ties of (11) are held back to where they were, one after the other."""
-_ROOM = (1e-10, 1e-9, 1e-8)
-"""Violation, in scaled units, that they may leave, tried in turn: the set of optima can be as thin as that."""
 GOOD = 1e-7
 """Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
 coordinates of its residual."""
+
+
+@dataclass(frozen=True)
+class Face:
+    """Where the optima of (11) are: what is met with equality in all of them, and one of them.
+
+    `xi` (r + q,): that one; `bounds` (r + q,): which bounds of ξ; `samples` (3, K): which rows of the first K samples
+    of the pool, as of `Programmes.rows`; `asked`: which rows of what the structure asks.
+    """
+
+    xi: Array
+    bounds: NDArray[np.bool_]
+    samples: NDArray[np.bool_]
+    asked: NDArray[np.bool_]
 
 
 class Programmes:
@@ -80,8 +91,9 @@ class Programmes:
         self.row = row
         self._unit = 1.0  # of the δ that the nominal elements alone decide, in units of the row's limit
         self.allowed = 0.0  # δ that the ties may have, in the same units
-        self.exact = row.sums.visits.size > 1  # (11) by the simplex method
-        self.least = 0.0  # δ of (11) that it found, in the same units as the limit
+        self.exact = False  # (11) by the simplex method
+        self.least = 0.0  # δ of (11) that it or `nominal` found, in the same units as the limit
+        self._face: Face | None = None
         self.attempt: tuple[float, float] = _ATTEMPTS[0] if like is None else like.attempt
         self._last: dict[str, Answer] = {} if like is None else dict(like._last)  # to the last programme of a kind
         self._start_simplex_afresh()
@@ -229,29 +241,9 @@ class Programmes:
 
         limits = np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf)
         answer, solver = self._solve("nominal", objective, *self._distances(row.pool), *limits)
-        delta = answer[-1] * self._unit
+        delta, self._face = answer[-1] * self._unit, None
         row.store_limited(np.concatenate([answer[:-1], box * delta, [delta]]))
         return solver
-
-    @property
-    def decided(self) -> bool:
-        """The samples on which δ of `nominal` rests leave no other elements either.
-
-        In every optimum of (11) those of positive multiplier are at a bound and as wide as δ: as many as unknowns fix
-        the nominal elements, and, if their sizes are independent, the half-widths. Of many the next is so near that
-        one may be missing: what it leaves open is rounding.
-        """
-        row, last, sides = self.row, self._last.get("nominal"), self._sides("nominal")
-        missing = int(row.r + row.q >= MANY)
-        if last is None or last.active is None or sides is None:
-            return False
-        if np.count_nonzero(last.active) + missing <= row.r:
-            return False
-        psi = row.psi[row.pool[: sides.shape[1]][sides.any(axis=0)]]
-        if len(psi) + missing < row.q:
-            return False
-        values = np.linalg.svd(psi, compute_uv=False)
-        return bool(values[-1] > INDEPENDENT * values[0])
 
     def _set_unit(self) -> None:
         self._unit = float(np.median(self.row.width[self.row.pool] if len(self.row.pool) else self.row.width))
@@ -263,8 +255,7 @@ class Programmes:
         if box is not None and self._simplex is None:
             self._set_unit()
         G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
-        kinds = 3 if box is None else 2
-        number = kinds * np.tile(row.samples.index[row.pool], kinds) + np.repeat(np.arange(kinds), len(row.pool))
+        number = self._numbers()
         if self._simplex is None:  # of each sample the side that it is on, and its width
             self._simplex = self.minimax(nominal_alone=box is not None)
             theta, d = row.scaled()
@@ -294,7 +285,7 @@ class Programmes:
         if box is not None:
             delta = answer[-1] * self._unit
             answer = np.concatenate([answer[:-1], box * delta, [delta]])
-        self.least = float(answer[-1])
+        self.least, self._face = float(answer[-1]), None
         row.store_limited(answer)
         return "HiGHS simplex"
 
@@ -341,16 +332,13 @@ class Programmes:
         """A lower bound of δ, in units of scale, by multipliers; -inf where there are none."""
         row, bound = self.row, -np.inf
         assert row.limit is not None
-        for kind in ("nominal", "regularised") if "nominal" in self._last else ("regularised",):
-            size, unit = (row.r, self._unit) if kind == "nominal" else (row.r + row.q, 1.0)
-            G, h = self._with_asked(*(self._distances if kind == "nominal" else self.rows)(row.pool))
-            xi = np.append(np.concatenate(row.scaled())[:size], row.limit / unit)
-            cost = np.append(np.zeros(size), 1.0)
-            low, high = np.append(row.lower[:size], 0.0), np.append(row.upper[:size], np.inf)
-            for active in self._active_sets(kind, len(xi) + len(h)):
-                bound = max(bound, linear_bound(cost, G, h, low, high, xi, active) * unit)
-                if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
-                    return bound
+        G, h = self._with_asked(*self.rows(row.pool))
+        xi, cost = np.append(np.concatenate(row.scaled()), row.limit), np.append(np.zeros(row.r + row.q), 1.0)
+        low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
+        for active in self._active_sets("regularised", len(xi) + len(h)):
+            bound = max(bound, linear_bound(cost, G, h, low, high, xi, active)[0])
+            if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+                break
         return bound
 
     def minimax(self, nominal_alone: bool = False) -> Simplex:
@@ -485,43 +473,67 @@ class Programmes:
     def bounded(self) -> str:
         """Least squared widths, then the centre, among what is as good by (11), sought from an optimum of it.
 
-        The set is so thin that a solver finds its way only if the step is held back at first; and if it finds none,
-        containment gets some room, which the repair covers.
+        What has a price is met with equality in every optimum, so it stays as it is.
         """
-        row = self.row
-        assert row.limit is not None and self._simplex is not None
-        (point, box), pool = (self._simplex.solution(), self.box), row.pool
-        point = point[:-1] if box is None else np.concatenate([point[:-1], box * (point[-1] * self._unit)])
-        G, h = row.containment(pool)
-        width = row.width[pool]
-        unit = np.minimum(1.0, 1.0 / width)
-        rows = np.hstack([np.zeros((len(pool), row.r)), -(width * unit)[:, None] * row.psi[pool]])
-        limits = (width * row.half[pool] - self.allowed) * unit
-        G, h = self._with_asked(np.vstack([G, rows]), np.concatenate([h, limits]))
-        h = np.minimum(h - G @ point, 0.0)  # the point satisfies them, but for rounding
+        row, face = self.row, self.face()
+        G, h = self.rows(row.pool)
+        rows, limits = self._with_asked(G[:, :-1], h - G[:, -1] * self.allowed)
+        more = len(row.pool) - face.samples.shape[1]  # the pool grew since
+        tight = np.concatenate([face.bounds, np.pad(face.samples, ((0, 0), (0, more))).ravel(), face.asked])
         H, f = row.hessian(row.plain, row.plain_linear, BOUNDED_TIE_BREAK)
-        f, largest = f + H @ point, float(np.diagonal(H).max())
-        step, solver, contained = np.zeros(len(point)), "HiGHS simplex", 2 * len(pool)
-        around, active = h[:contained].copy(), None
-        for room in _ROOM:
-            h[:contained] -= room
-            for share in _HOLD:
-                try:
-                    programme = Programme(H, f, G, h, row.lower - point, row.upper - point).held(share * largest, step)
-                    feasible = _ROOM[-1] if row.refined else FEASIBLE
-                    answer = solve_near(programme, step, active, feasible, any_solver=True)
-                except FitError:
-                    break
-                left = max(0.0, -float((G[:contained] @ answer.xi - around).min(initial=0.0)))  # the repair covers it
-                d = (point + answer.xi)[row.r :]
-                if (width * (row.psi[pool] @ d + row.half[pool] + left)).max(initial=0.0) > (1.0 + GOOD) * self.allowed:
-                    break
-                step, solver, active = answer.xi, answer.solver, answer.active
-            if step.any():
-                break
+        limits = np.minimum(limits - rows @ face.xi, 0.0)  # the optimum satisfies them, but for rounding
+        programme = Programme(H, f + H @ face.xi, rows, limits, row.lower - face.xi, row.upper - face.xi)
         self.attempt = _ATTEMPTS[0]
-        row.store_limited(np.append(point + step, self.allowed))
-        return solver
+        try:
+            answer = solve_on_face(programme, tight)
+        except FitError:  # the ties stay as they are
+            row.store_limited(np.append(face.xi, self.allowed))
+            return "HiGHS simplex"
+        row.store_limited(np.append(face.xi + answer.xi, self.allowed))
+        return answer.solver
+
+    def face(self) -> Face:
+        """Where the optima of (11) are, on the working set of the last that was found.
+
+        Raises FitError where no multipliers prove that it was one.
+        """
+        if self._face is None:
+            row, box, count = self.row, self.box, len(self.row.pool)
+            xi, prices = self._priced() if self.exact else self._proven()
+            size = len(xi) - 1
+            tight = np.abs(prices) > _POSITIVE * np.abs(prices).max(initial=0.0)
+            bounds, samples, asked = np.split(tight, [size, len(tight) - len(row.asked)])
+            samples = samples.reshape(3 if box is None else 2, count)
+            if box is not None:  # a sample that is as far off as it may be is as wide as it may be
+                xi = np.concatenate([xi[:-1], box * (xi[-1] * self._unit), xi[-1:]])
+                bounds, samples = np.pad(bounds, (0, row.q)), np.vstack([samples, samples.any(axis=0)])
+            self._face = Face(xi[:-1], bounds, samples, asked)
+        return self._face
+
+    def _priced(self) -> tuple[Array, Array]:
+        """[ξ δ] of the simplex method, and its prices of [bounds of ξ; rows of the pool; what is asked]."""
+        assert self._simplex is not None
+        duals, number, asked = self._simplex.duals(), self._numbers(), len(self.row.asked)
+        order, prices = np.argsort(number), np.zeros(len(number))
+        prices[order[np.searchsorted(number, self._known, sorter=order)]] = duals[asked:]
+        return self._simplex.solution(), np.concatenate([self._simplex.reduced_costs()[:-1], prices, duals[:asked]])
+
+    def _proven(self) -> tuple[Array, Array]:
+        """The same of `nominal`, by the multipliers that prove its δ, which becomes `least`."""
+        row, xi = self.row, self._last["nominal"].xi
+        G, h = self._with_asked(*self._distances(row.pool))
+        limits = np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf)
+        for active in self._active_sets("nominal", len(xi) + len(h)):
+            bound, prices = linear_bound(np.eye(len(xi))[-1], G, h, *limits, xi, active)
+            if xi[-1] <= (1.0 + WIDTH_SLACK) * bound:
+                self.least = bound * self._unit
+                return xi, np.delete(prices, len(xi) - 1)
+        raise FitError("no multipliers prove the least largest width")
+
+    def _numbers(self) -> Index:
+        """A number for each row of the samples of the pool, by which the simplex method's are known."""
+        index, kinds = self.row.samples.index[self.row.pool], 3 if self.box is None else 2
+        return np.asarray(kinds * np.tile(index, kinds) + np.repeat(np.arange(kinds), len(index)))
 
     def polish(self) -> None:
         """Solve for the centre again, with the half-widths as they are: the tie-break on its own.

@@ -38,6 +38,8 @@ _NEAR = 2
 """Rows per unknown that a programme begins with."""
 MANY = 60
 """Unknowns from which on an interior point finds what is active sooner than an active-set method."""
+_ALONG, _FIXED = 1e-6, 1e-9
+"""Relative singular value below which rows leave a direction, and relative size of a row that does not see it."""
 _ANEW, _NEAR_INSIDE = 0.02, 3
 """Then: violated rows per unknown from which on it begins anew, and rows per unknown that it begins with."""
 
@@ -234,7 +236,7 @@ def dual_bound(of: Programme, xi: Array, active: Sense | None = None) -> float:
     from scipy.optimize import nnls
 
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(of.H), 1e-300))  # as in `solve_qp`
-    C, limits = _binding(*of[2:], xi, active)
+    C, limits, _ = _binding(*of[2:], xi, active)
     best = -np.inf
     try:
         L = np.linalg.cholesky(of.H * np.outer(s, s))
@@ -255,29 +257,61 @@ def dual_bound(of: Programme, xi: Array, active: Sense | None = None) -> float:
 
 def linear_bound(
     cost: Array, G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None = None
-) -> float:
-    """As `dual_bound`, of the linear programme minimise costᵀξ subject to G ξ >= h, lower <= ξ <= upper."""
+) -> tuple[float, Array]:
+    """As `dual_bound`, of the linear programme minimise costᵀξ subject to G ξ >= h, lower <= ξ <= upper.
+
+    Returns also the multipliers that prove it, (v + K,) of [bounds of ξ; rows of G].
+    """
     from scipy.optimize import nnls
 
-    C, limits = _binding(G, h, lower, upper, xi, active)
-    unit = np.maximum(np.linalg.norm(C, axis=0), 1e-300)
+    size = len(xi)
+    C, limits, which = _binding(G, h, lower, upper, xi, active)
+    unit, prices = np.maximum(np.linalg.norm(C, axis=0), 1e-300), np.zeros(size + len(h))
     try:
         multiplier = nnls(C / unit, cost)[0] / unit
     except RuntimeError:  # too many iterations
-        return -np.inf
+        return -np.inf, prices
+    np.add.at(prices, np.where(which < size, which, which - size), multiplier)
     left = float(np.abs(C @ multiplier - cost).sum())
-    return float(limits @ multiplier) if left <= _SLIGHT else -np.inf
+    return float(limits @ multiplier) if left <= _SLIGHT else -np.inf, prices
 
 
-def _binding(G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None) -> tuple[Array, Array]:
-    """Columns (v, k) and limits (k,) of what is active, as lower bounds; by the slack at ξ where it is not known."""
+def _binding(
+    G: Array, h: Array, lower: Array, upper: Array, xi: Array, active: Sense | None
+) -> tuple[Array, Array, Index]:
+    """Columns (v, k) and limits (k,) of what is active, as lower bounds; by the slack at ξ where it is not known.
+
+    Returns also which they are, (k,) of [lower bounds; upper bounds; rows of G].
+    """
     size = len(xi)
     rows, limits = np.vstack([np.eye(size), -np.eye(size), G]), np.concatenate([lower, -upper, h])
     if active is None:
         near = rows @ xi - limits <= 1e-7 * np.maximum(np.abs(rows).max(axis=1), 1.0)
     else:
         near = np.concatenate([active[:size] == 3, active[:size] == 1, active[size:] > 0])
-    return rows[near].T, limits[near]
+    return rows[near].T, limits[near], np.flatnonzero(near)
+
+
+def solve_on_face(of: Programme, tight: NDArray[np.bool_]) -> Answer:
+    """Minimise a programme, which a step of 0 does not violate, along what leaves some bounds and rows as they are.
+
+    `tight` (v + K,): of [bounds of ξ; rows of G] those. What is left of the others is no longer thin, so that DAQP,
+    whose tolerance is one in the metric of H, does not have to find its way between two sides that all but touch.
+    """
+    rows, s = np.vstack([np.eye(len(of.f)), of.G]), 1.0 / np.sqrt(np.maximum(np.diagonal(of.H), 1e-300))
+    unit = np.maximum(np.abs(rows * s).max(axis=1), 1e-300)
+    _, values, right = np.linalg.svd((rows * s / unit[:, None])[tight])
+    along = s[:, None] * right[int((values > _ALONG * values.max(initial=0.0)).sum()) :].T
+    if not along.shape[1]:
+        return Answer(np.zeros(len(s)), "HiGHS simplex", None)
+    low, high = (np.flatnonzero(np.isfinite(bound)) for bound in (of.lower, of.upper))
+    G = np.vstack([of.G, np.eye(len(s))[low], -np.eye(len(s))[high]]) @ along
+    h = np.concatenate([of.h, of.lower[low], -of.upper[high]])
+    moves = np.abs(G).max(axis=1) > _FIXED * np.concatenate([unit[len(s) :], unit[low], unit[high]])
+    free = np.full(along.shape[1], np.inf)
+    programme = Programme(along.T @ of.H @ along, along.T @ of.f, G[moves], h[moves], -free, free)
+    answer = solve_near(programme, np.zeros(len(free)), any_solver=True)
+    return Answer(along @ answer.xi, answer.solver, None)
 
 
 _ITERATIONS = 50
@@ -346,6 +380,10 @@ class Simplex:
         Returns (rows,): one per row.
         """
         return np.asarray(self._highs.getSolution().row_dual, dtype=np.float64)
+
+    def reduced_costs(self) -> Array:
+        """As `duals`, of the bounds of ξ, (variables,)."""
+        return np.asarray(self._highs.getSolution().col_dual, dtype=np.float64)
 
     def drop(self, rows: Index) -> None:
         """Take rows out that the optimum found last does not rest on; it stays, and so does what it starts from.

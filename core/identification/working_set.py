@@ -271,11 +271,14 @@ class WorkingSet:
 
         def settle(row: Row) -> None:
             own = self.programmes[row.i]
+            boxed = row.unknown and own.box is not None
+            own.exact |= not boxed and row.columns.count > 1  # of many blocks the weight is seldom small enough
             if not own.exact:
                 try:
-                    if row.unknown and own.box is not None:
+                    if boxed:
                         self._settle(own, Programmes.nominal)
-                    if not own.decided:
+                        own.face()  # or it was no optimum
+                    else:
                         self._settle(own, Programmes.regularised, polish=True)
                 except FitError:
                     own.exact = True
@@ -286,7 +289,7 @@ class WorkingSet:
                 row.limit = float((row.width * row.half).max(initial=0.0))
             deltas[row.i] = row.limit * row.limit_unit
             own.allowed = row.limit = row.limit * (1.0 + WIDTH_SLACK)  # room for the ties
-            if own.exact:
+            if own.exact or boxed:
                 self._settle(own, Programmes.bounded, polish=True)
 
         self._solve(settle)
@@ -318,7 +321,7 @@ class WorkingSet:
     def _least_width(self, row: Row) -> float:
         """A lower bound of δ."""
         own = self.programmes[row.i]
-        return (own.least if own.exact else own.least_width()) * row.limit_unit
+        return (own.least if own.exact or own.box is not None else own.least_width()) * row.limit_unit
 
     def _above(self, row: Row, bounds: Array) -> float:
         """How far the largest width of a row will be above its bound at most, relative."""
