@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
@@ -180,9 +180,11 @@ def list_of(value: Any) -> list[Any]:
 
 
 def finite_data(value: Any) -> Any:
-    """Replace numbers that JSON has no text for."""
-    if isinstance(value, dict):
-        return {key: finite_data(v) for key, v in value.items()}
+    """What JSON has a text for: numpy's as Python's, and None for a number that is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): finite_data(v) for key, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [finite_data(v) for v in value]
+    if hasattr(value, "tolist"):
+        return finite_data(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -19,12 +19,10 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
-import numpy as np
-
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import kind_of, written
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import finite_data, plural
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Residuals, Run
@@ -80,15 +78,15 @@ def structure(model: Any) -> dict[str, Any]:
         "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
         "run": _dict(model.run),
         "domain": {name: [v if math.isfinite(v) else None for v in limits] for name, limits in box.items()}
-        | _known({"measure": _dict(domain.measure), "step_max": _plain(domain.step_max)}, ("measure", "step_max")),
+        | _known({"measure": _dict(domain.measure), "step_max": finite_data(domain.step_max)}, ("measure", "step_max")),
         "residuals": _dict(model.residuals),
         "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
         if model.alarm == (rule,)
         else {"rules": [rule.to_dict() for rule in model.alarm]},
         "frozen": _dict(model.repeats),
         "signatures": [signature.to_dict() for signature in model.signatures] or None,
-        "fit": _plain({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
-        "validation": _plain(model.validation),
+        "fit": finite_data({_IN_FILES.get(key, key): value for key, value in model.fit_summary.items()}),
+        "validation": finite_data(model.validation),
         "memory": model.memory or None,
     }
     whole = _known(whole, whole)
@@ -309,21 +307,6 @@ def _limits(value: Any, name: str, size: int) -> Array:
     limits = checked([0.0 if v is None else v for v in value], name, (size,))
     limits[[v is None for v in value]] = without
     return limits
-
-
-def _plain(value: Any) -> Any:
-    """numpy and not finite numbers to what JSON has."""
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [_plain(v) for v in value]
-    if isinstance(value, (np.integer, np.bool_)):
-        return value.item()
-    if isinstance(value, (float, np.floating)):
-        return float(value) if math.isfinite(value) else None
-    return value
 
 
 def _layout(data: Mapping[str, Any]) -> str:
