@@ -45,6 +45,10 @@ def test_the_end_at_which_a_command_acts_is_found(share: float, found: str, gain
     assert at == found and bool(why) == (at != "departure")
 
 
+def test_two_recordings_say_too_little_of_it() -> None:
+    assert choose_ends([plant(run, 1.0) for run in range(2)], **WAY) == ("departure", "")
+
+
 def test_a_controllers_answer_to_the_arrival_is_not_taken() -> None:
     """With it the bounds of a reading that is mostly noise would be narrower."""
     runs = [plant(run, 0.0, 1.5, 0.5) for run in range(4)]
