@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -483,14 +484,11 @@ class Programmes:
         H, f = row.hessian(row.plain, row.plain_linear, BOUNDED_TIE_BREAK)
         limits = np.minimum(limits - rows @ face.xi, 0.0)  # the optimum satisfies them, but for rounding
         programme = Programme(H, f + H @ face.xi, rows, limits, row.lower - face.xi, row.upper - face.xi)
-        self.attempt = _ATTEMPTS[0]
-        try:
-            answer = solve_on_face(programme, tight)
-        except FitError:  # the ties stay as they are
-            row.store_limited(np.append(face.xi, self.allowed))
-            return "HiGHS simplex"
-        row.store_limited(np.append(face.xi + answer.xi, self.allowed))
-        return answer.solver
+        self.attempt, step, solver = _ATTEMPTS[0], np.zeros(len(face.xi)), ""
+        with suppress(FitError):  # or the ties stay as they are
+            step, solver = solve_on_face(programme, tight)
+        row.store_limited(np.append(face.xi + step, self.allowed))
+        return solver or ("HiGHS simplex" if self.exact else self._last["nominal"].solver)
 
     def face(self) -> Face:
         """Where the optima of (11) are, on the working set of the last that was found.

@@ -292,18 +292,19 @@ def _binding(
     return rows[near].T, limits[near], np.flatnonzero(near)
 
 
-def solve_on_face(of: Programme, tight: NDArray[np.bool_]) -> Answer:
+def solve_on_face(of: Programme, tight: NDArray[np.bool_]) -> tuple[Array, str]:
     """Minimise a programme, which a step of 0 does not violate, along what leaves some bounds and rows as they are.
 
-    `tight` (v + K,): of [bounds of ξ; rows of G] those. What is left of the others is no longer thin, so that DAQP,
-    whose tolerance is one in the metric of H, does not have to find its way between two sides that all but touch.
+    What is left of the others is no longer thin, so that DAQP, whose tolerance is one in the metric of H, does not have
+    to find its way between two sides that all but touch. `tight` (v + K,): of [bounds of ξ; rows of G] those. Returns
+    ξ (v,) and the solver, "" where nothing is left to solve.
     """
     rows, s = np.vstack([np.eye(len(of.f)), of.G]), 1.0 / np.sqrt(np.maximum(np.diagonal(of.H), 1e-300))
     unit = np.maximum(np.abs(rows * s).max(axis=1), 1e-300)
     _, values, right = np.linalg.svd((rows * s / unit[:, None])[tight])
     along = s[:, None] * right[int((values > _ALONG * values.max(initial=0.0)).sum()) :].T
     if not along.shape[1]:
-        return Answer(np.zeros(len(s)), "HiGHS simplex", None)
+        return np.zeros(len(s)), ""
     low, high = (np.flatnonzero(np.isfinite(bound)) for bound in (of.lower, of.upper))
     G = np.vstack([of.G, np.eye(len(s))[low], -np.eye(len(s))[high]]) @ along
     h = np.concatenate([of.h, of.lower[low], -of.upper[high]])
@@ -311,7 +312,7 @@ def solve_on_face(of: Programme, tight: NDArray[np.bool_]) -> Answer:
     free = np.full(along.shape[1], np.inf)
     programme = Programme(along.T @ of.H @ along, along.T @ of.f, G[moves], h[moves], -free, free)
     answer = solve_near(programme, np.zeros(len(free)), any_solver=True)
-    return Answer(along @ answer.xi, answer.solver, None)
+    return along @ answer.xi, answer.solver
 
 
 _ITERATIONS = 50
