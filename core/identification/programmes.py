@@ -256,7 +256,8 @@ class Programmes:
         if box is not None and self._simplex is None:
             self._set_unit()
         G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
-        number = self._numbers()
+        kinds = 3 if box is None else 2
+        number = self._numbers(kinds)
         if self._simplex is None:  # of each sample the side that it is on, and its width
             self._simplex = self.minimax(nominal_alone=box is not None)
             theta, d = row.scaled()
@@ -497,21 +498,22 @@ class Programmes:
         """
         if self._face is None:
             row, box, count = self.row, self.box, len(self.row.pool)
-            xi, prices = self._priced() if self.exact else self._proven()
+            kinds = 3 if box is None else 2
+            xi, prices = self._priced(kinds) if self.exact else self._proven()
             size = len(xi) - 1
             tight = np.abs(prices) > _POSITIVE * np.abs(prices).max(initial=0.0)
             bounds, samples, asked = np.split(tight, [size, len(tight) - len(row.asked)])
-            samples = samples.reshape(3 if box is None else 2, count)
+            samples = samples.reshape(kinds, count)
             if box is not None:  # a sample that is as far off as it may be is as wide as it may be
                 xi = np.concatenate([xi[:-1], box * (xi[-1] * self._unit), xi[-1:]])
                 bounds, samples = np.pad(bounds, (0, row.q)), np.vstack([samples, samples.any(axis=0)])
             self._face = Face(xi[:-1], bounds, samples, asked)
         return self._face
 
-    def _priced(self) -> tuple[Array, Array]:
+    def _priced(self, kinds: int) -> tuple[Array, Array]:
         """[ξ δ] of the simplex method, and its prices of [bounds of ξ; rows of the pool; what is asked]."""
         assert self._simplex is not None
-        duals, number, asked = self._simplex.duals(), self._numbers(), len(self.row.asked)
+        duals, number, asked = self._simplex.duals(), self._numbers(kinds), len(self.row.asked)
         order, prices = np.argsort(number), np.zeros(len(number))
         prices[order[np.searchsorted(number, self._known, sorter=order)]] = duals[asked:]
         return self._simplex.solution(), np.concatenate([self._simplex.reduced_costs()[:-1], prices, duals[:asked]])
@@ -528,9 +530,9 @@ class Programmes:
                 return xi, np.delete(prices, len(xi) - 1)
         raise FitError("no multipliers prove the least largest width")
 
-    def _numbers(self) -> Index:
+    def _numbers(self, kinds: int) -> Index:
         """A number for each row of the samples of the pool, by which the simplex method's are known."""
-        index, kinds = self.row.samples.index[self.row.pool], 3 if self.box is None else 2
+        index = self.row.samples.index[self.row.pool]
         return np.asarray(kinds * np.tile(index, kinds) + np.repeat(np.arange(kinds), len(index)))
 
     def polish(self) -> None:

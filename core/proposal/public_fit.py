@@ -288,8 +288,8 @@ def fit_many(
         at, why = choose_ends(some, criterion=criterion or "lp", additive=additive or "noise")
         if why:
             some, messages = [t.controls_at(at) for t in some], [why]
-            free = [replace(c, at=at) if not (c.delay or c.memory) else c for c in signals.controls]
-            signals = replace(signals, controls=tuple(free))
+            assert some[0].signals is not None
+            signals = replace(signals, controls=some[0].signals.controls)
         own = {"schedule": asked, "operating_point": point_of(some[0]), "false_alarms": false_alarms}
         taken = choose_monitored(some, ways, **own, **said)
         criterion, additive = (taken.model.fit_summary[name] for name in ("criterion", "additive"))
