@@ -21,10 +21,11 @@ import pytest
 from bag_writer import Topic, ramp, write
 from engine_bag import SIGNALS, engine_bag
 
-from uncertain_lti import EnvelopeMonitor, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import STATE_TOPIC
+from uncertain_lti.reports.check import check_data
 
 
 @pytest.fixture
@@ -58,6 +59,17 @@ def test_check_tells_when_and_how_long(folder, capsys):
     # an alarm rule of the command line in place of the model's: 250 of 250 never comes true
     rule = ["--violations", "250", "--window", "250"]
     assert main(["check", str(folder / "m.model.json"), str(bad), *rule]) == 0
+
+
+@pytest.mark.parametrize("after", [1, 6])
+def test_an_alarm_lasts_no_longer_than_the_pass_that_raised_it(after):
+    """A loop begins anew, with as many samples after it."""
+    empty = np.empty((1, 0))
+    model = UncertainLTI([[0.0]], empty, [[0.0]], empty, v=[1.0])
+    t, x = [0.0, 1.0, 2.0, 3.0, 4.0, 5.0], [0.0, 0.0, 0.0, 9.0, 18.0, 27.0]
+    run = Transient(np.array([*t, *t[:after]]), [*x, *x[:after]], [], max_gap=1.5)
+    first, *_ = check_data(model, EnvelopeMonitor(model).check(run))["alarms"]
+    assert (first["t"], first["seconds"]) == (3.0, 2.0)
 
 
 def test_commands_say_what_the_library_says(folder, capsys):

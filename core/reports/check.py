@@ -38,6 +38,7 @@ from uncertain_lti.model.domain import jump_words, jumps, outside_in_words
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
@@ -349,8 +350,11 @@ def _instant(transient: Transient, k: int) -> dict[str, Any]:
 
 
 def _span(transient: Transient, start: int, stop: int) -> dict[str, Any]:
-    """The first of some samples, and the time to the last of them, s."""
-    return {**_instant(transient, start), "seconds": float(transient.t_ns[stop - 1] - transient.t_ns[start]) * 1e-9}
+    """The first of some samples, and the time to the last of them, s; steps back to a further pass take none."""
+    t_ns = np.append(transient.t_ns[start:stop], transient.t_ns[min(stop, len(transient) - 1)])
+    first = np.flatnonzero(back_and_restarts(t_ns)[1]) - 1
+    passed = t_ns[-2] - t_ns[0] + (t_ns[first - 1] - t_ns[first]).sum()
+    return {**_instant(transient, start), "seconds": float(passed) * 1e-9}
 
 
 # --- regimes -----------------------------------------------------------------------------------------------------
