@@ -22,7 +22,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.kernel.arithmetic import Judge
@@ -142,23 +141,6 @@ def test_the_oldest_format_that_holds_a_model_is_written(tmp_path: Path) -> None
     older = UncertainLTI.from_dict({**data, "format": "uncertain-lti/1"})
     assert older.domain.measure is None and older.to_dict()["format"] == "uncertain-lti/1"
     assert UncertainLTI.from_dict(data).domain.measure is None, "every new key is optional"
-
-
-@pytest.mark.parametrize(
-    ("change", "named"),
-    [
-        ({"cells": True}, "domain.measure.cells"),
-        ({"cells": 10**9}, "domain.measure.cells"),
-        ({"cells": 5}, "domain.measure.occupied"),
-        ({"occupied": "?"}, "domain.measure.occupied"),
-        ({"more": 1}, "domain.measure"),
-    ],
-)
-def test_a_measure_that_is_none_is_refused_by_name(tmp_path: Path, change: dict[str, Any], named: str) -> None:
-    _, data = a_file(tmp_path)
-    data["domain"]["measure"] |= change
-    with pytest.raises(ModelError, match=named):
-        UncertainLTI.from_dict(data)
 
 
 def test_far_beyond_is_more_than_a_tenth_of_the_range() -> None:

@@ -22,7 +22,6 @@ from test_live import CONTROL, STATE, joint_state, vector
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.base.arrays import LARGEST
-from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
@@ -100,23 +99,6 @@ def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI, tmp_
     few = UncertainLTI.from_dict(data).repeats
     assert few is not None and few.to_dict() == data["frozen"]
     assert few is not None and few.longest_repeat_s.tolist() == [0.5, 0.25] and np.isinf(few.largest_run).all()
-
-
-@pytest.mark.parametrize(
-    ("frozen", "named"),
-    [
-        ({"longest_repeat_s": [1.0]}, "frozen"),
-        ({"longest_repeat_s": [1.0, -1.0]}, "longest_repeat_s"),
-        ({"longest_repeat_s": [1.0, True]}, "longest_repeat_s"),
-        ({"longest_repeat_s": [1.0, 1.0], "largest_run": [1.0]}, "largest_run"),
-        ({"longest_repeat_s": [1.0, 1.0], "more": 1}, "frozen.more"),
-        ({"largest_run": [1.0, 1.0]}, "longest_repeat_s"),
-        ([1.0, 1.0], "frozen"),
-    ],
-)
-def test_a_wrong_section_is_refused_by_name(model: UncertainLTI, frozen: Any, named: str) -> None:
-    with pytest.raises(ModelError, match=named):
-        UncertainLTI.from_dict({**model.to_dict(), "frozen": frozen})
 
 
 def test_of_two_that_which_calls_fewer_states_frozen_counts() -> None:

@@ -15,6 +15,7 @@ import json
 import math
 import os
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -23,13 +24,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from perturbed import armed_model
 from test_signals import damaged
 
 from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
+from uncertain_lti.model.horizon import MOST_STEPS
 from uncertain_lti.model.model_file import FORMATS
+from uncertain_lti.model.signature import Signature
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
@@ -419,15 +423,27 @@ def test_the_base_of_the_damaged_files_is_whole(tmp_path: Path) -> None:
     assert model.to_dict() == base()
 
 
-def put(place: str, value: Any) -> Any:
-    """The base with one thing at `a.b.0` replaced; `...` takes it away."""
-    data = base()
+@cache
+def armed_text() -> str:
+    model = armed_model(np.random.default_rng(0), everything=True)
+    return json.dumps(model.replace(signatures=[Signature("a fault", [1], np.ones((1, 3, 3)) / 3)]).to_dict())
+
+
+def armed() -> dict[str, Any]:
+    """A whole file of a model of three states: a schedule, horizons, rules, repeats, signatures."""
+    return dict(json.loads(armed_text()))
+
+
+def put(data: dict[str, Any], place: str, value: Any) -> Any:
+    """The data with one thing at `a.b.0` replaced; `...` takes it away."""
     inner: Any = data
     *way, last = [int(p) if p.isdigit() else p for p in place.split(".")]
     for step in way:
         inner = inner[step]
     if value is ...:
         del inner[last]
+    elif isinstance(inner, list) and last == len(inner):
+        inner.append(value)
     else:
         inner[last] = value
     return data
@@ -480,11 +496,112 @@ def put(place: str, value: Any) -> Any:
     ],
 )
 def test_a_damaged_file_is_refused_by_file_and_field(place: str, value: Any, words: str, tmp_path: Path) -> None:
-    path = write(tmp_path, put(place, value))
+    refused(write(tmp_path, put(base(), place, value)), words)
+
+
+def refused(path: Path, words: str) -> None:
     with pytest.raises(ModelError, match=words) as caught:
         UncertainLTI.load(path)
     sentence = str(caught.value)
     assert sentence.startswith(str(path)) and len(sentence.splitlines()) == 1 and len(sentence) < 500
+
+
+ENERGY = {"kind": "energy", "window_s": 1.0, "threshold": 0.5}
+RULES: list[tuple[Any, str]] = [
+    (7, "must be a list"),
+    ([7], r"alarm.rules\[0\]' is not an object"),
+    ([{"kind": "chi2", "window_s": 1.0}], r"rules\[0\].threshold' is missing"),
+    ([{"kind": "containment", "violations": 1, "window": 1, "margin": "x"}], r"rules\[0\]': margin is 'x'"),
+    ([{"kind": "containment", "violations": 2, "window": 1, "margin": 1}], r"rules\[0\].*violations is 2 of window 1"),
+    *(
+        ([ENERGY | change], rf"alarm.rules\[0\].*{words}")
+        for change, words in (
+            ({"kind": "median"}, "kind.* is 'median'; it must be one of containment, energy"),
+            ({"window_s": -1}, "window_s of energy is -1; it must be a number of seconds, 0 for one verdict"),
+            ({"window_s": True}, "window_s of energy is True"),
+            ({"threshold": -1}, "threshold of energy is -1"),
+            ({"threshold": [1.0, None]}, "threshold of energy"),
+            ({"horizon": 1.5}, r"horizon is 1.5; it must be a whole number"),
+            ({"kind": "cusum", "window_s": 0}, "window_s of cusum is 0; it must be a positive number"),
+            ({"kind": "cusum", "allowance": -1}, "allowance is -1"),
+            ({"kind": "chi2", "threshold": [1.0, 1.0]}, "chi2 is one number for all states"),
+        )
+    ),
+    ([ENERGY | {"allowance": 0.1}], r"unknown field 'alarm.rules\[0\].allowance'"),
+]
+RESIDUALS: list[tuple[str, Any, str]] = [
+    ("", [], "residuals' is not an object"),
+    (".covariance", ..., "residuals.covariance' is missing"),
+    (".odd", 1, "unknown field '.*residuals.odd'"),
+    (".relative", 1, "relative' is 1; it must be true"),
+    ("", {"mean": [0.0], "covariance": [[1.0]]}, "residuals of 1 state for 3 states"),
+    (".covariance.0.1", 1e9, "not symmetric"),
+    (".covariance", [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "negative variance"),
+    (".covariance", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -1e-10]], "negative variance"),
+    (".covariance", [[1.0, 0.0, 0.0]], "has shape"),
+]
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "words"),
+    [
+        ("blocks.0", ..., "blocks"),
+        ("blocks.1.A", ..., r"blocks\[1\].A"),
+        ("blocks.1.v.0", -1.0, r"blocks\[1\].v"),
+        ("blocks.1.tied_to", 99, "tied_to"),
+        ("blocks.1.odd", 7, "odd"),
+        ("A", [[1.0]], "unknown field 'A'"),
+        ("schedule.0.signal", "torque", "torque"),
+        ("format", "uncertain-lti/1", "'A' is missing"),
+        ("scheduling.1", {"name": "w", "topic": "", "field": "w"}, "schedules nothing"),
+        ("horizons.0.steps", True, "whole number, 2 to"),
+        ("horizons.0.steps", MOST_STEPS + 1, "whole number"),
+        ("horizons.0.steps", 40, "two have as many steps"),
+        ("horizons.0.widths", "wide", "growing or constant"),
+        ("horizons.0.widths", "constant", "dA, dB or dc is not 0"),
+        ("horizons.0.blocks", [], r"horizons\[0\].blocks"),
+        ("horizons.0.odd", 1, "odd"),
+        ("horizons.0.blocks.0.A", [[1.0]], r"horizons\[0\].blocks\[0\].A"),
+        ("horizons.0.blocks.0.v.1", -1.0, "negative half-width"),
+        ("run", [], "'run' is not an object"),
+        ("run.blocks", [], "a list of 6 blocks"),
+        ("run.blocks.0.c", ..., r"'run.blocks\[0\].c' is missing; fit the model"),
+        ("run.blocks.0.A.1.1", INF, "not finite"),
+        ("frozen", [1.0, 1.0], "frozen"),
+        ("frozen.longest_repeat_s", [1.0], "frozen"),
+        ("frozen.longest_repeat_s.1", -1.0, "longest_repeat_s"),
+        ("frozen.longest_repeat_s.1", True, "longest_repeat_s"),
+        ("frozen.largest_run", [1.0], "largest_run"),
+        ("frozen.more", 1, "frozen.more"),
+        ("frozen.longest_repeat_s", ..., "longest_repeat_s"),
+        ("signatures.0.label", "", "label"),
+        ("signatures.0.steps", [2, 1], "steps"),
+        ("signatures.0.steps", [True], "whole numbers"),
+        ("signatures.0.moments", [[[1.0]]], "states"),
+        ("signatures.0.recordings", 0, "whole numbers"),
+        ("signatures.0.more", 1, "must have"),
+        ("signatures", armed()["signatures"] * 2, "different labels"),
+        ("domain.measure.cells", True, "domain.measure.cells"),
+        ("domain.measure.cells", 10**9, "domain.measure.cells"),
+        ("domain.measure.cells", 5, "domain.measure.occupied"),
+        ("domain.measure.occupied", "?", "domain.measure.occupied"),
+        ("domain.measure.more", 1, "domain.measure"),
+        *(("alarm.rules", rules, words) for rules, words in RULES),
+        *((f"residuals{place}", value, words) for place, value, words in RESIDUALS),
+        *((f"horizons.0.residuals{place}", value, f"(?=.*horizon).*{words}") for place, value, words in RESIDUALS),
+    ],
+)
+def test_a_damaged_file_with_everything_armed_is_refused_by_file_and_field(
+    place: str, value: Any, words: str, tmp_path: Path
+) -> None:
+    refused(write(tmp_path, put(armed(), place, value)), words)
+
+
+def test_the_file_with_everything_armed_is_whole(tmp_path: Path) -> None:
+    data = armed()
+    assert UncertainLTI.load(write(tmp_path, data)).to_dict() == data
+    data["alarm"] = {"rules": [ENERGY]}
+    assert UncertainLTI.from_dict(data).alarm == (StatisticRule("energy", 1.0, 0.5),)
 
 
 @pytest.mark.parametrize(
@@ -503,9 +620,7 @@ def test_a_damaged_file_is_refused_by_file_and_field(place: str, value: Any, wor
 def test_a_file_that_is_no_model_is_refused(content: bytes, words: str, tmp_path: Path) -> None:
     path = tmp_path / "no.model.json"
     path.write_bytes(content)
-    with pytest.raises(ModelError, match=words) as caught:
-        UncertainLTI.load(path)
-    assert str(caught.value).startswith(str(path)) and len(str(caught.value).splitlines()) == 1
+    refused(path, words)
 
 
 def test_a_file_that_is_not_there_or_far_too_large(tmp_path: Path) -> None:

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -166,27 +165,6 @@ def test_a_free_run_follows_the_schedule() -> None:
         at = model.at(speed=3.0 + 2.0 * float(x[0]))
         x = x + 0.1 * (at.A @ x + at.c)
         np.testing.assert_allclose(run[k + 1], x, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    ("change", "words"),
-    [
-        (lambda d: d["blocks"].pop(), "blocks"),
-        (lambda d: d["blocks"][1].pop("A"), r"blocks\[1\].A"),
-        (lambda d: d["blocks"][1].update(v=[-1.0, 0.0]), r"blocks\[1\].v"),
-        (lambda d: d["blocks"][1].update(tied_to=7), "tied_to"),
-        (lambda d: d["blocks"][1].update(odd=7), "odd"),
-        (lambda d: d.update(A=[[1.0]]), "unknown field 'A'"),
-        (lambda d: d["schedule"][0].update(signal="torque"), "torque"),
-        (lambda d: d.update(format="uncertain-lti/1"), "'A' is missing"),
-        (lambda d: d.update(scheduling=[{"name": "w", "topic": "", "field": "w"}]), "schedules nothing"),
-    ],
-)
-def test_a_damaged_file_is_refused_by_its_field(change: Any, words: str) -> None:
-    data = scheduled(np.random.default_rng(8), Schedule((SPEED,))).to_dict()
-    change(data)
-    with pytest.raises(ModelError, match=words):
-        UncertainLTI.from_dict(data)
 
 
 def test_a_signals_file_says_how_to_schedule() -> None:
