@@ -22,6 +22,7 @@ import pytest
 import yaml
 from bag_writer import Message, Topic, write
 from engine_bag import SIGNALS, engine_bag
+from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import BagError, absent
@@ -30,7 +31,6 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.sampling.clock import LONGEST_NS, Status, to_ns
-from uncertain_lti.sampling.sampler import Step
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -319,9 +319,7 @@ def test_a_value_that_the_bounds_cannot_carry_has_no_verdict_live_as_offline(val
     assert np.flatnonzero(~verdicts.judged).tolist() == [0, 101, 201]
     assert verdicts.flags[100, 0] == 1.0 and np.isfinite(verdicts.lower[verdicts.judged]).all()
     assert {verdicts.statuses()[k] for k in (101, 201)} == {Status.MISSING}
-    for k in (99, 100, 101, 200, 201):
-        before = [*x[k - 1].tolist(), *u[k - 1].tolist()]
-        live = monitor.judge(Step(Status.OK, int(run.t_ns[k]), 0, float(run.dt[k - 1]), before, x[k].tolist()))
+    for k, live in enumerate(map(monitor.judge, steps_of(run))):
         assert live.status is verdicts.statuses()[k]
         for name in ("flags", "lower", "upper", "utilisation"):
             assert np.array_equal(getattr(live, name), getattr(verdicts, name)[k], equal_nan=True), (k, name)

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from steps import steps_of
 from test_event_log import Rig
 from test_live import CONTROL, STATE, joint_state, vector
 
@@ -31,7 +32,6 @@ from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted
-from uncertain_lti.sampling.sampler import Step
 
 DT = 0.01
 
@@ -67,18 +67,6 @@ def held(transient: Transient, state: int | slice, begin: int, end: int) -> Tran
 @pytest.fixture(scope="module")
 def model() -> UncertainLTI:
     return fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise")
-
-
-def steps_of(transient: Transient) -> list[Step]:
-    """As the sampler gives them."""
-    found = []
-    z = np.hstack([transient.x, transient.u, transient.s])
-    for k, status in enumerate(transient.statuses()):
-        none = [float("nan")] * z.shape[1]
-        before = z[k - 1].tolist() if k and not status.opens_segment else none
-        dt = (transient.t_ns[k] - transient.t_ns[k - 1]) * 1e-9 if k else float("nan")
-        found.append(Step(status, int(transient.t_ns[k]), 0, float(dt), before, transient.x[k].tolist()))
-    return found
 
 
 def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI, tmp_path: Path) -> None:

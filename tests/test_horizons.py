@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
@@ -27,7 +28,6 @@ from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS, SHAPES
 from uncertain_lti.monitor.verdict import place as place_of
 from uncertain_lti.sampling.clock import Status
-from uncertain_lti.sampling.sampler import Sampler, Step
 from uncertain_lti.signals.signal_map import Signal
 
 SPEED = Schedule((Axis("x1", knots=(-0.5, 0.0, 1.0)),))
@@ -88,8 +88,8 @@ SCHEDULES = [None, SPEED, Schedule((GEAR,)), Schedule((SPEED.axes[0], GEAR))]
 
 
 @st.composite
-def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
-    """A run with gaps, resets, dropped messages, NaN, long steps, other modes: as a transient, and by the Sampler."""
+def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient]:
+    """A run with gaps, resets, dropped messages, NaN, long steps, other modes."""
     n, m = draw(st.integers(1, 3)), draw(st.integers(0, 2))
     schedule = draw(st.sampled_from(SCHEDULES))
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
@@ -119,37 +119,14 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient, list[Step]]:
         horizons=[horizon(rng, h, blocks, n, m) for h in lengths],
         run=draw(st.sampled_from([None, Run(*(getattr(horizon(rng, 2, blocks, n, m), name) for name in "ABc"))])),
     )
-    sampler = Sampler(signals)
-    pushed = [s for k in range(len(t)) for s in sampler.push("/c", int(t[k]), int(t[k]), z[k].tolist())]
-    transient = Transient(t, z[:, :n], z[:, n : n + m], s=z[:, n + m :], signals=signals, max_gap=0.05)
-    return model, transient, pushed
-
-
-@settings(max_examples=40, deadline=None)
-@given(streams())
-def test_a_stream_has_the_utilisations_of_its_transient(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
-    """Through gaps, resets, dropped messages, missing values, steps out of range and changes of mode."""
-    model, transient, steps = case
-    whole = EnvelopeMonitor(model).check(transient).horizon_utilisation
-    again = live(model, steps)
-    assert again.tobytes() == whole.tobytes()
-
-
-def live(model: UncertainLTI, steps: list[Step]) -> Any:
-    monitor = EnvelopeMonitor(model)
-    verdicts = [(step, monitor.judge(step)) for step in steps]
-    for step, verdict in verdicts:
-        assert not step.status.dropped or np.isnan(verdict.horizon_utilisation).all()
-        assert verdict.horizon_utilisation[0].tobytes() == verdict.utilisation.tobytes()
-    kept = [verdict.horizon_utilisation for step, verdict in verdicts if not step.status.dropped]
-    return np.array(kept).reshape(len(kept), len(model.horizons) + 1, model.n)
+    return model, Transient(t, z[:, :n], z[:, n : n + m], s=z[:, n + m :], signals=signals, max_gap=0.05)
 
 
 @settings(max_examples=25, deadline=None)
 @given(streams())
-def test_windows_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient, list[Step]]) -> None:
+def test_windows_are_those_of_the_rules_worked_out_naively(case: tuple[UncertainLTI, Transient]) -> None:
     """Which windows count, and the run and its envelope, one number after another."""
-    model, transient, _ = case
+    model, transient = case
     verdicts = EnvelopeMonitor(model).check(transient)
     table, point, n, m = verdicts.horizon_utilisation, model.operating_point, model.n, model.m
     kinds = verdicts.statuses()
@@ -246,9 +223,6 @@ def test_on_the_edge_of_an_envelope_the_comparison_decides_not_the_quotient(sche
         found = EnvelopeMonitor(model).check(there).longer_utilisation[last, 0]
         assert np.array_equal(np.abs(found) <= 1.0, np.full((200, 2), inside))
         off += int((np.abs((edge - centre.T) / half.T) <= 1.0).sum() != 400 * inside)
-        steps = [
-            Step(status, int(t_ns), 0, there.dt[k - 1] if k else np.nan, [*moved[k - 1], *run.u[k - 1]], [*moved[k]])
-            for k, (status, t_ns) in enumerate(zip(there.statuses(), there.t_ns, strict=True))
-        ]
-        assert live(model, steps)[last, 1].tobytes() == found.tobytes()
+        live = np.array([verdict.horizon_utilisation for verdict in map(EnvelopeMonitor(model).judge, steps_of(there))])
+        assert live[last, 1].tobytes() == found.tobytes()
     assert off, "no quotient is off here, so this shows nothing"

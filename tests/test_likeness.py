@@ -178,7 +178,7 @@ def test_a_changed_law_points_to_its_row(model: UncertainLTI) -> None:
 
 
 def test_live_says_what_check_says(taught: UncertainLTI) -> None:
-    from test_frozen import steps_of
+    from steps import steps_of
 
     transient = run(200, "p stuck")
     monitor, explainer, quiet = EnvelopeMonitor(taught), Explainer(taught), 0

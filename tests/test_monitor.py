@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
@@ -42,15 +43,7 @@ def a_model(n: int, m: int, seed: int, **options: Any) -> UncertainLTI:
 
 
 def judge(monitor: EnvelopeMonitor, transient: Transient, **options: Any) -> list[Any]:
-    verdicts = []
-    for k in range(1, len(transient)):
-        dt = int(transient.t_ns[k] - transient.t_ns[k - 1]) * 1e-9
-        step = Step(
-            Status.OK, int(transient.t_ns[k]), 0, dt, [*transient.x[k - 1].tolist(), *transient.u[k - 1].tolist()],
-            transient.x[k].tolist(),
-        )  # fmt: skip
-        verdicts.append(monitor.judge(step, **options))
-    return verdicts
+    return [monitor.judge(step, **options) for step in steps_of(transient)[1:]]
 
 
 def a_transient(n: int, m: int, seed: int, count: int = 30) -> Transient:

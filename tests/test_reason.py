@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
@@ -24,7 +25,6 @@ from uncertain_lti.monitor.alarm import Raised
 from uncertain_lti.monitor.reason import Reasons, over_recording
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.clock import Status
-from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 DT = 0.1
@@ -59,26 +59,22 @@ def recording(seed: int, count: int = 300) -> Transient:
 
 
 def live(monitor: EnvelopeMonitor, transient: Transient) -> list[str]:
-    reasons, said = Reasons(monitor.model, monitor.alarms.rules), []
-    statuses = transient.statuses()
-    for k, status in enumerate(statuses):
-        parts = (transient.x, transient.u, transient.s)
-        before = np.concatenate([np.full(a.shape[1], np.nan) if status.opens_segment else a[k - 1] for a in parts])
-        dt = 1e-9 * float(transient.t_ns[k] - transient.t_ns[k - 1]) if k else np.nan
-        step = Step(status, int(transient.t_ns[k]), 0, dt, list(before), transient.x[k].tolist())
-        verdict = monitor.judge(step)
-        said.append(reasons.take(verdict, monitor.alarm))
-    return said
+    reasons = Reasons(monitor.model, monitor.alarms.rules)
+    return [reasons.take(monitor.judge(step), monitor.alarm) for step in steps_of(transient)]
+
+
+def same_words(monitor: EnvelopeMonitor, transient: Transient) -> list[tuple[int, str]]:
+    """Each change of the words over a recording, which are those that are said live."""
+    changes = list(over_recording(monitor.check(transient), monitor.model))
+    words = live(monitor, transient)
+    assert changes == [(k, text) for k, text in enumerate(words) if k == 0 or text != words[k - 1]]
+    return changes
 
 
 @pytest.mark.parametrize("rules", RULES.values(), ids=list(RULES))
 @pytest.mark.parametrize("seed", range(4))
 def test_live_and_over_a_recording_the_words_are_the_same(rules: tuple[Rule, ...], seed: int) -> None:
-    monitor, transient = EnvelopeMonitor(model_with(rules)), recording(seed)
-    changes = list(over_recording(monitor.check(transient), monitor.model))
-    expected = live(monitor, transient)
-    assert changes == [(k, text) for k, text in enumerate(expected) if k == 0 or text != expected[k - 1]]
-    every = "\n".join(expected)
+    every = "\n".join(text for _, text in same_words(EnvelopeMonitor(model_with(rules)), recording(seed)))
     assert "alarm: frozen: x1" in every and "; no verdict on x1" in every
     assert "no verdict: x1 missing, stale, not valid or not finite" in every
     assert "no verdict: u1 missing, stale, not valid or not finite" in every
@@ -96,13 +92,8 @@ def test_a_mode_that_is_not_listed_is_named_live_and_over_a_recording() -> None:
         **{name: np.stack([getattr(plain, name)] * 2) for name in ("A", "B", "dA", "dB", "v")},
         signals=SignalMap(states, controls, further), schedule=gear, alarm=RULES["containment"],
     )  # fmt: skip
-    one = recording(0)
     s = np.repeat([1.0, 4.0, 5.0, 2.0, 4.0, 1.0], 50)[:, None]
-    transient = one.replace(s=s, signals=model.signals)
-    monitor = EnvelopeMonitor(model)
-    expected = live(monitor, transient)
-    changes = list(over_recording(monitor.check(transient), model))
-    assert changes == [(k, text) for k, text in enumerate(expected) if k == 0 or text != expected[k - 1]]
+    changes = same_words(EnvelopeMonitor(model), recording(0).replace(s=s, signals=model.signals))
     said = [text.split("no verdict: ")[-1] for _, text in changes]
     assert said.count("gear = 4 is not among the modes of the model, 1, 2") >= 2
     assert said.count("gear = 5 is not among the modes of the model, 1, 2") >= 1
@@ -144,10 +135,7 @@ def test_a_jump_larger_than_any_of_the_fit_is_named_with_its_limit() -> None:
     spiked[60] += 2.0
     transient = Transient(round(1e8) * np.arange(100), spiked, u[:100])
     monitor = EnvelopeMonitor(model)
-    verdicts = monitor.check(transient)
-    said = list(over_recording(verdicts, model))
-    expected = live(monitor, transient)
-    assert said == [(k, text) for k, text in enumerate(expected) if k == 0 or text != expected[k - 1]]
+    verdicts, said = monitor.check(transient), same_words(monitor, transient)
     jumped = f"x1 jumped by {spiked[60, 0] - spiked[59, 0]:.3g} in one step (at most {largest:.3g} in the fit)"
     assert dict(said)[60] == f"alarm: at least 1 of 1 verdicts violated: x1; {jumped}"
     data = check_data(model, verdicts, samples=False)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_frozen import steps_of
+from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
