@@ -26,7 +26,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from rclpy.serialization import deserialize_message
-from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, joint_state, vector
+from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, float64, joint_state, vector
 
 from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
@@ -274,6 +274,7 @@ def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     assert rig.lines == [f"no verdict yet: nothing received on {STATE}, {CONTROL}"]
     rig.send(200, state=False)
     assert rig.lines == [f"no verdict yet: nothing received on {STATE}"]
+    assert rig.session.reason(rig.now, TIMEOUT) == f"no verdict for more than 1 s: nothing received on {STATE}"
     rig.send(20)
     assert rig.lines == ["judging a, b; alarm when at least 2 of 5 verdicts violated"]
     rig.wait(30.0)
@@ -326,6 +327,19 @@ def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: st
     (line,) = rig.lines
     assert re.match(r"no verdict for 1\.\d s: ", line) and why in line
     assert why.partition("; ")[2] in rig.session.report(rig.now, TIMEOUT)[0].message
+
+
+def test_equal_times_of_receipt_tell_that_the_simulated_clock_is_coarse() -> None:
+    rig = Rig()
+    rig.watch(by_hand("log"), Rule())
+    for k in range(150):
+        for topic in ("/voltage", "/power"):
+            rig.session.take(topic, EPOCH_NS + 10 * STEP_NS * (k // 10), float64(0.3), rig.now)
+        rig.wait(STEP)
+    (line,) = rig.lines
+    told = "): /clock moves more seldom than they come; play with --clock, or by ros2 bag with --clock-topics-all"
+    assert line.endswith(f"(equal stamp{told}")
+    assert f"(equal stamp 135{told}" in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
 def test_problems_and_the_enable_condition_are_told_when_they_change() -> None:

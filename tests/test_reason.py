@@ -163,6 +163,9 @@ def test_where_no_verdict_was_possible_the_reason_comes_with_a_remedy(
     t, x, u = round(1e8) * np.arange(400), np.cumsum(rng.normal(size=(400, 1)), axis=0), rng.normal(size=(400, 1))
     model = fit([Transient(t, x, u)], additive="noise")
     given = {"t": t[:steps], "x": x[:steps], "u": u[:steps]} | change
-    data = check_data(model, EnvelopeMonitor(model).check(Transient(**given)), samples=False)
+    verdicts = EnvelopeMonitor(model).check(Transient(**given))
+    if remedy.endswith("rate of the fit"):
+        assert [text for _, text in over_recording(verdicts, model)][1].endswith("was fitted to (0.1 to 0.1 s)")
+    data = check_data(model, verdicts, samples=False)
     assert data["outcome"] == "unknown" and data["reason"].startswith("no verdict was possible, so nothing is known; ")
     assert remedy in data["reason"]

@@ -34,9 +34,17 @@ WHY = {
     Status.FROZEN: "every state needs one that is frozen",
     Status.UNASKED: "outside the time asked for",
 }
-"""Why a sample has no verdict."""
+"""Why a sample has no verdict, whatever the model."""
 QUIET = "no alarm"
 """What is said of a verdict without an alarm."""
+
+
+def why_not(status: Status, model: UncertainLTI) -> str:
+    """Why a sample has no verdict, with the steps that the model was fitted to."""
+    sampling, text = model.sampling, WHY[status]
+    if status is Status.STEP and sampling.dt_min is not None and sampling.dt_max is not None:
+        text += f" ({sampling.dt_min:.3g} to {sampling.dt_max:.3g} s)"
+    return text
 
 
 Values = Callable[[], tuple[Sequence[float], Sequence[float], Sequence[float]]]
@@ -132,7 +140,7 @@ class Reasons:
             lacking = dict.fromkeys(name for name, v in zip(of, [*before, *after], strict=True) if v != v)
             if lacking:
                 return f"{', '.join(lacking)} missing, stale, not valid or not finite"
-        return WHY[status]
+        return why_not(status, self._model)
 
 
 def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[int, str]]:

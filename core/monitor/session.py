@@ -28,7 +28,7 @@ from uncertain_lti.monitor.deployed import Days, condition_words
 from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.outputs import JUDGED
-from uncertain_lti.monitor.reason import WHY
+from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
 from uncertain_lti.monitor.stream import topic_types as topic_types
 from uncertain_lti.monitor.verdict import Verdict
@@ -93,7 +93,7 @@ class Session(Stream):
                 which = ""
                 if status is Status.MISSING:
                     which = f" ({shortlist([signal.name for signal in lacking], SHOWN)})"
-                why = WHY[status]
+                why = why_not(status, self.model)
                 if status is Status.MODE and period.last_unlisted is not None:
                     why = self.model.why_unlisted(period.last_unlisted.before)
                 complaints.append(f"{period.statuses[status]} samples without a verdict: {why}{which}")
@@ -101,7 +101,8 @@ class Session(Stream):
         dropped = sum(count for status, count in period.statuses.items() if status.dropped)
         if dropped:
             which = ", ".join(f"{status.value} {count}" for status, count in period.statuses.items() if status.dropped)
-            complaints.append(f"{dropped} messages dropped ({which})")
+            coarse = self.coarse_clock(period.statuses[Status.EQUAL])
+            complaints.append(f"{dropped} messages dropped ({which}){coarse}")
         if late := self.late - period.late:
             complaints.append(f"{late} messages came too late")
         if self.unreadable.total() > period.unreadable:
@@ -148,8 +149,10 @@ class Session(Stream):
         text = self.reasons.text
         if self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
+        never = [topic for topic in self.types if self.heard(topic) is None]
         silent = self.silent_for(now) > timeout
         why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
+        why = f"nothing received on {', '.join(never)}" if never else why
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
@@ -188,6 +191,12 @@ class Session(Stream):
                 if data is not None and not found.get(signal.topic) and any(v != v for v in reader.read(data)[1]):
                     found[signal.topic] = FieldPath(signal.field).absent(reader.decode(data))
         return [f"{topic}: {why}" for topic, why in found.items() if why]
+
+    def coarse_clock(self, equal: int) -> str:
+        """What to do about equal stamps, if there are any, where they are times of receipt by a simulated clock."""
+        if not equal or self.model.signals.time.get(self.sampler.clock) != "log":
+            return ""
+        return ": /clock moves more seldom than they come; play with --clock, or by ros2 bag with --clock-topics-all"
 
     def rule_text(self) -> str:
         """The rules of the alarm in words."""
@@ -442,10 +451,11 @@ class EventLog:
             found += session.absent(lacking)
         counted = {Status.GAP: "gaps", Status.RESET: "resets"}
         kinds = Status.GAP, Status.RESET, Status.STEP, Status.MODE, Status.FROZEN
-        found += [WHY[kind] for kind in kinds if since[counted.get(kind, kind.value)]]
+        found += [why_not(kind, session.model) for kind in kinds if since[counted.get(kind, kind.value)]]
         dropped = [status.value for status in Status if status.dropped and since[status.value]]
         if dropped:
-            found.append(f"messages on {clock} are dropped ({', '.join(dropped)})")
+            coarse = session.coarse_clock(since[Status.EQUAL.value])
+            found.append(f"messages on {clock} are dropped ({', '.join(dropped)}){coarse}")
         unreadable = session.unreadable - self._unreadable
         found += [f"{topic}: a message {session.why_unreadable[topic]}" for topic in sorted(unreadable)]
         return "; ".join(found)
