@@ -68,6 +68,14 @@ def test_fit_alone_gives_a_panel_that_is_quiet_on_what_it_saw_and_sees_what_it_p
     assert alarm["within"] == pytest.approx(DT) and seen >= 36  # nine of ten, as promised
 
 
+@pytest.mark.parametrize("count", [2, 3])
+def test_what_few_short_recordings_promise_is_by_the_bounds_that_judge(count):
+    """The models that leave one of them out have narrower ones."""
+    few = fit([plant(seed, 100) for seed in range(count)])
+    (size, _), monitor = few.fit_summary["alarm"]["biases"], EnvelopeMonitor(few)
+    assert sum(monitor.check(plant(100 + i, bias=(-1) ** i * size)).alarm[300] for i in range(40)) >= 36
+
+
 def test_a_slow_average_takes_four_recordings_that_say_how_far_they_differ(runs):
     for count, slow in ((1, {"mean", "chi2"}), (3, {"mean", "chi2"}), (4, {"ewma"})):
         assert {rule.kind for rule in fit(runs[:count], "lp", additive="noise").alarm} == {"energy", *slow}

@@ -85,8 +85,9 @@ class Part:
     left-out model's envelopes over each horizon on this part, recorded units; NaN likewise; `extrapolated` (K,):
     `Reach.level`; `outside_domain`: verdicts from outside the domain fitted without this part; `unseen`: violated
     verdicts from inside that domain; `mean_width`, `max_width` (n,): of the left-out model's bounds on this part,
-    recorded units; `relative_width` (n,): the mean over that of the full model on the same samples; `usual_width`,
-    `median_width` (n,): width that USUAL of them, and half of them, have at most, recorded units.
+    recorded units; `relative_width` (n,): the mean over that of the full model on the same samples; `usual_width` (n,):
+    width that USUAL of the full model's bounds, which judge from now on, have at most there, recorded units;
+    `median_width` (n,): the same of half of the left-out model's.
     """
 
     name: str
@@ -205,7 +206,7 @@ def judge(
         mean_width=width.mean(axis=0),
         max_width=width.max(axis=0),
         relative_width=width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
-        usual_width=np.quantile(width, USUAL, axis=0),
+        usual_width=np.quantile(whole, USUAL, axis=0),
         median_width=np.median(width, axis=0),
     )
 
