@@ -173,6 +173,11 @@ def test_an_alarm_by_a_statistic_says_which_state_and_by_how_much() -> None:
     message = rig.session.report(rig.now, TIMEOUT)[0].message
     assert message.startswith(f"alarm: mean of the utilisation over {5 * STEP:.3g} s above 0.4: a, b")
     assert "2 of 5" not in message, "a rule that raised nothing is not named"
+    rig = Rig([AlarmRule(2, 5), StatisticRule("mean", 5 * STEP, 40.0)])
+    rig.send(10)
+    rig.lines.clear()
+    rig.send(3, off=2.0)
+    assert rig.lines[0].startswith("alarm, at least 2 of 5 verdicts violated: a = ")
 
 
 def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> None:
