@@ -95,12 +95,17 @@ def test_thresholds_and_promise_are_learnt_from_all_recordings():
     assert new["hours"] == pytest.approx(all_at_once["hours"]) and new["units"] == 7
     limits = [alarm["limit_per_hour"] for alarm in (old, new, all_at_once)]
     assert limits[1] < limits[0] and limits[1] == pytest.approx(limits[2], rel=0.5)
-    assert "7 recordings" in new["promises"][0] and "brought up to date" in new["note"]
+    assert "7 recordings" in new["promises"][0] and new["note"].startswith("brought up to date: of each recording")
     x = runs[3].x.copy()
     x[700:760, 0] += 0.02 * np.where(np.arange(60) % 2, 1.0, -1.0)
     loud = Transient(runs[3].t, x, runs[3].u, name="loud")
     assert EnvelopeMonitor(model).check(loud).alarm.any()
-    assert not EnvelopeMonitor(model.update(loud)).check(loud).alarm.any()
+    with_loud = model.update(loud)
+    assert not EnvelopeMonitor(with_loud).check(loud).alarm.any()
+    for later in (with_loud, with_loud.update(runs[4])):  # the alarm is as blind after the next one
+        said = later.fit_summary["alarm"]
+        times = f"{said['figure'] / model.fit_summary['alarm']['figure']:.1f} times as large as the fit before them saw"
+        assert f"only changes {times}: fit all recordings together" in said["note"], said["note"]
 
 
 def test_an_alarm_that_was_changed_stays():

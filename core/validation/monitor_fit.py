@@ -184,6 +184,8 @@ NOTE = (
     "brought up to date: of each recording counts how far it was from the fit that was made without it at the time; a "
     "fit of all recordings leaves each out of all the others, which moves thresholds a little"
 )
+GROWN = 1.5
+"""Size of what the alarm sees after updates, over that before them, from which on it is said."""
 KEPT = "the alarm is that of before the update, as it is not the panel that the first fit learnt; fit all recordings"
 
 
@@ -209,6 +211,13 @@ def updated(
         alarm = {**alarm, "note": KEPT} if parts else alarm
     else:
         found = found.replace(alarm=panel.rules)
-        kept, alarm = panel.evidence.to_dict(), {**alarm, **panel.summary(found), "note": NOTE}
+        before, note = alarm.get("fitted_figure", alarm["figure"]), NOTE
+        if panel.figure > GROWN * before:
+            note = (
+                f"brought up to date with recordings unlike the earlier ones, so that the alarm sees only changes "
+                f"{panel.figure / before:.1f} times as large as the fit before them saw: fit all recordings together"
+            )
+        kept = panel.evidence.to_dict()
+        alarm = {**alarm, **panel.summary(found), "fitted_figure": before, "note": note}
     memory = found.memory and {**found.memory, "evidence": kept}
     return found.replace(memory=memory, fit_summary={**found.fit_summary, "alarm": alarm})
