@@ -10,6 +10,7 @@
 """Fixtures that several test files share, and what holds for every test: loopback only, no process left behind."""
 
 import os
+import shutil
 import signal
 import threading
 import zlib
@@ -136,3 +137,9 @@ def engine_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = ["--signals", str(folder / "signals.yaml"), "--additive", "noise", "--alarm", "containment", "-q"]
     assert main(["fit", str(folder / "run.mcap"), *words, "--output", str(folder / "m.model.json")]) == 0
     return folder
+
+
+@pytest.fixture
+def engine_copy(engine_folder: Path, tmp_path: Path) -> Path:
+    """A copy of `engine_folder` to write to."""
+    return Path(shutil.copytree(engine_folder, tmp_path / "engine"))

@@ -29,8 +29,8 @@ from uncertain_lti.reports.check import check_data
 
 
 @pytest.fixture
-def folder(engine_folder, tmp_path):
-    return Path(shutil.copytree(engine_folder, tmp_path / "engine"))
+def folder(engine_copy):
+    return engine_copy
 
 
 def refused(capsys, arguments):

@@ -57,6 +57,17 @@ def run(seed=0, count=1500, noise=1e-3, dt=0.05, u=None, feedback=None, lag=0, c
     return Transient(t_ns, x, u, name="run", **{**names, **options})
 
 
+def put(rows, state, value):
+    """A change of a recording: a value, or what is made of x, in these rows of a state."""
+
+    def change(x, u):
+        x = x.copy()
+        x[rows, state] = value(x) if callable(value) else value
+        return x, u
+
+    return change
+
+
 def messages(*transients, additive="noise", **options):
     return fit(list(transients), additive=additive, seek_carriers=True, **options).fit_summary["messages"]
 
@@ -128,11 +139,7 @@ def test_step_too_long_for_the_fastest_mode(dt, slow):
 
 
 def test_frozen_sensor_is_named_with_its_stretch():
-    def freeze(x, u):
-        x = x.copy()
-        x[400:520, 1] = x[400, 1]
-        return x, u
-
+    freeze = put(slice(400, 520), 1, lambda x: x[400, 1])
     (message,) = [m for m in messages(run(change=freeze)) if WORDS["frozen"] in m]
     assert "'flow'" in message and "119 samples" in message
     assert "run at 20 s" in message
@@ -142,20 +149,13 @@ def test_a_machine_at_rest_is_not_frozen():
     u = steps(np.random.default_rng(7), 1501)
     u[300:700] = 0.0
 
-    def settle(x, u):
-        x = x.copy()
-        x[400:700] = 0.0
-        return x, u
-
+    settle = put(slice(400, 700), slice(None), 0.0)
     assert "frozen" not in said(messages(run(u=u, change=settle, noise=0.0)))
 
 
 @pytest.mark.parametrize("period", [2, 5])
 def test_state_of_a_slower_topic_is_named_with_its_period(period):
-    def slower(x, u):
-        x = x.copy()
-        x[:, 1] = x[np.arange(len(x)) // period * period, 1]
-        return x, u
+    slower = put(slice(None), 1, lambda x: x[np.arange(len(x)) // period * period, 1])
 
     def said_of(**judged):
         states = [Signal("speed", "/a", "x"), Signal("flow", "/a", "y", **judged)]
@@ -204,12 +204,7 @@ def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
 
 
 def spiked(at, size=0.5):
-    def change(x, u):
-        x = x.copy()
-        x[list(at), 0] += size
-        return x, u
-
-    return change
+    return put(list(at), 0, lambda x: x[list(at), 0] + size)
 
 
 @pytest.mark.parametrize("at", [(400,), (400, 700, 701, 1100)])
@@ -232,10 +227,7 @@ def test_for_a_criterion_that_would_discard_others_the_stretch_is_named():
     assert "leave that stretch out" in message and "--discard" not in message
 
 
-def white(x, u):
-    x = x.copy()
-    x[:, 1] = 2.0 + 0.05 * np.random.default_rng(9).standard_normal(len(x))
-    return x, u
+white = put(slice(None), 1, lambda x: 2.0 + 0.05 * np.random.default_rng(9).standard_normal(len(x)))
 
 
 def test_a_state_that_is_noise_is_named():
@@ -320,12 +312,7 @@ def test_a_lagged_state_as_control_is_understood(recordings, signals_folder):
 
 @pytest.mark.parametrize(("code", "at"), [(9999.0, [5, 6, 700]), (-32768.0, range(900))])
 def test_a_number_that_stands_for_no_value_is_named_and_no_steady_state(code, at):
-    def coded(x, u):
-        x = x.copy()
-        x[list(at), 0] = code
-        return x, u
-
-    spoiled = run(change=coded)
+    spoiled = run(change=put(list(at), 0, code))
     found = messages(spoiled)
     assert WORDS["code"] in found[0] and f"'speed' is exactly {code:.9g} in {len(at)} of 1500" in found[0]
     assert not {"missing", "weak", "hidden"} & said(found)

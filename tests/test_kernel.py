@@ -170,19 +170,6 @@ def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(
     assert (unlisted > 0 or not gear) and (unknown > 0) == (schedule is not None)
 
 
-def test_a_million_have_the_bits_of_one() -> None:
-    """Blocks of samples begin and end anywhere."""
-    rng = np.random.default_rng(4)
-    model = some_model(5, 4, None, rng)
-    x, u, dt = rng.normal(size=(1025, 5)), rng.normal(size=(1025, 4)), rng.uniform(0.01, 0.1, 1025)
-    whole = model.centre_and_half(x, u, dt)
-    for k in (0, 1, 255, 256, 257, 511, 512, 1024):
-        for one, all_of_them in zip(model.centre_and_half(x[k], u[k], dt[k]), whole, strict=True):
-            assert one.tobytes() == all_of_them[k].tobytes()
-        for one, all_of_them in zip(model.centre_and_half(x[:k], u[:k], dt[:k]), whole, strict=True):
-            assert one.tobytes() == all_of_them[:k].tobytes()
-
-
 def test_on_the_edge_of_a_horizon_the_comparison_decides_and_a_run_beyond_all_numbers_is_outside() -> None:
     quotient, inside = np.array([1.0, -1.0, -1.5, np.nan, np.nan]), np.array([False, False, True, False, True])
     beyond = np.nextafter(1.0, 2.0)

@@ -625,21 +625,15 @@ def test_a_rule_that_kept_the_node_from_starting_can_be_mended(world: World, tmp
 
 
 def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_path: Path) -> None:
-    foreign = by_hand()
-    signals = replace(
-        foreign.signals,
-        controls=tuple(replace(c, type="frost_interfaces/msg/UCommand") for c in foreign.signals.controls),
+    model, signals = by_hand(), by_hand().signals
+    foreign = replace(
+        signals, controls=tuple(replace(c, type="frost_interfaces/msg/UCommand") for c in signals.controls)
     )
-    missing = saved(
-        UncertainLTI(foreign.A, foreign.B, foreign.dA, foreign.dB, signals=signals, sampling=foreign.sampling),
-        tmp_path, "missing",
-    )  # fmt: skip
+    wrong = replace(signals, states=tuple(replace(s, field="positions[0]") for s in signals.states))
+    missing, unknown_field = (
+        saved(model.replace(signals=s), tmp_path, name) for name, s in (("missing", foreign), ("field", wrong))
+    )
     arrays = saved(UncertainLTI([[-1.0]], [[1.0]], [[0.1]], [[0.1]]), tmp_path, "arrays")
-    field = by_hand()
-    wrong = replace(field.signals, states=tuple(replace(s, field="positions[0]") for s in field.signals.states))
-    unknown_field = saved(
-        UncertainLTI(field.A, field.B, field.dA, field.dB, signals=wrong, sampling=field.sampling), tmp_path, "field"
-    )
     process = world.run_node("envelope_monitor", {"model": str(missing), "diagnostics_period": 0.1})
     diagnostics = world.diagnostics()
     diagnostics.reaches(ERROR, saying="the Python package frost_interfaces is not installed; install it")
@@ -650,9 +644,7 @@ def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_
     accepted, reason = world.set(model=str(unknown_field))
     assert not accepted and "positions" in reason and "position[]" in reason
     assert world.state() == "unconfigured"
-    accepted, reason = world.set(model=str(saved(foreign, tmp_path, "right")))
-    assert accepted, reason
-    assert world.state() == "active"
+    assert world.set(model=str(saved(model, tmp_path, "right"))) == (True, "") and world.state() == "active"
     diagnostics.reaches(STALE, saying="no verdict yet")
 
 

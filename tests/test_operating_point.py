@@ -146,33 +146,20 @@ def test_steady_is_the_median_over_the_longest_still_stretch_and_scale_the_large
     assert words.startswith("25 still samples (every signal within 5% of its range)")
 
 
-def test_a_median_and_not_a_mean() -> None:
-    values = np.concatenate([np.full(30, 1.0), np.full(5, 1.04), [2.0]])
-    steady, _, _ = resolve_auto(signals(AUTO), [values[:, None]])
-    assert steady == [1.0]
-
-
-def test_where_the_steady_magnitude_is_zero_the_scale_is_the_range() -> None:
-    values = np.concatenate([np.zeros(30), [-3.0, 4.0]])
-    assert resolve_auto(signals(AUTO), [values[:, None]])[:2] == ([0.0], [7.0])
-
-
-def test_where_nothing_ever_moves_the_scale_is_one() -> None:
-    assert resolve_auto(signals(AUTO), [rest(0.0, 30)])[:2] == ([0.0], [1.0])
-    assert resolve_auto(signals(AUTO), [rest(5.0, 30)])[:2] == ([5.0], [5.0])
-
-
-def test_the_band_is_doubled_until_there_is_a_stretch() -> None:
-    saw = np.tile([0.0, 0.35], 20)
-    values = np.concatenate([saw, [1.0]])
-    steady, _, words = resolve_auto(signals(AUTO), [values[:, None]])
-    assert "within 40% of its range" in words and steady == [pytest.approx(0.175)]
-
-
-def test_without_a_stretch_all_samples_count() -> None:
-    values = np.array([1.0, 2.0, 6.0])[:, None]
-    steady, scale, words = resolve_auto(signals(AUTO), [values])
-    assert (steady, scale, words) == ([2.0], [2.0], "all samples (no still stretch)")
+@pytest.mark.parametrize(
+    ("values", "steady", "scale", "words"),
+    [
+        ([*[1.0] * 30, *[1.04] * 5, 2.0], 1.0, 1.0, ""),  # a median and not a mean
+        ([*[0.0] * 30, -3.0, 4.0], 0.0, 7.0, ""),  # where the steady magnitude is zero, the range
+        ([0.0] * 30, 0.0, 1.0, ""),  # nothing ever moves
+        ([5.0] * 30, 5.0, 5.0, ""),
+        ([*[0.0, 0.35] * 20, 1.0], 0.175, 0.175, "within 40% of its range"),  # doubled until there is a stretch
+        ([1.0, 2.0, 6.0], 2.0, 2.0, "all samples (no still stretch)"),
+    ],
+)
+def test_what_auto_resolves_to(values: list[float], steady: float, scale: float, words: str) -> None:
+    found = resolve_auto(signals(AUTO), [np.array(values)[:, None]])
+    assert found[:2] == ([pytest.approx(steady)], [pytest.approx(scale)]) and words in found[2]
 
 
 def test_a_signal_that_never_comes_stays_at_zero_and_one() -> None:

@@ -10,10 +10,10 @@
 """The optimum: fits against independent solvers of the whole problem, and what is said of the distance from it."""
 
 import itertools
-import sys
 from pathlib import Path
 
 import numpy as np
+import optimum
 import pytest
 
 from uncertain_lti import OperatingPoint, Transient, read_transients
@@ -23,10 +23,6 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.structure import Structure
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import optimum  # noqa: E402
-
 KEY = "optimality_gap"
 
 

@@ -18,6 +18,7 @@ import scipy.stats
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import fitting
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
@@ -103,13 +104,17 @@ def test_what_is_given_by_hand_is_what_one_gets(runs):
         fit(runs, alarm="loud")
 
 
-def test_thresholds_are_the_largest_sizes_with_an_allowance(runs):
-    """By the formulas of the statistics over the whole record, in numpy."""
-    from uncertain_lti.identification import fit as plain
-
-    full = plain(runs, "lp", additive="noise", describe_data=False)
+@pytest.fixture(scope="module")
+def learnt(runs):
+    """A model without an alarm, what leaving out gave, and the panel learnt of it."""
+    full = fitting.fit(runs, "lp", additive="noise", describe_data=False)
     left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
-    panel = learn(left, fitted_parts(full, runs))
+    return full, left, learn(left, fitted_parts(full, runs))
+
+
+def test_thresholds_are_the_largest_sizes_with_an_allowance(learnt, runs):
+    """By the formulas of the statistics over the whole record, in numpy."""
+    full, left, panel = learnt
     sample, energy = (rule for rule in panel.rules if rule.kind == "energy")
     parts = left.parts
     inside = [full_utilisation(full, run) for run in runs]
@@ -205,9 +210,9 @@ def test_the_limit_counts_a_cluster_of_alarms_for_every_rule_but_one():
     assert Panel.of(one, rules, "recording", (), None).limit == pytest.approx(limit, rel=1e-12)
 
 
-def test_false_alarms_are_counted_per_hour_of_verdicts(runs):
+def test_false_alarms_are_counted_per_hour_of_verdicts(learnt):
     """A margin that some verdicts of the left-out recordings exceed, counted in numpy."""
-    parts = validate(runs, criterion="lp", additive="noise").parts
+    parts = learnt[1].parts
     sizes = [np.abs(part.utilisation).max(axis=1) for part in parts]
     rule = AlarmRule(margin=float(np.quantile(np.concatenate(sizes), 0.995)))
     over = [size > rule.margin for size in sizes]
@@ -271,12 +276,9 @@ def test_few_steps_give_a_panel_or_a_reason(steps):
     assert ("biases" in alarm) != ("not_learnt" in alarm)
 
 
-def test_windows_are_at_most_a_tenth_of_what_was_left_out(runs):
-    from uncertain_lti.identification import fit as plain
-
-    model = plain(runs, "lp", additive="noise", describe_data=False)
+def test_windows_are_at_most_a_tenth_of_what_was_left_out(learnt):
     for steps in (5, 40, 95, 1000):
-        for rule in [*rules_for(model, steps, DT), *rules_for(model, steps, DT, apart=True)]:
+        for rule in [*rules_for(learnt[0], steps, DT), *rules_for(learnt[0], steps, DT, apart=True)]:
             window = round(rule.window_s / DT - 0.5) if rule.window_s else 1
             assert window <= max(steps / {"energy": 10, "mean": 3, "chi2": 3, "ewma": 2}[rule.kind], 1)
 
@@ -363,13 +365,9 @@ def test_large_problems_are_armed_by_what_was_fitted(runs, monkeypatch):
     assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in runs)
 
 
-def test_states_that_are_blind_are_named(runs):
+def test_states_that_are_blind_are_named(learnt):
     """Worth and promises follow from the sizes alone."""
-    from uncertain_lti.identification import fit as plain
-
-    full = plain(runs, "lp", additive="noise", describe_data=False)
-    left = validate(runs, full=full, operating_point=full.operating_point, criterion="lp", additive="noise")
-    panel = learn(left, fitted_parts(full, runs))
+    full, _, panel = learnt
     span = full.domain.x_max - full.domain.x_min
     blind = replace(panel, biases=np.array([panel.biases[0], 1.01 * span[1]]))
     assert worth(full, blind)[0] == "some" and worth(full, blind)[1].startswith("sees only x1: of x2")

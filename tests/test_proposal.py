@@ -31,7 +31,7 @@ from uncertain_lti.proposal.choosing import _function, _may_follow, _may_move_wi
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
-JOINT = "sensor_msgs/msg/JointState"
+JOINT, POSE_2D = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Pose2D"
 MS = 10**6
 
 
@@ -56,6 +56,10 @@ def pose(topic, t_ns, roll=0.0, yaw=0.0, x=0.0):
     return Message(topic, t_ns, cdr(POSE, header=header(t_ns), pose=body), t_ns)
 
 
+def wrapped(topic, t_ns, yaw):
+    return Message(topic, t_ns, cdr(POSE_2D, x=0.0, y=0.0, theta=math.remainder(yaw, math.tau)), t_ns)
+
+
 def driven(names=("/plant/state", "/plant/cmd"), count=400, seed=0, extra=lambda k, x, u: []):
     """First-order lag with a stepping command, 50 Hz."""
     rng = np.random.default_rng(seed)
@@ -73,6 +77,12 @@ def save(path, messages, types):
     topics = [Topic(name, types.get(name, FLOAT64)) for name in dict.fromkeys(m.topic for m in messages)]
     topics += [Topic(name, kind) for name, kind in types.items() if name not in {m.topic for m in messages}]
     return write(topics, messages).save(path)
+
+
+def proposed(folder, messages, types=None):
+    """A recording of these messages, and what is proposed for it."""
+    path = save(folder / "run.mcap", messages, types or {})
+    return path, propose([path])
 
 
 def fitted(paths, proposal):
@@ -168,7 +178,7 @@ def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
     def extra(k, x, u):
         return [f64("/plant/z_state", 10**18 + k * 20 * MS, 2 * x)]
 
-    proposal = propose([save(tmp_path / "a.mcap", driven(extra=extra), {})])
+    proposal = proposed(tmp_path, driven(extra=extra))[1]
     assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
     assert "too large" in proposal.text
 
@@ -177,8 +187,7 @@ def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
 
 
 def test_a_command_is_found_by_its_effect_where_names_say_nothing(tmp_path):
-    path = save(tmp_path / "a.mcap", driven(("/b/state", "/a")), {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, driven(("/b/state", "/a")))
     assert signals_of(proposal) == ([("/b/state", "data")], [("/a", "data")])
     assert "by correlation alone" in proposal.text
 
@@ -195,40 +204,31 @@ def test_a_cascade_keeps_every_tank(tmp_path):
         messages += [Message("/tanks/level", t, cdr(ARRAY, layout=layout, data=np.array(level)), t)]
         messages += [f64("/tanks/pump_cmd", t, u)]
         x = x + 0.1 * np.array([u - x[0], x[0] - x[1], x[1] - 0.8 * x[2]])
-    proposal = propose([save(tmp_path / "a.mcap", messages, {"/tanks/level": ARRAY})])
+    proposal = proposed(tmp_path, messages, {"/tanks/level": ARRAY})[1]
     assert [c.path for c in proposal.states] == ["data[0]", "data[1]", "data[2]"], proposal.text
 
 
-def test_angles_of_quaternions_are_unwrapped(tmp_path):
+@pytest.mark.parametrize(
+    ("kind", "sent", "field"),
+    [
+        (POSE, lambda t, yaw: pose("/body/state", t, yaw=yaw), "unwrap(yaw(pose.orientation))"),
+        (POSE_2D, lambda t, yaw: wrapped("/body/state", t, yaw), "unwrap(theta)"),
+    ],
+    ids=["a quaternion", "by its name"],
+)
+def test_angles_are_unwrapped(tmp_path, kind, sent, field):
     """A yaw that turns round and round follows its rate; x, y, z, w are not offered beside it."""
     rng = np.random.default_rng(1)
     yaw, rate, messages = 0.0, 1.0, []
     for k in range(800):
         rate = float(rng.uniform(0.2, 3.0)) if k % 50 == 0 else rate
         t = 10**18 + k * 20 * MS
-        messages += [pose("/body/pose", t, yaw=yaw), f64("/body/rate_cmd", t, rate)]
+        messages += [sent(t, yaw), f64("/body/rate_cmd", t, rate)]
         yaw += 0.02 * rate
-    path = save(tmp_path / "a.mcap", messages, {"/body/pose": POSE})
-    proposal = propose([path])
-    assert [c.path for c in proposal.states] == ["unwrap(yaw(pose.orientation))"]
-    assert "orientation.w" not in proposal.text
+    path, proposal = proposed(tmp_path, messages, {"/body/state": kind})
+    assert [c.path for c in proposal.states] == [field] and "orientation.w" not in proposal.text
     model = fitted([path], proposal)
     assert model.fit_summary["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
-
-
-def test_a_wrapped_angle_by_name_is_unwrapped(tmp_path):
-    heading, messages = 0.0, []
-    rng = np.random.default_rng(1)
-    rate = 1.0
-    for k in range(800):
-        rate = float(rng.uniform(-1.0, 3.0)) if k % 50 == 0 else rate
-        t = 10**18 + k * 20 * MS
-        kind = "geometry_msgs/msg/Pose2D"
-        messages += [Message("/base/state", t, cdr(kind, x=0.0, y=0.0, theta=math.remainder(heading, math.tau)), t)]
-        messages += [f64("/base/turn_cmd", t, rate)]
-        heading += 0.02 * rate
-    proposal = propose([save(tmp_path / "a.mcap", messages, {"/base/state": "geometry_msgs/msg/Pose2D"})])
-    assert [c.path for c in proposal.states] == ["unwrap(theta)"]
 
 
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
@@ -244,27 +244,20 @@ def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
 
     types = {"/plant/all_state": ARRAY, "/plant/big_state": ARRAY, "/plant/talk": "std_msgs/msg/String"}
     types |= {"/plant/silent_state": FLOAT64}
-    path = save(tmp_path / "a.mcap", driven(("/plant/x_state", "/plant/cmd"), extra=extra), types)
-    proposal = propose([path])
-    comments = [line for line in proposal.text.splitlines() if line.lstrip().startswith("#")]
-
-    def said(words):
-        return [line for line in comments if words in line]
-
-    assert (
-        said("data[1]: always 7")
-        and said("data[2]: never a number")
-        and said("data[3]: grows as a clock or a counter does")
-    )
-    assert said("data[4]: a number in 10 of 400 messages only") and said("data[5]: moves with data[0]")
-    assert said(f"an array of {LONGEST_ARRAY + 1} numbers")
-    assert said("/plant/talk: no number in it") and said("/plant/silent_state: 0 messages only")
+    path, proposal = proposed(tmp_path, driven(("/plant/x_state", "/plant/cmd"), extra=extra), types)
+    comments = "\n".join(line for line in proposal.text.splitlines() if line.lstrip().startswith("#"))
+    for words in (
+        "data[1]: always 7", "data[2]: never a number", "data[3]: grows as a clock or a counter does",
+        "data[4]: a number in 10 of 400 messages only", "data[5]: moves with data[0]",
+        f"an array of {LONGEST_ARRAY + 1} numbers", "/plant/talk: no number in it",
+        "/plant/silent_state: 0 messages only",
+    ):  # fmt: skip
+        assert words in comments
     assert fitted([path], proposal).fit_summary["violations"] == 0
 
 
 def test_no_command_leaves_the_controls_empty(tmp_path):
-    path = save(tmp_path / "a.mcap", [m for m in driven() if m.topic == "/plant/state"], {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, [m for m in driven() if m.topic == "/plant/state"])
     assert not proposal.controls and "controls: []" in proposal.text
     assert fitted([path], proposal).m == 0
 
@@ -278,8 +271,7 @@ def test_commands_that_come_now_and_then(tmp_path):
                 continue
             last = m.data
         messages.append(m)
-    path = save(tmp_path / "a.mcap", messages, {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, messages)
     assert [c.topic for c in proposal.controls] == ["/plant/cmd"]
     assert "max_hold" not in yaml.safe_load(proposal.text)["controls"][0]
     assert fitted([path], proposal).fit_summary["transitions"] > 500
@@ -296,8 +288,7 @@ def test_clocks_that_disagree_or_stand_still_are_not_gone_by(tmp_path, still):
             data = cdr("geometry_msgs/msg/PointStamped", header=stamp, point=point)
             m = Message("/plant/state", m.log_time, data, m.log_time)
         messages.append(m)
-    path = save(tmp_path / "a.mcap", messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
     assert yaml.safe_load(proposal.text)["topics"] == {"/plant/state": {"time": "log"}, "/plant/cmd": {"time": "log"}}
     assert fitted([path], proposal).fit_summary["transitions"] > 300
 
@@ -311,8 +302,7 @@ def test_topics_and_names_that_yaml_would_misread(tmp_path):
         u = rng.normal()
         messages += [Message("/j/states", t, joint_state(t, x, names), t), f64("/j/cmd", t, u)]
         x = x + 0.02 * (-np.arange(1, 5) * x + u) + 1e-3 * rng.normal(size=4)
-    path = save(tmp_path / "a.mcap", messages, {"/j/states": "sensor_msgs/msg/JointState"})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, messages, {"/j/states": "sensor_msgs/msg/JointState"})
     assert len(proposal.states) == 4
     assert fitted([path], proposal).n == 4
 
@@ -513,7 +503,7 @@ def test_noise_is_no_state(tmp_path):
     def extra(k, x, u):
         return [f64("/plant/temperature", 10**18 + k * 20 * MS, 20.0 + 0.1 * rng.normal() + 0.02 * u)]
 
-    proposal = propose([save(tmp_path / "run.mcap", driven(count=2000, extra=extra), {})])
+    proposal = proposed(tmp_path, driven(count=2000, extra=extra))[1]
     assert [c.topic for c in proposal.states] == ["/plant/state"], proposal.text
     (line,) = [line for line in proposal.text.splitlines() if "/plant/temperature" in line]
     assert "noise: one sample predicts" in line or "the controls do not show" in line
@@ -522,8 +512,7 @@ def test_noise_is_no_state(tmp_path):
 def test_a_recording_of_noise_alone_says_so(tmp_path, capsys):
     rng = np.random.default_rng(3)
     messages = [f64("/plant/state", 10**18 + k * 20 * MS, 1.0 + 0.1 * rng.normal()) for k in range(500)]
-    path = save(tmp_path / "run.mcap", messages, {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, messages)
     assert len(proposal.states) == 1 and "# Beware: nothing here is more than noise" in proposal.text
     assert main(["init", str(path)]) == 0
     assert "record the machine at work" in capsys.readouterr().err
@@ -538,8 +527,7 @@ def test_a_late_answer_becomes_the_delay_that_the_fit_would_name(tmp_path, late)
         t = 10**18 + k * 20 * MS
         messages += [f64("/plant/state", t, x + 1e-3 * rng.normal()), f64("/plant/cmd", t, history[-1])]
         x += 0.02 * (-2.0 * x + 3.0 * history[-1 - late])
-    path = save(tmp_path / "run.mcap", messages, {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, messages)
     assert [c.delay for c in proposal.controls] == [late]
     assert not any("better when it is taken" in m for m in fitted([path], proposal).fit_summary["messages"])
 
@@ -551,8 +539,7 @@ def test_numbers_that_stand_for_none_are_ignored_by_the_proposal(tmp_path):
     messages = driven()
     for k in range(0, len(messages), 100):
         messages[k] = f64("/plant/state", messages[k].log_time, 2146000000.0)
-    path = save(tmp_path / "run.mcap", messages, {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, messages)
     (entry,) = yaml.safe_load(proposal.text)["states"]
     assert entry["ignore"] == [2146000000.0] and entry["scale"] < 100
     (run,) = read_transients(path, SignalMap.from_dict(yaml.safe_load(proposal.text)))
@@ -574,8 +561,7 @@ def swinging(count=900):
 
 
 def test_a_rate_that_is_not_recorded_is_proposed_with_what_it_gains(tmp_path):
-    path = save(tmp_path / "run.mcap", swinging(), {})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, swinging())
     entry = yaml.safe_load(proposal.text)["states"][1]
     assert entry["field"] in ("rate(data)", "lag(data, 1)") and "on left-out data" in proposal.text
     blind = SignalMap.from_dict(
@@ -719,8 +705,7 @@ def joints(still=""):
 
 @pytest.mark.parametrize(("still", "members"), [("", ("left", "right", "arm")), ("right", ("left", "arm"))])
 def test_the_file_is_for_all_that_move_alike(tmp_path, still, members):
-    path = save(tmp_path / "joints.mcap", joints(still), {"/joint_states": JOINT, "/joint_commands": JOINT})
-    proposal = propose([path])
+    path, proposal = proposed(tmp_path, joints(still), {"/joint_states": JOINT, "/joint_commands": JOINT})
     assert proposal.members == members
     assert f"# {len(members)} that are alike: each depends on its own states and controls." in proposal.text
     assert ("position[right]: always 0" in proposal.text) == bool(still)

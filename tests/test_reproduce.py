@@ -11,7 +11,7 @@
 
 import io
 import json
-import sys
+import runpy
 from contextlib import redirect_stdout
 from pathlib import Path
 
@@ -21,14 +21,13 @@ import pytest
 pytest.importorskip("scipy", reason="scipy, which the experiment needs, is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, is not installed")
 
-from uncertain_lti import EnvelopeMonitor, UncertainLTI
+from direct_search import direct_search
+
+from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
-from uncertain_lti.plants.leibov import leibov2006, transient
-
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from direct_search import direct_search  # noqa: E402
+from uncertain_lti.plants.leibov import transient
+from uncertain_lti.plants.turbofan_runs import make_run, simulate, turbofan_signals
 
 
 def objective(model, transients):
@@ -53,20 +52,6 @@ def test_the_direct_search_contains_every_sample_and_never_beats_the_exact_solve
     assert found.rows.sum() == pytest.approx(found.objective)
 
 
-def test_the_published_model_can_be_checked_simulated_and_drawn(tmp_path):
-    from uncertain_lti.reports.figures import envelope_figure, save
-
-    model, run = leibov2006(), transient(300, 3)
-    verdicts = EnvelopeMonitor(model).check(run)
-    assert not verdicts.violated.any()
-    assert model.simulate(run.x[0], run.u[:-1], run.dt).shape == run.x.shape
-    figure = envelope_figure(model, verdicts)
-    assert [axes.get_title("left").split()[0] for axes in figure.axes] == [s.name for s in model.signals.states]
-    save(figure, tmp_path / "f.png")
-    narrower = UncertainLTI(model.A, model.B, 0.5 * model.dA, 0.5 * model.dB, signals=model.signals)
-    assert EnvelopeMonitor(narrower).check(run).violated.any()
-
-
 def test_the_published_model_is_known_to_the_commands_by_name(capsys):
     """It contains its own shipped recording up to the sample after which that leaves the intervals, and not beyond."""
     assert main(["check", "leibov2006", str(ROOT / "bags/leibov_check.mcap"), "--json"]) == 1
@@ -77,10 +62,21 @@ def test_the_published_model_is_known_to_the_commands_by_name(capsys):
     assert "-15.59-17j" in capsys.readouterr().out
 
 
+ROOT = Path(__file__).resolve().parents[1]
+RECORDINGS = runpy.run_path(str(ROOT / "bags/make.py"))["TURBOFAN"]
+SHIPPED = {make_run(**parameters): ROOT / f"bags/{name}.mcap" for name, parameters in RECORDINGS.items()}
+
+
+def recorded(run):
+    """A run as it is shipped, which test_turbofan holds against its simulation; one that is not is simulated."""
+    return read_transients(SHIPPED[run], turbofan_signals())[0] if run in SHIPPED else simulate(run)
+
+
 @pytest.fixture(scope="module")
 def experiment(tmp_path_factory):
     folder = tmp_path_factory.mktemp("reproduce")
-    with redirect_stdout(io.StringIO()) as printed:
+    with redirect_stdout(io.StringIO()) as printed, pytest.MonkeyPatch.context() as patch:
+        patch.setattr("uncertain_lti.plants.reproduce.simulate", recorded)
         assert main(["reproduce", "--output", str(folder / "new"), "--json"]) == 0
     data = json.loads((folder / "new" / "reproduce.json").read_text())
     assert json.loads(printed.getvalue()) == {"output": str(folder / "new"), **data}

@@ -598,7 +598,12 @@ def test_what_is_as_new_as_the_chosen_message_comes_late_and_what_is_older_does_
         assert sampler.counters["late /u"] == late
 
 
-STEPS_BACK = ["c105 u106 u101 c107 c108", "c101 u101 u52 u103 c54 u55 c7", "u50 u1 c6 u11 u12 u-33 u19 c21 c23 c28"]
+STEPS_BACK = [
+    "c105 u106 u101 c107 c108",
+    "c101 u101 u52 u103 c54 u55 c7",
+    "u50 u1 c6 u11 u12 u-33 u19 c21 c23 c28",
+    "u100 c100 u50 c50 c52 u58 u51 c53",  # back with the clock and before it: the sample keeps what it had
+]
 """Stamps that tell a rule of a step back from its neighbour; so few streams do that drawn ones seldom show it."""
 
 
@@ -619,15 +624,6 @@ def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: boo
                 sampler.push(*message)
         assert len(sampler.kept("/u")) <= 2
     assert sampler.counters["resets"] == 2
-
-
-def test_a_topic_that_stepped_back_with_the_clock_may_step_back_before_it_again() -> None:
-    """The open sample keeps what it had chosen before."""
-    signals = two_topics()
-    stamps = [("/u", 100), ("/c", 100), ("/u", 50), ("/c", 50), ("/c", 52), ("/u", 58), ("/u", 51), ("/c", 53)]
-    messages = [at(topic, 100 + k, stamp, float(k)) for k, (topic, stamp) in enumerate(stamps)]
-    hold_against(Reference(signals, messages, forgets=True), signals, messages)
-    assert run(signals, messages)[0][-1][0].u.tolist() == [2.0]
 
 
 @settings(max_examples=40)

@@ -94,32 +94,24 @@ def outside(model, transient):
 @pytest.mark.parametrize("which", SCHEDULES)
 def test_objective_is_that_of_the_problem_as_written(which, criterion):
     schedule = SCHEDULES[which]
-    for additive in ("none", "both"):
+    rng = np.random.default_rng(0)
+    root = rng.standard_normal((500, 2, 2))
+    weights = {
+        "control": rng.uniform(0.1, 10, (500, 2)),
+        "state": np.array([1.0, 30.0]),
+        "further": root @ root.transpose(0, 2, 1) + 0.1 * np.eye(2),
+    }
+    for additive, W in (("none", None), ("both", None), ("disturbance", weights.get(which))):
+        if additive == "disturbance" and W is None:
+            continue
         transient = drawn(schedule, 500, 1, noise=0.0 if additive == "none" else 1e-3)
-        model = fit(transient, criterion, additive=additive, schedule=schedule)
-        expected = optimum(transient, schedule, additive, criterion)
+        model = fit(transient, criterion, W, additive, schedule=schedule)
+        expected = optimum(transient, schedule, additive, criterion, W)
         assert [data.tied_to for data in model.block_data] == [None] * schedule.blocks
         assert sum(data.transitions for data in model.block_data) == 500
         assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
         assert model.fit_summary["optimality_gap"] < 1e-7
         assert outside(model, transient) == 0
-
-
-@pytest.mark.parametrize("criterion", ["qp", "lp"])
-@pytest.mark.parametrize("kind", ["per state", "per sample", "full"])
-def test_weights_of_a_scheduled_model(criterion, kind):
-    transient = drawn(THREE, 400, 2, noise=1e-3)
-    rng = np.random.default_rng(0)
-    root = rng.standard_normal((400, 2, 2))
-    weights = {
-        "per state": np.array([1.0, 30.0]),
-        "per sample": rng.uniform(0.1, 10, (400, 2)),
-        "full": root @ root.transpose(0, 2, 1) + 0.1 * np.eye(2),
-    }[kind]
-    model = fit(transient, criterion, weights, "disturbance", schedule=THREE)
-    expected = optimum(transient, THREE, "disturbance", criterion, weights)
-    assert np.atleast_1d(model.fit_summary["objective"]) == pytest.approx(expected, rel=1e-6)
-    assert model.fit_summary["optimality_gap"] < 1e-7
 
 
 @settings(max_examples=25, deadline=None)

@@ -17,7 +17,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from engine_bag import SIGNALS, engine_bag
 
 import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, OperatingPoint, Transient, UncertainLTI, validate
@@ -59,8 +58,12 @@ def options(**more):
     return {"additive": "noise", **more}
 
 
-def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out():
-    model = fit(RUNS, schedule={"x1": "auto"}, **options())
+@pytest.fixture(scope="module")
+def model():
+    return fit(RUNS, schedule={"x1": "auto"}, **options())
+
+
+def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out(model):
     one = fit(RUNS, **options())
     (facts,) = model.fit_summary["schedule"]
     assert facts["chosen"] == 3 == model.schedule.blocks
@@ -77,8 +80,7 @@ def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out
     assert model.fit_summary["mean_width"][1] < 0.6 * one.fit_summary["mean_width"][1]
 
 
-def test_the_table_is_that_of_validate():
-    model = fit(RUNS, schedule={"x1": "auto"}, **options())
+def test_the_table_is_that_of_validate(model):
     (facts,) = model.fit_summary["schedule"]
     row = next(row for row in facts["candidates"] if row["knots"] == facts["chosen"])
     left = validate(model, RUNS)
@@ -245,11 +247,10 @@ def test_validate_keeps_the_knots_of_the_model():
 
 
 @pytest.fixture
-def folder(tmp_path):
+def folder(engine_copy):
     """A recording of an engine, whose plant is linear, and its signals file."""
-    (tmp_path / "signals.yaml").write_text(SIGNALS)
-    engine_bag(tmp_path / "run.mcap")
-    return tmp_path
+    (engine_copy / "m.model.json").unlink()
+    return engine_copy
 
 
 def command(folder, *more):

@@ -52,8 +52,7 @@ def test_the_policy_allows_what_the_node_does_and_nothing_else(world: World, tmp
         clock=topics[str(model.signals.clock)],
         time={topics[t]: source for t, source in model.signals.time.items()},
     )
-    model = type(model)(model.A, model.B, model.dA, model.dB, signals=signals, sampling=model.sampling)
-    world.monitor(saved(model, tmp_path), use_sim_time=True)
+    world.monitor(saved(model.replace(signals=signals), tmp_path), use_sim_time=True)
     node = world.node
 
     def names(found: list[tuple[str, list[str]]]) -> set[str]:
