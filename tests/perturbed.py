@@ -285,6 +285,10 @@ Row = dict[str, Any]
 """What is said of one sample, arrays as bytes."""
 
 
+_ARRAYS = ("flags", "lower", "upper", "utilisation", "horizon_utilisation", "statistics", "state")
+_TRUTHS = ("outside_domain", "unknown_regime", "violated")
+
+
 def _row(**said: Any) -> Row:
     return {
         name: np.asarray(value, dtype=np.float64).tobytes() if isinstance(value, np.ndarray) else value
@@ -331,15 +335,9 @@ def told(verdicts: Sequence[Any], latched: bool = False) -> list[Row]:
         if v.status.dropped:
             assert not v.judged and math.isnan(v.flags[0])
             continue
-        rows.append(
-            _row(
-                t_ns=v.t_ns, status=v.status, alarm=v.alarm or latched, flags=v.flags, lower=v.lower, upper=v.upper,
-                utilisation=v.utilisation, horizon_utilisation=v.horizon_utilisation, statistics=v.statistics,
-                raised=v.raised, outside=v.outside_domain, unknown=v.unknown_regime, violated=v.violated,
-                frozen=tuple(moved.state for moved in v.frozen),
-                repeating=tuple(moved.state for moved in v.repeating), state=v.state,
-            )
-        )  # fmt: skip
+        said = {name: getattr(v, name) for name in (*_ARRAYS, *_TRUTHS)}
+        said |= {name: tuple(moved.state for moved in getattr(v, name)) for name in ("frozen", "repeating")}
+        rows.append(_row(t_ns=v.t_ns, status=v.status, alarm=v.alarm or latched, raised=v.raised, **said))
     return rows
 
 
@@ -352,18 +350,13 @@ def offline(model: UncertainLTI, rule: Rule, messages: Sequence[Message], path: 
     )
     deployed = DeployedMonitor(monitor, Condition.parse(rule.enable), rule.grace, rule.latch)
     verdicts, _ = check_recording(deployed, Bag(path))
-    return [
-        _row(
-            t_ns=int(verdicts.transient.t_ns[k]), status=status, alarm=bool(verdicts.alarm[k]),
-            flags=verdicts.flags[k], lower=verdicts.lower[k], upper=verdicts.upper[k],
-            utilisation=verdicts.utilisation[k], horizon_utilisation=verdicts.horizon_utilisation[k],
-            statistics=verdicts.statistics[k], raised=verdicts.raised(k), outside=bool(verdicts.outside_domain[k]),
-            unknown=bool(verdicts.unknown_regime[k]), violated=bool(verdicts.violated[k]),
-            frozen=tuple(np.flatnonzero(verdicts.frozen[k]).tolist()),
-            repeating=tuple(np.flatnonzero(verdicts.repeating[k]).tolist()), state=verdicts.state[k],
-        )
-        for k, status in enumerate(verdicts.statuses())
-    ]  # fmt: skip
+    rows = []
+    for k, status in enumerate(verdicts.statuses()):
+        said = {name: getattr(verdicts, name)[k] for name in _ARRAYS}
+        said |= {name: bool(getattr(verdicts, name)[k]) for name in ("alarm", *_TRUTHS)}
+        said |= {name: tuple(np.flatnonzero(getattr(verdicts, name)[k]).tolist()) for name in ("frozen", "repeating")}
+        rows.append(_row(t_ns=int(verdicts.transient.t_ns[k]), status=status, raised=verdicts.raised(k), **said))
+    return rows
 
 
 Arriving = tuple[float, str, int, bytes, int]

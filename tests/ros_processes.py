@@ -220,6 +220,7 @@ class World:
             "PYTHONUNBUFFERED": "1",
         }
         self._processes: list[Process] = []
+        self._hosted: list[Any] = []
         self._clients: dict[tuple[Any, str], Any] = {}
         self._context = Context()
         rclpy.init(context=self._context, domain_id=domain)
@@ -234,6 +235,11 @@ class World:
         while not self._ends:
             self._executor.spin_once(timeout_sec=0.02)
 
+    def host(self, node: Any) -> None:
+        """Have a node of this process run beside the one that listens, and end with it."""
+        self._hosted.append(node)
+        self._executor.add_node(node)
+
     def close(self) -> None:
         for process in self._processes:
             process.kill()
@@ -241,7 +247,10 @@ class World:
         self._ends = True
         self._thread.join()
         self._executor.shutdown()  # first: the middleware calls it as long as it knows of the node's entities
-        self.node.destroy_node()
+        for node in self._hosted:
+            node.finish()
+        for node in (*self._hosted, self.node):
+            node.destroy_node()
         self._context.try_shutdown()
 
     # --- processes ---
@@ -253,17 +262,19 @@ class World:
         self._processes.append(process)
         return process
 
-    def run_node(self, module: str, parameters: dict[str, Any], *more: str) -> Process:
+    def run_node(self, module: str, parameters: dict[str, Any], *more: str, code: str = "") -> Process:
+        """A node, by its console script or by this code, in a Python of its own."""
         given = [part for key, value in parameters.items() for part in ("-p", f"{key}:={json.dumps(value)}")]
-        return self.start(module, _NODES.format(module), "--ros-args", *given, *more, forked=True)
+        command = ["-c", code] if code else [_NODES.format(module)]
+        return self.start(module, *command, "--ros-args", *given, *more, forked=not code)
 
     def command(self, name: str, *arguments: Any) -> Process:
         """`play`, `record`, `watch` or `demo`."""
         return self.start(name, _COMMANDS, name, *(str(a) for a in arguments), forked=True)
 
-    def monitor(self, model: Path | str, *more: str, name: str = MONITOR, **parameters: Any) -> Process:
+    def monitor(self, model: Path | str, *more: str, name: str = MONITOR, code: str = "", **parameters: Any) -> Process:
         """An envelope_monitor that is active."""
-        process = self.run_node("envelope_monitor", {"model": str(model)} | parameters, *more)
+        process = self.run_node("envelope_monitor", {"model": str(model)} | parameters, *more, code=code)
         until(lambda: self.status(name).get("state") == "active" or not process.running, "an active monitor")
         assert process.running, process.output
         return process

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from pathlib import Path
 
@@ -22,7 +21,6 @@ import yaml
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from geometry_msgs.msg import Vector3Stamped
-from rclpy.experimental import EventsExecutor
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from ros_processes import Diagnostics, World, until
@@ -76,43 +74,25 @@ def test_two_monitors_in_one_process(world: World, tmp_path: Path) -> None:
         )
         for name, prefix in (("left", "/robot1"), ("right", "/robot2/"))
     ]  # fmt: skip
-    executor = EventsExecutor(context=world.node.context)
     for node in nodes:
-        executor.add_node(node)
+        world.host(node)
         node.start()
         assert node.active, node.reason
-    ends = threading.Event()
+    diagnostics = world.diagnostics()
+    flags = {name: world.listen(JointState, f"/fleet/{name}/flags").connected() for name in ("left", "right")}
+    robots = Robots(world, ["/robot1", "/robot2"])
+    robots.send("/robot1", 12)
+    robots.send("/robot2", 7)
+    assert len(flags["left"].count(12)) == 12 and len(flags["right"].count(7)) == 7
+    assert [stamp_of(m) for m in flags["left"].messages] == [EPOCH_NS + 10_000_000 * k for k in range(12)]
+    for name, verdicts in (("left", "11"), ("right", "6")):
 
-    def spin() -> None:
-        while not ends.is_set():
-            executor.spin_once(timeout_sec=0.02)
+        def reported(monitor: str = f"fleet/{name}: monitor", verdicts: str = verdicts) -> bool:
+            status = diagnostics.latest(monitor)
+            return status is not None and Diagnostics.values(status)["verdicts"] == verdicts
 
-    thread = threading.Thread(target=spin)
-    thread.start()
-    try:
-        diagnostics = world.diagnostics()
-        flags = {name: world.listen(JointState, f"/fleet/{name}/flags").connected() for name in ("left", "right")}
-        robots = Robots(world, ["/robot1", "/robot2"])
-        robots.send("/robot1", 12)
-        robots.send("/robot2", 7)
-        assert len(flags["left"].count(12)) == 12 and len(flags["right"].count(7)) == 7
-        assert [stamp_of(m) for m in flags["left"].messages] == [EPOCH_NS + 10_000_000 * k for k in range(12)]
-        for name, verdicts in (("left", "11"), ("right", "6")):
-            monitor = f"fleet/{name}: monitor"
-            until(
-                lambda m=monitor, v=verdicts: (
-                    (status := diagnostics.latest(m)) and Diagnostics.values(status)["verdicts"] == v
-                ),
-                f"a report of {name}",
-            )
-        assert [node.session.monitor.rule.margin for node in nodes if node.session] == [2.0, 2.0]
-    finally:
-        ends.set()
-        thread.join()
-        executor.shutdown()
-        for node in nodes:
-            node.finish()
-            node.destroy_node()
+        until(reported, f"a report of {name}")
+    assert [node.session.monitor.rule.margin for node in nodes if node.session] == [2.0, 2.0]
 
 
 def test_inputs_under_a_prefix_and_their_enable_condition(world: World, tmp_path: Path) -> None:

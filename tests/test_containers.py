@@ -35,15 +35,19 @@ JAZZY = get_typestore(Stores.ROS2_JAZZY)
 NOETIC = get_typestore(Stores.ROS1_NOETIC)
 
 
-def to_database(source, folder):
-    with Rosbag2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+def copied(source, writer, store, converted=lambda data, definition: data):
+    """The messages of a recording through another writer."""
+    with writer:
         connections = {}
         for raw in Bag(source).raw_messages():
+            kind = raw.channel.definition.type_name
             if raw.topic not in connections:
-                connections[raw.topic] = writer.add_connection(
-                    raw.topic, raw.channel.definition.type_name, typestore=JAZZY
-                )
-            writer.write(connections[raw.topic], raw.log_time_ns, raw.data)
+                connections[raw.topic] = writer.add_connection(raw.topic, kind, typestore=store)
+            writer.write(connections[raw.topic], raw.log_time_ns, converted(raw.data, raw.channel.definition))
+
+
+def to_database(source, folder):
+    copied(source, Rosbag2Writer(folder, version=9, storage_plugin=StoragePlugin.SQLITE3), JAZZY)
     return next(folder.glob("*.db3"))
 
 
@@ -52,16 +56,12 @@ def to_ros1(source, path, compression=None, chunk=1 << 18):
     if compression:
         writer.set_compression(Ros1Writer.CompressionFormat[compression])
     writer.chunk_threshold = chunk
-    with writer:
-        connections = {}
-        for raw in Bag(source).raw_messages():
-            if raw.topic not in connections:
-                connections[raw.topic] = writer.add_connection(
-                    raw.topic, raw.channel.definition.type_name, typestore=NOETIC
-                )
-            definition = raw.channel.definition
-            whole = bytes(JAZZY.serialize_cdr(definition.decode(raw.data), definition.type_name))
-            writer.write(connections[raw.topic], raw.log_time_ns, JAZZY.cdr_to_ros1(whole, definition.type_name))
+
+    def converted(data, definition):
+        whole = bytes(JAZZY.serialize_cdr(definition.decode(data), definition.type_name))
+        return JAZZY.cdr_to_ros1(whole, definition.type_name)
+
+    copied(source, writer, NOETIC, converted)
     return path
 
 

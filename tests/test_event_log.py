@@ -84,6 +84,14 @@ class Rig:
             self.t_ns += round(min(seconds, 0.1) * 1e9)
             self.event_log.look(self.session, self.now, TIMEOUT, self.publishers, self.problems)
 
+    @classmethod
+    def at_work(cls, **rule: Any) -> Rig:
+        """One that has judged some samples and said so."""
+        rig = cls(**rule)
+        rig.send(10)
+        rig.said.clear()
+        return rig
+
     @property
     def lines(self) -> list[str]:
         """What was said since this was last asked for."""
@@ -114,9 +122,7 @@ def test_a_state_that_drifts_from_day_to_day_is_told_once_a_day() -> None:
 
 
 def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end_is_none() -> None:
-    rig = Rig()
-    rig.send(10)
-    rig.lines.clear()
+    rig = Rig.at_work()
     rig.send(3, off=2.0)
     (level, line) = rig.said[-1]
     verdict = rig.session.last
@@ -181,9 +187,7 @@ def test_an_alarm_by_a_statistic_says_which_state_and_by_how_much() -> None:
 
 
 def test_masked_states_are_not_named_and_a_latched_alarm_says_what_ends_it() -> None:
-    rig = Rig(masked="b", latch=True)
-    rig.send(10)
-    rig.lines.clear()
+    rig = Rig.at_work(masked="b", latch=True)
     rig.send(30, off=-2.0)
     (line,) = rig.lines[-1:]
     assert " below its bounds " in line and "b = " not in line and line.endswith("it lasts until ~/reset")
@@ -254,9 +258,7 @@ def test_an_alarm_that_stands_through_silence_is_told_in_the_reports() -> None:
 
 
 def test_a_flapping_alarm_does_not_flood_the_log_and_each_is_named_or_counted() -> None:
-    rig = Rig()
-    rig.send(10)
-    rig.lines.clear()
+    rig = Rig.at_work()
     began = rig.now
     for _ in range(100):
         rig.send(2, off=2.0)
@@ -290,6 +292,8 @@ def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     rig.send(20)
     assert rig.lines == [f"messages on {CONTROL} again", "judging again, after 30.0 s without a verdict"]
     rig.send(400, control=False)
+    values = rig.session.report(rig.now, TIMEOUT)[0].values
+    assert float(values[f"age {CONTROL}"]) > 0.5 > float(values[f"age {STATE}"]) and int(values["stale p"]) > 20
     assert [re.sub(r"\d+\.\d", "#", line) for line in rig.lines] == [
         f"no message on {CONTROL} for # s",
         "no verdict for # s: p, q missing, stale or not finite",
@@ -312,9 +316,7 @@ NO_NAME = f"{STATE}: there is no '{{}}' in the message's names"
     ],
 )
 def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: str, why: str) -> None:
-    rig = Rig()
-    rig.send(20)
-    rig.lines.clear()
+    rig = Rig.at_work()
     fixed = rig.t_ns
     for _ in range(150):
         rig.send(1, state=False)

@@ -14,10 +14,14 @@ from __future__ import annotations
 import os
 import struct
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import fuzz
 import pytest
+
+from uncertain_lti.recordings.message_reader import UnreadableError
+from uncertain_lti.signals.field_path import FieldPath
 
 
 @pytest.mark.parametrize("kind", list(fuzz.DAMAGED))
@@ -45,6 +49,7 @@ def framed(
 
 
 BIG = b"\0\0\0\0"
+needs_rclpy = pytest.mark.skipif(find_spec("rclpy") is None, reason="rclpy is not installed")
 READ = {
     "regular": framed(b"base\0"),
     "Latin-1": framed(b"Tr\xe4ger\0"),
@@ -70,11 +75,8 @@ REFUSED = {
 }
 
 
+@needs_rclpy
 def test_odd_messages_read_alike_live_and_from_recordings() -> None:
-    pytest.importorskip("rclpy", reason="rclpy is not installed")
-    from uncertain_lti.recordings.message_reader import UnreadableError
-    from uncertain_lti.signals.field_path import FieldPath
-
     make_reader, fields, decoder = fuzz.middleware()
     paths = [FieldPath("position[a]")]
     live = make_reader(fuzz.JOINT_STATE, paths, fields, decoder(fuzz.JOINT_STATE))
@@ -105,9 +107,6 @@ def made(kind: str, *values: object) -> bytes:
 
 def read_alike(kind: str, path: str, data: bytes, before: list[bytes]) -> float | None:
     """What live and a recording read of a message, which must be the same; None where both refuse it."""
-    from uncertain_lti.recordings.message_reader import UnreadableError
-    from uncertain_lti.signals.field_path import FieldPath
-
     make_reader, fields, decoder = fuzz.middleware()
     live = make_reader(kind, [FieldPath(path)], fields, decoder(kind))
     for one in before:
@@ -122,9 +121,9 @@ def read_alike(kind: str, path: str, data: bytes, before: list[bytes]) -> float 
     return float(value)
 
 
+@needs_rclpy
 def test_a_cut_message_is_refused_live_and_of_recordings() -> None:
     """Also where the middleware takes the bytes that are missing for zeros."""
-    pytest.importorskip("rclpy", reason="rclpy is not installed")
     from geometry_msgs.msg import Point32, Polygon
     from std_msgs.msg import Header
 
@@ -142,17 +141,17 @@ def test_a_cut_message_is_refused_live_and_of_recordings() -> None:
                 assert read_alike(kind, path, data[:size], before) is None, size
 
 
+@needs_rclpy
 def test_a_byte_is_a_number_live_as_of_recordings() -> None:
-    pytest.importorskip("rclpy", reason="rclpy is not installed")
     for kind, path in (("std_msgs/msg/Byte", "data"), ("diagnostic_msgs/msg/DiagnosticStatus", "level")):
         data = made(kind, b"\7")
         assert read_alike(kind, path, data, []) == read_alike(kind, path, data, [data] * 2) == 7.0
 
 
+@needs_rclpy
 @pytest.mark.parametrize("path", ["present", "voltage"])
 def test_a_truth_value_of_2_is_refused_live_and_of_recordings(path: str) -> None:
     """Wanted or not, whether messages like it are known or not."""
-    pytest.importorskip("rclpy", reason="rclpy is not installed")
     from std_msgs.msg import Header
 
     kind = "sensor_msgs/msg/BatteryState"

@@ -283,20 +283,25 @@ def test_rest_with_a_moving_successor_names_sample_and_remedy():
         assert count_outside(fit(transient, additive=additive), [transient]) == 0
 
 
-def test_input_that_never_moves_is_named():
-    raw = drawn(small_plant(1, 2, 2), 200, 1, rest=0)
-    for value, words in ((0.0, "'steering' is 0 in every transition"), (0.7, "'steering' is constant")):
-        u = raw.u.copy()
-        u[:, 1] = value
-        model = fit(
-            Transient(raw.t_ns, raw.x, u, control_names=["throttle", "steering"]),
-            additive="disturbance" if value else "noise",
-        )
-        assert any(words in message for message in model.fit_summary["messages"])
-        assert count_outside(model, [Transient(raw.t_ns, raw.x, u)]) == 0
-        if value == 0.0:
-            assert model.fit_summary["rank"] == 3
-            assert (model.B[:, 1] == 0).all() and (model.dB[:, 1] == 0).all()
+@pytest.mark.parametrize(
+    ("factors", "more", "rank", "words"),
+    [
+        ([1.0, 0.0], 0.0, 3, "'steering' is 0 in every transition"),
+        ([1.0, 0.0], 0.7, 4, "'steering' is constant"),
+        ([1.0, 0.0, 0.0], 0.0, 3, "'steering' and 'brake' are 0 in every transition, so their columns are not"),
+        (None, 0.0, 3, "'throttle' and 'steering' move together in every transition"),
+    ],
+)
+def test_inputs_that_say_nothing_or_the_same_are_named_in_one_message(factors, more, rank, words):
+    raw = drawn(small_plant(1, 2, len(factors or [1, 1])), 200, 1, rest=0)
+    u = raw.u[:, [0, 0]] * [1.0, -2.0] if factors is None else raw.u * factors + [0.0, more, 0.0][: len(factors)]
+    moved = Transient(raw.t_ns, raw.x, u, control_names=["throttle", "steering", "brake"][: u.shape[1]])
+    model = fit(moved, additive="disturbance" if more else "noise")
+    told = [m for m in model.fit_summary["messages"] if "in every transition" in m]
+    assert words in told[-1] and len(told) == 1 + bool(more) and count_outside(model, [moved]) == 0
+    assert model.fit_summary["rank"] == rank
+    still = ~u.any(axis=0)
+    assert not model.B[:, still].any() and not model.dB[:, still].any()
 
 
 def test_a_fit_does_not_end_for_what_is_said_of_it(monkeypatch):
@@ -308,22 +313,6 @@ def test_a_fit_does_not_end_for_what_is_said_of_it(monkeypatch):
     raw = drawn(small_plant(1, 2, 2), 400, 1, rest=0)
     monkeypatch.setattr("uncertain_lti.identification.discard._solve", gives_up)
     assert count_outside(fit(raw, additive="noise", seek_carriers=True), [raw]) == 0
-
-
-def test_inputs_that_never_move_are_named_in_one_message():
-    raw = drawn(small_plant(1, 2, 3), 200, 1, rest=0)
-    u = raw.u * [1.0, 0.0, 0.0]
-    model = fit(Transient(raw.t_ns, raw.x, u, control_names=["throttle", "steering", "brake"]), additive="noise")
-    told = [message for message in model.fit_summary["messages"] if "in every transition" in message]
-    assert len(told) == 1 and "'steering' and 'brake' are 0 in every transition, so their columns are not" in told[0]
-
-
-def test_signals_that_move_together_are_named():
-    raw = drawn(small_plant(1, 2, 2), 200, 1, rest=0)
-    u = np.column_stack([raw.u[:, 0], -2.0 * raw.u[:, 0]])
-    model = fit(Transient(raw.t_ns, raw.x, u, control_names=["left", "right"]), additive="noise")
-    assert any("'left' and 'right' move together" in message for message in model.fit_summary["messages"])
-    assert model.fit_summary["rank"] == 3
 
 
 def test_unstable_nominal_model_is_said():

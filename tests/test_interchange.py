@@ -22,6 +22,7 @@ from uncertain_lti.base.text import MOST
 from uncertain_lti.identification import fit
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
+from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.reports import figures
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -40,7 +41,7 @@ def some_model(n=2, m=1, seed=0, drift=True, names=None):
 
 
 def same(a, b, exactly=True):
-    for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+    for name in ARRAYS:
         left, right = getattr(a, name), getattr(b, name)
         assert np.array_equal(left, right) if exactly else np.allclose(left, right, rtol=1e-12, atol=1e-12), name
 

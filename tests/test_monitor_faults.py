@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 import signal
 import subprocess
@@ -37,7 +36,6 @@ from uncertain_lti.monitor.verdict import Verdict
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import test_node_stream as stream_cases
-from geometry_msgs.msg import Vector3Stamped
 from processes import own_domain
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -50,7 +48,6 @@ from std_msgs.msg import Bool, UInt8
 from test_live import (
     CONTROL,
     EPOCH_NS,
-    ERROR,
     JOINT_STATE,
     OK,
     STALE,
@@ -160,41 +157,6 @@ def mutated(rng: random.Random, data: bytes) -> bytes:
     return bytes(body)
 
 
-def test_a_silent_state_and_a_silent_control_are_told_apart(bench: StartBench) -> None:
-    on = bench(state_timeout=0.4, heartbeat=0.2)
-    diagnostics, flags, plant = on.diagnostics, on.flags, on.plant
-    violation = on.world.listen(Bool, f"{NODE}/violation").connected()
-    plant.send(10)
-    flags.count(10)
-
-    u = plant.model.operating_point.u_s
-    before = diagnostics.count
-    for k in range(60):  # the control goes on, the state does not
-        message = stamped(Vector3Stamped(), plant.t_ns + k * STEP_NS)
-        message.vector.x, message.vector.y = float(u[0]), float(u[1])
-        plant.control.publish(message)
-        time.sleep(0.01)
-    status = diagnostics.reaches(STALE, saying=f"no message on {STATE} for", since=before)
-    values = Diagnostics.values(status)
-    assert float(values[f"age {CONTROL}"]) < 0.4 <= float(values[f"age {STATE}"])
-    assert len(flags.messages) == 10 and violation.messages[-1].data is False
-
-    assert not ever(diagnostics, OK, "0 verdicts")
-    plant.t_ns += 60 * STEP_NS
-    plant.send(5)
-    flags.count(15)
-    x = plant.model.operating_point.recorded_x(plant.x).tolist()
-    for k in range(80):  # the state goes on, the control does not: held for max_hold, 0.5 s, and no longer
-        plant.state.publish(stamped(JointState(name=["a", "b"], position=x), plant.t_ns + k * STEP_NS))
-        time.sleep(0.01)
-    got = np.isnan(on.flagged(95, since=15))
-    held = np.flatnonzero(got)[0]
-    assert 49 <= held <= 52 and got[held:].all(), held
-    until(lambda: ever(diagnostics, ERROR, "a signal is missing, stale or not finite"), "a report of it")
-    values = Diagnostics.values(diagnostics.reaches(STALE))
-    assert float(values[f"age {CONTROL}"]) > 0.5 and int(values["stale p"]) > 20
-
-
 def test_missed_deadlines_are_told(world: World, tmp_path: Path) -> None:
     model = by_hand()
     plant = Plant(world, model)
@@ -267,11 +229,7 @@ deployed.EnvelopeMonitor = Judging
 envelope_monitor.EnvelopeMonitorNode.report = reporting
 sys.exit(envelope_monitor.main())
 """
-    path = saved(model, tmp_path)
-    process = world.start(
-        "monitor", "-c", code, "--ros-args", "-p", f"model:={json.dumps(str(path))}", "-p", "diagnostics_period:=0.1"
-    )
-    until(lambda: world.status().get("state") == "active" or not process.running, "an active monitor")
+    process = world.monitor(saved(model, tmp_path), code=code, diagnostics_period=0.1)
     diagnostics = world.diagnostics()
     flags = world.listen(JointState, f"{NODE}/flags").connected()
     plant = Plant(world, model).subscribed()

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -151,10 +150,8 @@ envelope_monitor.EnvelopeMonitorNode.subscribe = subscribing
 sys.exit(envelope_monitor.main())
 """
     diagnostics = world.diagnostics()
-    process = world.start(
-        "monitor", "-c", code, "--ros-args", "-p", f"model:={json.dumps(str(saved(by_hand(), tmp_path)))}",
-        "-p", "diagnostics_period:=0.1", "-p", "autostart:=false",
-    )  # fmt: skip
+    given = {"model": str(saved(by_hand(), tmp_path)), "diagnostics_period": 0.1, "autostart": False}
+    process = world.run_node("envelope_monitor", given, code=code)
     assert world.change("configure")
     events = world.listen(TransitionEvent, f"{NODE}/transition_event").connected()
     assert not world.change("activate")
@@ -202,10 +199,7 @@ sys.modules["rclpy.experimental"] = None
 from uncertain_lti_ros.envelope_monitor import main
 sys.exit(main())
 """
-    process = world.start(
-        "monitor", "-c", code, "--ros-args", "-p", f"model:={json.dumps(str(path))}", "-p", "use_sim_time:=true"
-    )
-    until(lambda: world.status().get("state") == "active" or not process.running, "an active monitor")
+    process = world.monitor(path, code=code, use_sim_time=True)
     process.says("runs on the default executor")
     outputs = Outputs.of(world)
     # this executor may swap messages that arrive together, so the next one waits for the one before

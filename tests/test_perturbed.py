@@ -38,7 +38,7 @@ def test_live_is_offline(case, tmp_path: Path) -> None:
         assert not found, f"seed {seed}: {found}"
         seen.update(row["status"] for row in ours)
         raised |= {reason.kind for row in ours for reason in row["raised"]}
-        seen["outside"] += sum(row["outside"] for row in ours)
+        seen["outside"] += sum(row["outside_domain"] for row in ours)
         seen["alarm"] += sum(row["alarm"] for row in ours)
     assert seen[Status.OK] > 100 * COUNTS[case] / 3 and seen["outside"] > 100 and seen["alarm"] > 500
     assert seen.keys() >= {Status.OK, Status.MISSING, Status.FROZEN}

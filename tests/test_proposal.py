@@ -383,7 +383,7 @@ def test_a_table_of_many_columns_takes_seconds(tmp_path):
     assert "temp_4: moves with temp_3" in text and "temp_7: says what temp_8 says already" in text
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6), missing=st.booleans())
 def test_what_is_looked_for_at_once_leaves_out_nothing(seed, missing):
     rng = np.random.default_rng(seed)

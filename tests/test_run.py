@@ -84,11 +84,6 @@ def this_python(setting: str = "") -> str:
     return f'{setting} exec "{Path(sys.executable).resolve()}" "$@"'
 
 
-def python_of_version(version: str) -> str:
-    """Shell text that answers like an interpreter of that version; asked for more, it fails."""
-    return f"[[ $2 == *version_info* ]] && echo {version}"
-
-
 def refusal(result: subprocess.CompletedProcess) -> str:
     """The one sentence with which `./run` stopped."""
     assert result.returncode == 2, result
@@ -104,30 +99,43 @@ def test_help_lists_the_commands(run):
         assert f"\n  {command}" in result.stdout
 
 
-def test_unknown_command(run):
-    assert "no command 'tset'" in refusal(run("tset"))
-
-
-def test_no_python(run):
-    assert "apt-get install python3 python3-dev gcc" in refusal(run("setup"))
-
-
-def test_every_python_of_a_wrong_version_is_named(run):
-    programs = {"python3": python_of_version("3.14"), "python3.12": "exit 127"}
-    sentence = refusal(run("setup", programs=programs))
-    assert "Python 3.11, 3.12 or 3.13 is needed" in sentence and "python3 is 3.14" in sentence
-    assert "python3.12 is" not in sentence
-
-
 def without(module: str, folder: Path) -> str:
     """Shell text that is this interpreter without a module of the standard library."""
     (folder / f"{module}.py").write_text("raise ModuleNotFoundError\n")
     return this_python(f'PYTHONPATH="{folder}"')
 
 
-def test_python_without_venv_module(run, tmp_path):
-    sentence = refusal(run("setup", programs={"python3": without("venv", tmp_path)}))
-    assert sentence.endswith(f"apt-get install python{VERSION}-venv")
+OLD, HUMBLE = "[[ $2 == *version_info* ]] && echo 3.14", "[[ $2 == 'import rclpy' ]] || echo 3.10"
+SOURCED = {"ROS_DISTRO": "humble"}
+
+
+@pytest.mark.parametrize(
+    ("words", "programs", "environment", "says"),
+    [
+        ("tset", {}, {}, "no command 'tset'"),
+        ("setup all", {"python3": this_python()}, {}, "setup takes --all or --monitor, and not 'all'"),
+        ("setup", {}, {}, "apt-get install python3 python3-dev gcc$"),
+        ("setup", {"python3": OLD, "python3.12": "exit 127"}, {}, "3.11, 3.12 or 3.13 is needed, python3 is 3.14;"),
+        ("setup", {"python3": "venv"}, {}, rf"apt-get install python{VERSION}-venv$"),
+        ("setup", {"python3": OLD, f"python{VERSION}": "venv"}, {}, f"Python {VERSION} has no venv module"),
+        (
+            "setup",
+            {"python3": HUMBLE, "python3.11": this_python()},
+            {"ROS_DISTRO": "humble"},
+            "humble runs on Python 3.10",
+        ),
+        (
+            "setup",
+            {"python3": this_python("CC=no-such-compiler")},
+            {},
+            f"a C compiler.*apt-get install gcc python{VERSION}-dev$",
+        ),
+    ],
+    ids=["command", "option", "no Python", "versions", "venv", "its own name", "ROS 2", "compiler"],
+)
+def test_what_is_lacking_is_a_sentence_with_the_remedy(run, tmp_path, words, programs, environment, says):
+    programs = {name: without(text, tmp_path) if text == "venv" else text for name, text in programs.items()}
+    assert re.search(says, refusal(run(*words.split(), programs=programs, **environment)))
 
 
 def test_python_without_ensurepip_takes_pip_from_the_index(run, tmp_path):
@@ -155,22 +163,6 @@ def test_python_without_ensurepip_takes_pip_from_the_index(run, tmp_path):
     assert first.stderr.strip().endswith("/simple/pip/ lists no wheel of pip")
     assert "pip-25.1-py3-none-any.whl is not what" in second.stderr.splitlines()[-1]
     assert asked == ["/simple/pip/", "/simple/pip/", "/p/pip-25.1-py3-none-any.whl"]
-
-
-def test_no_compiler(run):
-    sentence = refusal(run("setup", programs={"python3": this_python("CC=no-such-compiler")}))
-    assert "a C compiler" in sentence and sentence.endswith(f"apt-get install gcc python{VERSION}-dev")
-
-
-def test_a_suitable_python_is_found_under_its_own_name(run, tmp_path):
-    programs = {"python3": python_of_version("3.14"), f"python{VERSION}": without("venv", tmp_path)}
-    assert f"Python {VERSION} has no venv module" in refusal(run("setup", programs=programs))
-
-
-def test_sourced_ros_on_another_python(run):
-    programs = {"python3": "[[ $2 == 'import rclpy' ]] || echo 3.10", "python3.11": this_python()}
-    sentence = refusal(run("setup", programs=programs, ROS_DISTRO="humble"))
-    assert "ROS 2 humble runs on Python 3.10" in sentence
 
 
 def test_no_network(run):
@@ -344,12 +336,6 @@ def test_a_machine_without_loopback_is_a_sentence(run, tmp_path, command):
         env={"PATH": f"{Path(sys.executable).resolve().parent}:{os.environ['PATH']}"},
     )
     assert "the loopback interface of this machine is down" in refusal(done) and "ip link set lo up" in done.stderr
-
-
-def test_setup_takes_one_option(run):
-    assert "setup takes --all or --monitor, and not 'all'" in refusal(
-        run("setup", "all", programs={"python3": this_python()})
-    )
 
 
 def noting(maker: Path, asked: Path) -> None:

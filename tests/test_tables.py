@@ -55,6 +55,13 @@ def signals_of(names, states, table=""):
     return "\n".join(lines) + "\n"
 
 
+def read_csv(folder, head, rows, encoding="utf-8"):
+    """The recording that a table is."""
+    (folder / "a.csv").write_text("\n".join([head, *rows]), encoding=encoding)
+    (bag,) = group_recordings([folder / "a.csv"])
+    return bag
+
+
 def rows_of(transient):
     return np.hstack([transient.x, transient.u])
 
@@ -535,14 +542,11 @@ def test_days_are_read_where_one_order_of_day_and_month_alone_goes_forward(tmp_p
 
 
 def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("Time,x\n" + "".join(f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}\n" for k in range(90)))
-    (bag,) = group_recordings([path])
+    bag = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}" for k in range(90)))
     assert set(np.diff(bag.times).tolist()) == {10**9}
     assert "column 'Time': '09/04/2021 11:00:00' is taken for day, month, year" in " ".join(bag.warnings)
     for order, first, second in (("day, month", "09/10/16", "10/10/16"), ("month, day", "10/09/16", "10/10/16")):
-        path.write_text("Time,x\n" + "".join(f"{first if k < 24 else second} {k % 24:02},{k}\n" for k in range(48)))
-        (bag,) = group_recordings([path])
+        bag = read_csv(tmp_path, "Time,x", (f"{first if k < 24 else second} {k % 24:02},{k}" for k in range(48)))
         assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}
         assert f"is taken for {order}, year" in " ".join(bag.warnings)
 
@@ -559,11 +563,10 @@ WRITTEN = (  # over noon; %I %p as English has it
 @pytest.mark.parametrize("form", WRITTEN)
 def test_times_as_spreadsheets_and_controllers_write_them(form, tmp_path):
     """A temperature beside them was taken for the time (`temp` for French), or one hour after noon for one at night."""
-    start, path = datetime(2024, 3, 13, 11, 59, 30), tmp_path / "a.csv"
+    start = datetime(2024, 3, 13, 11, 59, 30)
     instants = [start + timedelta(seconds=k) for k in range(60)]
     cells = [t.strftime(form.replace("A.M.", "a.m." if t.hour < 12 else "p.m.")) for t in instants]
-    path.write_text("Timestamp;x;Temp\n" + "".join(f'"{cell}";{k};{20 + k % 7}\n' for k, cell in enumerate(cells)))
-    (bag,) = group_recordings([path])
+    bag = read_csv(tmp_path, "Timestamp;x;Temp", (f'"{cell}";{k};{20 + k % 7}' for k, cell in enumerate(cells)))
     day = start if "%d" in form else datetime(1970, 1, 1, 11, 59, 30)
     assert bag.times[0] == np.datetime64(day, "ns").astype(np.int64)
     assert set(np.diff(bag.times).tolist()) == {10**9} and list(bag.columns_by_field) == ["x", "Temp"]
@@ -575,17 +578,15 @@ def test_times_as_spreadsheets_and_controllers_write_them(form, tmp_path):
 def test_days_beside_times_of_day_are_theirs(day, clock, tmp_path, capsys):
     """`init` took the day for the name of a run, as the time steps back at midnight, and ended in a traceback."""
     path, start = tmp_path / "a.csv", datetime(2024, 3, 13, 22)
-    instants = [start + timedelta(minutes=k) for k in range(400)]
-    x, rows = 0.0, ["Date,Time,cmd,x"]
-    for k, t in enumerate(instants):
+    x, rows = 0.0, []
+    for k in range(400):
+        t = start + timedelta(minutes=k)
         u = float(k // 20 % 2)
         rows.append(f"{t.strftime(day)},{t.strftime(clock)},{u},{x + 0.01 * math.sin(7 * k):.4f}")
         x += 0.2 * (u - x)
-    path.write_text("\n".join(rows))
-    (bag,) = group_recordings([path])
-    assert bag.times[0] == np.datetime64(start, "ns").astype(np.int64) and set(np.diff(bag.times).tolist()) == {
-        60 * 10**9
-    }
+    bag = read_csv(tmp_path, "Date,Time,cmd,x", rows)
+    assert bag.times[0] == np.datetime64(start, "ns").astype(np.int64)
+    assert set(np.diff(bag.times).tolist()) == {60 * 10**9}
     assert bag.warnings[0].startswith(f"{path}: column 'Time': its days are those of column 'Date'")
     assert main(["init", str(path)]) == 0 and "runs:" not in capsys.readouterr().out
 
@@ -599,55 +600,37 @@ def test_runs_that_are_named_as_no_file_is(tmp_path):
 
 
 def test_what_is_read_alike_in_many_columns_is_noted_once(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text("t;a;b;c\n" + "".join(f"{k};{k},5;{k};{k % 7},25\n" for k in range(40)))
-    (bag,) = group_recordings([path])
-    assert bag.warnings == [f"{path}: columns 'a', 'c': decimal commas read as points"]
+    bag = read_csv(tmp_path, "t;a;b;c", (f"{k};{k},5;{k};{k % 7},25" for k in range(40)))
+    assert bag.warnings == [f"{bag.path}: columns 'a', 'c': decimal commas read as points"]
 
 
 def test_noon_and_midnight_of_twelve_hours(tmp_path):
-    path = tmp_path / "a.csv"
     hours = ["12:00 AM", "1:30 am", "12:00 PM", "1:30 pm", "11:59 p.m."]
-    path.write_text("time,x\n" + "".join(f"{hour},{k}\n" for k, hour in enumerate(hours)))
-    (bag,) = group_recordings([path])
+    bag = read_csv(tmp_path, "time,x", (f"{hour},{k}" for k, hour in enumerate(hours)))
     assert (bag.times // (60 * 10**9)).tolist() == [0, 90, 720, 810, 1439]
 
 
 def test_a_time_that_cannot_be_read_is_named_and_no_temperature_taken_for_it(tmp_path):
-    path = tmp_path / "a.csv"
-    path.write_text(
-        "Timestamp,x,T\n" + "".join(f"2024-03-13 11:55:{k:02} CET,{k % 5},{20 + k % 7}\n" for k in range(60))
-    )
-    with pytest.raises(
-        BagError, match="column 'Timestamp': '2024-03-13 11:55:00 CET' in row 1 is neither a number nor"
-    ):
-        group_recordings([path])
-    path.write_text("Timestamp,t,x\n" + "".join(f"shift {k % 3},{0.1 * k},{k % 5}\n" for k in range(60)))
-    (bag,) = group_recordings([path])
+    rows = [f"2024-03-13 11:55:{k:02} CET,{k % 5},{20 + k % 7}" for k in range(60)]
+    words = "column 'Timestamp': '2024-03-13 11:55:00 CET' in row 1 is neither a number nor"
+    with pytest.raises(BagError, match=words):
+        read_csv(tmp_path, "Timestamp,x,T", rows)
+    bag = read_csv(tmp_path, "Timestamp,t,x", (f"shift {k % 3},{0.1 * k},{k % 5}" for k in range(60)))
     assert set(np.diff(bag.times).tolist()) == {10**8}
 
 
 def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
     """Newest rows first, whole seconds, days of a spreadsheet, the letters of Windows, a row for each number."""
-    path = tmp_path / "a.csv"
-
-    def said(text, encoding="utf-8"):
-        path.write_text(text, encoding=encoding)
-        (bag,) = group_recordings([path])
-        return bag, " ".join(bag.warnings)
-
-    for head in ("", "12/01/2014 "):
-        newest, words = said("time,x\n" + "".join(f"{head}00:{40 - k}:00,{k}\n" for k in range(30)))
-        assert set(np.diff(newest.times).tolist()) == {60 * 10**9} and "newest row comes first" in words
-        assert newest.columns_by_field["x"][0] == 29
-    assert (
-        "90 of 100 rows have the time of a row before"
-        in said("time,x\n" + "".join(f"{k // 10},{k}\n" for k in range(100)))[1]
-    )
-    assert (
-        "write days of a spreadsheet" in said("Date,x\n" + "".join(f"{45717 + k / 288:.6f},{k}\n" for k in range(9)))[1]
-    )
-    assert not said("time,x\n" + "".join(f"{45717 + k / 50:.3f},{k}\n" for k in range(9)))[1]  # since the boot
-    assert list(said("time,Größe °C\n0,1\n1,2\n", "cp1252")[0].columns_by_field) == ["Größe_C"]
-    rows, _ = said("time,signal,value\n" + "".join(f"{k},{('speed', 'load')[k % 2]},{k * k}\n" for k in range(90)))
+    for day in ("", "12/01/2014 "):
+        newest = read_csv(tmp_path, "time,x", (f"{day}00:{40 - k}:00,{k}" for k in range(30)))
+        assert set(np.diff(newest.times).tolist()) == {60 * 10**9} and newest.columns_by_field["x"][0] == 29
+        assert "newest row comes first" in newest.warnings[-1]
+    for head, rows, words in (
+        ("time,x", (f"{k // 10},{k}" for k in range(100)), "90 of 100 rows have the time of a row before"),
+        ("Date,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9)), "write days of a spreadsheet"),
+    ):
+        assert words in " ".join(read_csv(tmp_path, head, rows).warnings)
+    assert not read_csv(tmp_path, "time,x", (f"{45717 + k / 50:.3f},{k}" for k in range(9))).warnings  # since the boot
+    assert list(read_csv(tmp_path, "time,Größe °C", ["0,1", "1,2"], "cp1252").columns_by_field) == ["Größe_C"]
+    rows = read_csv(tmp_path, "time,signal,value", (f"{k},{('speed', 'load')[k % 2]},{k * k}" for k in range(90)))
     assert "column 'signal' names the signal" in rows.topics["/table"].reason

@@ -18,6 +18,7 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.model.terms import ARRAYS
 
 PAPER = {"additive": "noise", "alarm": "containment"}
 
@@ -41,7 +42,7 @@ def runs_of(seed, lengths, n=3, m=2, noise=0.01, dt=0.02):
 def equal(one, other):
     a, b = (np.atleast_1d(np.asarray(m.fit_summary["objective"])) for m in (one, other))
     assert a == pytest.approx(b, rel=1e-9)
-    for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+    for name in ARRAYS:
         assert getattr(one, name) == pytest.approx(getattr(other, name), rel=1e-6, abs=1e-7)
     for name in ("transitions", "transients", "segments"):
         assert one.fit_summary[name] == other.fit_summary[name]
