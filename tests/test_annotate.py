@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import COMPRESSIONS, Message, Topic, metadata_yaml, ramp, write, write_folder
+from bag_writer import COMPRESSIONS, Message, Topic, write
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as Recorded
@@ -322,31 +322,6 @@ def test_the_command_writes_and_says_so(engine, tmp_path, capsys):
         (about,) = [m.metadata for m in make_reader(stream).iter_metadata() if m.name == METADATA]
     assert about["alarm"] == "250 of 250, margin 1.0" and about["model"] == "m.model.json"
     assert len(about["model_sha256"]) == 64 and json.loads(about["states"])[0]["name"] == "fan"
-
-
-def test_nothing_recorded_is_ever_overwritten(engine, tmp_path, capsys):
-    folder, _ = engine
-    model_file = str(folder / "m.model.json")
-    before = (folder / "bad.mcap").read_bytes()
-    (tmp_path / "other.mcap").write_bytes(b"precious")
-    (tmp_path / "link.mcap").symlink_to(folder / "bad.mcap")
-    parts = {f"bag_{i}.mcap": write([Topic("/a")], ramp("/a", range(i * 10, i * 10 + 10))) for i in range(2)}
-    write_folder(tmp_path / "bag", parts, metadata_yaml(parts))
-    cases = {
-        (str(folder / "bad.mcap"),): (str(folder / "bad.mcap"), "is the recording itself"),
-        (str(folder / "bad.mcap"), ""): (str(tmp_path / "link.mcap"), "is the recording itself"),
-        (str(folder / "bad.mcap"), "", ""): (str(tmp_path / "other.mcap"), "is there already"),
-        (str(folder / "bad.mcap"), "", "", ""): (str(tmp_path / "no" / "out.mcap"), "make it first"),
-        (str(folder / "bad.mcap"), str(folder / "run.mcap")): (str(tmp_path / "x.mcap"), "one file for 2 recordings"),
-        (str(tmp_path / "bag"),): (str(tmp_path / "bag" / "x.mcap"), "folder of the recording"),
-        (str(folder / "bad.mcap"), "", "", "", ""): (model_file, "neither a folder nor"),
-    }
-    for bags, (output, why) in cases.items():
-        assert main(["check", model_file, *filter(None, bags), "--write", output]) == 2
-        said = capsys.readouterr()
-        assert why in said.err and said.err.count("\n") == 1 and not said.out
-    assert (folder / "bad.mcap").read_bytes() == before and (tmp_path / "other.mcap").read_bytes() == b"precious"
-    assert not (tmp_path / "x.mcap").exists()
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt, MemoryError, BagError("x: gone")])

@@ -14,6 +14,7 @@ import os
 import re
 import signal
 import threading
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -23,7 +24,6 @@ import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
-from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive, write_cache
 from uncertain_lti.identification.assembly import assemble
@@ -210,12 +210,18 @@ def test_bad_archives_are_refused(bags, tmp_path):
         fit_archive([still, control], rest, cache=tmp_path / "c")
 
 
-@pytest.fixture(scope="module")
-def cluster():
+@contextmanager
+def started_cluster():
     distributed = pytest.importorskip("distributed")
     with distributed.LocalCluster(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=":0") as local:
         with distributed.Client(local) as client:
             yield local, client
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    with started_cluster() as started:
+        yield started
 
 
 def steps_of(lines, what):
@@ -251,6 +257,20 @@ def test_it_says_how_far_it_has_come(bags, tmp_path):
 
 
 @pytest.mark.slow
+def test_a_lost_worker_costs_time_and_nothing_else(bags):
+    signals, paths = bags
+    model = fit(read_transients(paths, signals))
+    with started_cluster() as (local, client):
+        pid = next(iter(local.workers.values())).process.process.pid
+        killer = threading.Timer(0.3, os.kill, (pid, signal.SIGKILL))
+        killer.start()
+        again = 0
+        while killer.is_alive() or not again:  # until the kill has fallen into the middle of one of them, and once more
+            again += not killer.is_alive()
+            equal(fit_archive(paths, signals, client=client), model)
+
+
+@pytest.mark.slow
 def test_errors_of_workers_are_sentences(bags, cluster, tmp_path):
     signals, paths = bags
     wrong = tmp_path / "wrong.yaml"
@@ -259,22 +279,9 @@ def test_errors_of_workers_are_sentences(bags, cluster, tmp_path):
         fit_archive(paths, wrong, client=cluster[1])
 
 
-@pytest.mark.slow
-def test_a_lost_worker_costs_time_and_nothing_else(bags, cluster):
-    """The last test of the cluster."""
-    signals, paths = bags
-    local, client = cluster
-    model = fit(read_transients(paths, signals))
-    pid = next(iter(local.workers.values())).process.process.pid
-    killer = threading.Timer(0.3, os.kill, (pid, signal.SIGKILL))
-    killer.start()
-    again = 0
-    while killer.is_alive() or not again:  # until the kill has fallen into the middle of one of them, and once more
-        again += not killer.is_alive()
-        equal(fit_archive(paths, signals, client=client), model)
-
-
 def test_cache_of_the_command(bags, tmp_path, capsys):
+    from uncertain_lti.cli.main import main
+
     signals, paths = bags
     arguments = ["fit", *map(str, paths), "--signals", str(signals)]
     arguments += ["--criterion", "qp", "--additive", "none", "--output"]
@@ -283,6 +290,7 @@ def test_cache_of_the_command(bags, tmp_path, capsys):
     one, two = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
     assert np.array(one["dA"]) == pytest.approx(np.array(two["dA"]), rel=1e-9, abs=1e-9)
     assert one["fit"]["sources"] == two["fit"]["sources"]
+    capsys.readouterr()
 
 
 def test_what_a_killed_writer_left_goes_at_the_next_start(tmp_path):

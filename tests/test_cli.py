@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import Topic, ramp, write
+from bag_writer import Topic, metadata_yaml, ramp, write, write_folder
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
@@ -99,64 +99,105 @@ def test_commands_say_what_the_library_says(folder, capsys):
 # --- bad input ---
 
 
-def test_bad_input_gets_one_sentence(folder, capsys, tmp_path):
-    run, signals, out = str(folder / "run.mcap"), str(folder / "signals.yaml"), str(folder / "none.model.json")
+WRONG_SIGNALS = {
+    "another_topic": (("/engine/state", "/engine/stat"), "topics there: /engine/control, /engine/state"),
+    "near_topic": (("/engine/state", "/engine/stte", 1), "/engine/stte (is /engine/state meant?)"),
+    "near_field": (("position[fan_speed]", "positon[0]"), "(is position meant?)"),
+    "near_name": (("position[fan_speed]", "position[fan_sped]"), "(is fan_speed meant?)"),
+    "near_function": (("position[fan_speed]", "rol(position[0])"), "no function 'rol' (is roll meant?)"),
+    "near_key": (("states:", "sates:"), "unknown key 'sates' (is states meant?)"),
+    "no_yaml": (("states:", "states: [1, 2"), "is not YAML"),
+}
+FIT = "fit run.mcap --signals signals.yaml --output new.model.json"
+WRITERS = (
+    "fit run.mcap --signals signals.yaml --additive noise --output", "validate m.model.json --output",
+    "report m.model.json run.mcap --output", "layout m.model.json --foxglove", "layout m.model.json --plotjuggler",
+)  # fmt: skip
+VICTIMS = ("run.mcap", "signals.yaml", "lfs.mcap")
+REFUSED = [
+    *((f"fit run.mcap --signals {n}.yaml --output new", words) for n, (_, words) in WRONG_SIGNALS.items()),
+    ("check none.model.json run.mcap", "no such model file"),
+    ("check signals.yaml run.mcap", "this is a signals file, and a model file is wanted here; write a"),
+    ("check text.mcap run.mcap", "is not JSON"),
+    ("check . run.mcap", "this is a folder, and a model file is wanted here; name the file in it"),
+    ("check leibov206 run.mcap", "(is leibov2006 meant?)"),
+    ("check run.mcap m.model.json", "an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
+    ("topics text.mcap", "text.mcap"),
+    ("topics signals.yaml", "a signals file, and a recording is wanted here; are the arguments swapped?"),
+    (FIT.replace("run", "nope"), "nope.mcap"),
+    (FIT.replace("run", "empty"), "empty"),
+    (FIT.replace("run", "lfs"), "git lfs pull"),
+    (FIT.replace("signals.yaml", "nope.yaml"), "nope.yaml"),
+    (FIT.replace("new", "no/m"), "make it first"),
+    (f"{FIT} --workers 0", "--workers is 0; give 1 or more"),
+    (f"{FIT} --schedule fam", "is fan meant"),
+    (f"{FIT} --schedule fan --schedule fan=3", "twice"),
+    (f"{FIT} --schedule fan=0", "at least 1"),
+    (f"{FIT} --schedule fan=auto --cache arrays", "auto"),
+    (f"{FIT} --update m.model.json --criterion qp", "--signals is given, and an update keeps what"),
+    (
+        "fit run.mcap --update m.model.json --criterion qp --output new",
+        "--criterion is given, and an update keeps what",
+    ),
+    ("fit run.mcap --output new", "no --signals; give the signals file"),
+    # a place that cannot be written is refused before the work: what is read first is not there, or would print
+    *((f"{words} absent.mcap --output /sys/x", "/sys/x") for words in ("init", "start", "fit --signals absent.yaml")),
+    ("check leibov2006 run.mcap --write /sys/x.mcap", "/sys/x.mcap: cannot be written"),
+    *((f"{command} leibov2006 run.mcap --output /sys/x.html", "/sys/x.html") for command in ("report", "plot")),
+    ("layout leibov2006 --foxglove /sys/x.json", "/sys/x.json"),
+    ("reproduce --output text.mcap", "cannot be written"),
+    # nothing but an older file of its kind is written over, whatever the option was meant to be
+    *(
+        (f"{words} {name}", "choose another name")
+        for words in WRITERS
+        for name in ("run.mcap", "signals.yaml", "lfs.mcap")
+    ),
+    ("check m.model.json bad.mcap --write bad.mcap", "is the recording itself"),
+    ("check m.model.json bad.mcap --write link.mcap", "is the recording itself"),
+    ("check m.model.json bad.mcap --write text.mcap", "is there already"),
+    ("check m.model.json bad.mcap --write no/out.mcap", "make it first"),
+    ("check m.model.json bad.mcap run.mcap --write x.mcap", "one file for 2 recordings"),
+    ("check m.model.json parts --write parts/x.mcap", "folder of the recording"),
+    ("check m.model.json bad.mcap --write m.model.json", "neither a folder nor"),
+    ("plot m.model.json --output m.html", "model alone is drawn as an image"),
+    ("plot run.mcap --output r.png", "without a model are drawn as a page"),
+    ("plot m.model.json run.mcap bad.mcap --output r.png", "an image shows one recording"),
+    ("plot m.model.json run.mcap --output r.gif", "end the name in .html, .png"),
+    ("plot m.model.json run.mcap --signals s.yaml", "the model has its signals"),
+    ("plot m.model.json run.mcap --output run.mcap", "end the name in"),
+    ("plot no.model.json run.mcap --output r.html", "no such"),
+    ("plot no.mcap --output r.html", "no such"),
+    ("plot m.model.json run.mcap --output no/r.html", "make it first"),
+    ("layout m.model.json", "--foxglove"),
+    ("layout m.model.json --foxglove no/x.json", "make it first"),
+    ("validate m.model.json run.mcap bad.mcap", "do not give this model again"),
+    ("validate m.model.json --false-alarms -1", "positive"),
+    ("validate m.model.json --within 0", "positive number of seconds"),
+    ("validate m.model.json --output no/m.json", "make it first"),
+    ("signature m.model.json fan_damage --output new", "LABEL=BAG"),
+    ("signature m.model.json x=run.mcap --output new", "no alarm was raised"),
+    ("start absent.mcap", "absent.mcap"),
+    ("start run.mcap --check absent.mcap", "absent.mcap"),
+    ("start a\udcffb.mcap", "this name is not UTF-8, and a model file names its recordings; rename it"),
+    ("start run.mcap --output models/", "names no file"),
+    ("start run.mcap --output no_such_folder/m", "no_such_folder"),
+]
 
-    def fit_with(text):
-        other = folder / f"signals{len(list(folder.iterdir()))}.yaml"
-        other.write_text(text)
-        return ["fit", run, "--signals", str(other), "--output", out, "--additive", "noise"]
 
-    empty, lfs, text = folder / "empty.mcap", folder / "lfs.mcap", folder / "text.mcap"
-    empty.write_bytes(b"")
-    lfs.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
-    text.write_text("not a bag")
-    fit = ["fit", run, "--signals", signals, "--output", out]
-    cases = [
-        (["check", out, run], "no such model file"),
-        (["fit", str(folder / "nope.mcap"), *fit[2:]], "nope.mcap"),
-        (["fit", str(empty), *fit[2:]], "empty"),
-        (["fit", str(lfs), *fit[2:]], "git lfs pull"),
-        (["topics", str(text)], "text.mcap"),
-        (["fit", run, "--signals", str(folder / "nope.yaml"), "--output", out], "nope.yaml"),
-        (["fit", run, "--signals", signals, "--output", str(folder / "no" / "m.json")], "make it first"),
-        (fit_with(SIGNALS.replace("/engine/state", "/engine/stat")), "topics there: /engine/control, /engine/state"),
-        (fit_with("states: [1, 2"), "is not YAML"),
-        (fit_with(SIGNALS.replace("/engine/state", "/engine/stte", 1)), "/engine/stte (is /engine/state meant?)"),
-        (["check", signals, run], "this is a signals file, and a model file is wanted here; write a"),
-        (["check", str(text), run], "is not JSON"),
-        (["check", str(folder), run], "this is a folder, and a model file is wanted here; name the file in it"),
-        (["check", "leibov206", run], "(is leibov2006 meant?)"),
-        (["topics", signals], "this is a signals file, and a recording is wanted here; are the arguments swapped?"),
-        (["check", run, out], "this is an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
-        (fit_with(SIGNALS.replace("position[fan_speed]", "positon[0]")), "(is position meant?)"),
-        (fit_with(SIGNALS.replace("position[fan_speed]", "position[fan_sped]")), "(is fan_speed meant?)"),
-        (fit_with(SIGNALS.replace("position[fan_speed]", "rol(position[0])")), "no function 'rol' (is roll meant?)"),
-        (fit_with(SIGNALS.replace("states:", "sates:")), "unknown key 'sates' (is states meant?)"),
-        ([*fit, "--workers", "0"], "--workers is 0; give 1 or more"),
-    ]
-    for arguments, words in cases:
-        assert words in refused(capsys, arguments), arguments
-    assert not Path(out).exists()
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["fit", "absent.mcap", "--signals", "absent.yaml", "--output", "/sys/x.model.json"],
-        ["init", "absent.mcap", "--output", "/sys/x.yaml"],
-        ["start", "absent.mcap", "--output", "/sys/x"],
-        ["check", "leibov2006", "run.mcap", "--write", "/sys/x.mcap"],
-        ["report", "leibov2006", "run.mcap", "--output", "/sys/x.html"],
-        ["plot", "leibov2006", "run.mcap", "--output", "/sys/x.png"],
-        ["layout", "leibov2006", "--foxglove", "/sys/x.json"],
-    ],
-    ids=lambda arguments: arguments[0],
-)
-def test_a_place_that_cannot_be_written_is_refused_before_the_work(folder, arguments, monkeypatch, capsys):
-    """Root may not make a file in /sys either; what is read first is not there, or would print."""
+@pytest.mark.parametrize(("words", "said"), REFUSED)
+def test_bad_input_gets_one_sentence_and_changes_nothing(folder, words, said, monkeypatch, capsys):
+    for name, ((old, new, *count), _) in WRONG_SIGNALS.items():
+        (folder / f"{name}.yaml").write_text(SIGNALS.replace(old, new, *count))
+    (folder / "empty.mcap").write_bytes(b"")
+    (folder / "lfs.mcap").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
+    (folder / "text.mcap").write_text("not a bag")
+    (folder / "link.mcap").symlink_to(folder / "bad.mcap")
+    parts = {f"bag_{i}.mcap": write([Topic("/a")], ramp("/a", range(i * 10, i * 10 + 10))) for i in range(2)}
+    write_folder(folder / "parts", parts, metadata_yaml(parts))
     monkeypatch.chdir(folder)
-    assert "/sys/x" in (said := refused(capsys, arguments)) and "cannot be written" in said
+    before = {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))}
+    assert said in refused(capsys, words.split())
+    assert {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))} == before
 
 
 def test_a_condition_that_cannot_hold_is_no_quiet(folder, tmp_path, capsys):
@@ -172,24 +213,10 @@ def test_a_condition_that_cannot_hold_is_no_quiet(folder, tmp_path, capsys):
     )
 
 
-def test_nothing_but_an_older_file_of_its_kind_is_written_over(folder, capsys):
-    """Not a recording, not a signals file, not a note: whatever the option was meant to be."""
-    run, signals, model = folder / "run.mcap", folder / "signals.yaml", folder / "m.model.json"
-    note = folder / "notes.txt"
-    note.write_text("mine")
-    for victim in (run, signals, note):
-        before = victim.read_bytes()
-        for arguments in (
-            ["fit", str(run), "--signals", str(signals), "--output", str(victim), "--additive", "noise"],
-            ["validate", str(model), "--output", str(victim)],
-            ["report", str(model), str(run), "--output", str(victim)],
-            ["layout", str(model), "--foxglove", str(victim)],
-            ["layout", str(model), "--plotjuggler", str(victim)],
-        ):
-            assert "choose another name" in refused(capsys, arguments), arguments
-            assert victim.read_bytes() == before
-    pages = [["report", str(model), str(run), "--output", str(folder / "page.html"), "-q"]]
-    pages += [["layout", str(model), f"--{kind}", str(folder / kind)] for kind in ("foxglove", "plotjuggler")]
+def test_an_older_page_or_layout_is_written_over(folder):
+    model, run = str(folder / "m.model.json"), str(folder / "run.mcap")
+    pages = [["report", model, run, "--output", str(folder / "page.html"), "-q"]]
+    pages += [["layout", model, f"--{kind}", str(folder / kind)] for kind in ("foxglove", "plotjuggler")]
     for arguments in [*pages, *pages]:
         assert main(arguments) == 0, arguments
 
@@ -295,6 +322,14 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
         (["chek", "m", "b"], "(is check meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--additive", "noies"], "(is noise meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--discard", "abc"], "neither a whole number nor a share"),
+        *(
+            (["fit", "b", "--signals", "s", "--output", "m", "--schedule", given], said)
+            for given, said in (
+                ("fan=x", "neither auto"),
+                ("fan=", "write SIGNAL"),
+                ("fan=modes:", "neither auto"),
+            )
+        ),
     ],
 )
 def test_a_near_miss_names_one_option(words, said, capsys):

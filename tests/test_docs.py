@@ -148,7 +148,7 @@ class Reader:
                     command, cwd=self.folder, env=self.env, stdout=stream, stderr=stream, start_new_session=True
                 )
             self.background.append((process, log, []))
-            time.sleep(1.0)  # a reader needs longer to get to the next shell
+            time.sleep(3.0)  # a reader needs longer to get to the next shell
             until_idle(process)
             assert process.poll() is None, log.read_text()
             return

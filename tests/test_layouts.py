@@ -143,11 +143,3 @@ def test_odd_names_stay_well_formed():
     states = [Signal(name="a\x07]]>é", topic="/s", field="data")]
     ElementTree.fromstring(plotjuggler_layout(states).encode())
     json.loads(foxglove_layout(states))
-
-
-def test_bad_use_is_one_sentence(annotated, tmp_path, capsys):
-    _, model, _ = annotated
-    for arguments, why in (([], "--foxglove"), (["--foxglove", str(tmp_path / "no" / "x.json")], "make it first")):
-        assert main(["layout", str(model), *arguments]) == 2
-        said = capsys.readouterr()
-        assert why in said.err and said.err.count("\n") == 1 and not said.out

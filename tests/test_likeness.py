@@ -255,7 +255,3 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
         assert f"looks like {label} (match " in capsys.readouterr().out
     assert main(["signature", taught, labelled[0], "--output", str(tmp_path / "t.model.json"), *rule]) == 2
     assert "another label" in capsys.readouterr().err
-    assert main(["signature", model, "fan_damage", "--output", str(tmp_path / "t.model.json")]) == 2
-    assert "LABEL=BAG" in capsys.readouterr().err
-    assert main(["signature", model, f"x={noise[0]}", "--output", str(tmp_path / "t.model.json")]) == 2
-    assert "no alarm was raised" in capsys.readouterr().err

@@ -317,23 +317,3 @@ def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, capsys
     titles = {panel["title"] for panel in data_of(page.read_text())[0]["views"]["values"]}
     assert main(["plot", run, "--signals", str(engine / "signals.yaml"), "--output", str(page), "-q"]) == 0
     assert {panel["title"] for panel in data_of(page.read_text())[0]["views"]["values"]} >= {"fan"} and len(titles) > 5
-
-
-def test_what_cannot_be_drawn_is_one_sentence(engine, tmp_path, capsys):
-    model, bad, run = (str(engine / name) for name in ("m.model.json", "bad.mcap", "run.mcap"))
-    before = Path(model).read_bytes(), Path(run).read_bytes()
-    for words, why in (
-        ([model, "--output", str(tmp_path / "m.html")], "model alone is drawn as an image"),
-        ([run, "--output", str(tmp_path / "r.png")], "without a model are drawn as a page"),
-        ([model, run, bad, "--output", str(tmp_path / "r.png")], "an image shows one recording"),
-        ([model, run, "--output", str(tmp_path / "r.gif")], "end the name in .html, .png"),
-        ([model, run, "--signals", "s.yaml"], "the model has its signals"),
-        ([model, run, "--output", run], "end the name in"),
-        ([str(tmp_path / "no.model.json"), run, "--output", str(tmp_path / "r.html")], "no such"),
-        ([str(tmp_path / "no.mcap"), "--output", str(tmp_path / "r.html")], "no such"),
-        ([model, run, "--output", str(tmp_path / "no" / "r.html")], "make it first"),
-    ):
-        assert main(["plot", *words]) == 2
-        said = capsys.readouterr()
-        assert why in said.err and said.err.count("\n") == 1 and not said.out
-    assert (Path(model).read_bytes(), Path(run).read_bytes()) == before and not list(tmp_path.iterdir())

@@ -118,9 +118,3 @@ def test_the_experiment_leaves_figures_models_and_numbers(experiment):
     assert len(models) == len(data["cases"])
     for path in models:
         UncertainLTI.load(path)
-
-
-def test_a_folder_that_cannot_be_written_is_one_sentence(tmp_path, capsys):
-    (tmp_path / "file").write_text("in the way")
-    assert main(["reproduce", "--output", str(tmp_path / "file")]) == 2
-    assert "cannot be written" in capsys.readouterr().err

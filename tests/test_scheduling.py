@@ -290,25 +290,3 @@ def test_the_signals_file_asks_for_a_schedule(folder):
     model = UncertainLTI.load(folder / "m.model.json")
     assert model.fit_summary["schedule"][0]["signal"] == "fan"
     assert main(["validate", str(folder / "m.model.json")]) == 0
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        (["--schedule", "fam"], "is fan meant"),
-        (["--schedule", "fan", "--schedule", "fan=3"], "twice"),
-        (["--schedule", "fan=x"], "neither auto"),
-        (["--schedule", "fan="], "write SIGNAL"),
-        (["--schedule", "fan=0"], "at least 1"),
-        (["--schedule", "fan=modes:"], "neither auto"),
-        (["--schedule", "fan=auto", "--cache", "arrays"], "auto"),
-    ],
-)
-def test_the_command_refuses_in_one_sentence(folder, capsys, given, words, monkeypatch):
-    monkeypatch.chdir(folder)
-    try:
-        status = command(folder, *given)
-    except SystemExit as left:
-        status = left.code
-    assert status == 2
-    assert words in capsys.readouterr().err

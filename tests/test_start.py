@@ -74,23 +74,6 @@ def test_an_edited_signals_file_is_used_as_it_is(folder, capsys):
     assert data["fit"]["fit"]["transitions"] == 3 * 299 and data["report"] == "m.html"
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        (["absent.mcap"], "absent.mcap"),
-        ([*HEALTHY, "--check", "absent.mcap"], "absent.mcap"),
-        (["a\udcffb.mcap"], "this name is not UTF-8, and a model file names its recordings; rename it"),
-        ([*HEALTHY, "--output", "models/"], "names no file"),
-        ([*HEALTHY, "--output", "no_such_folder/m"], "no_such_folder"),
-    ],
-)
-def test_bad_input_gets_one_sentence(folder, capsys, words, sentence):
-    assert main(["start", *words]) == 2
-    said = capsys.readouterr()
-    assert said.out == "" and said.err.count("\n") == 1
-    assert said.err.startswith("uncertain-lti start: ") and sentence in said.err
-
-
 def test_what_is_to_note_of_a_recording_is_said_once(folder, capsys):
     whole = (folder / HEALTHY[0]).read_bytes()
     (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])

@@ -213,9 +213,3 @@ def test_the_command_updates(tmp_path, capsys):
     capsys.readouterr()
     assert main(["info", names[1], "--json"]) == 0
     assert "memory" not in json.loads(capsys.readouterr().out)
-    for more, words in (
-        (["--update", names[0], "--criterion", "qp"], "--criterion is given, and an update keeps what"),
-        ([], "no --signals; give the signals file"),
-    ):
-        assert main(["fit", bags[2], *more, "--output", str(tmp_path / "no.model.json")]) == 2
-        assert words in capsys.readouterr().err
