@@ -34,16 +34,21 @@ def share(folder: str) -> list[tuple[str, list[str]]]:
 
 COMPILED = {
     "kernel.arithmetic": "-O2 -ftree-loop-vectorize",
-    "monitor.envelope_monitor": "-O1",
-    "monitor.intake": "-O1",
-    "monitor.outputs": "-O1",
-    "monitor.stream": "-O1",
-    "monitor.verdict": "-O1",
+    "monitor.envelope_monitor": "-Og",
+    "monitor.intake": "-Og",
+    "monitor.outputs": "-Og",
+    "monitor.stream": "-Og",
+    "monitor.verdict": "-Og",
     "recordings.mcap_walk": "-O1",
     "recordings.message_reader": "-O1",
     "sampling.sampler": "-O1",
 }
-"""Modules that are compiled, and how: the kernel, and typed Python of the live chain."""
+"""Modules that are compiled, and how: the kernel, and typed Python of the live chain.
+
+-Og takes half the time to compile that -O1 takes, and the live chain 3 % more.
+"""
+SHARED = "uncertain_lti.kernel.shared"
+"""What every module that reads arrays needs of Cython, compiled once; before 3.1 each of them brings its own."""
 
 
 def compiled() -> list[Extension]:
@@ -52,14 +57,19 @@ def compiled() -> list[Extension]:
     Contraction of a * b + c is off, so that every machine gives the same bits.
     """
     from Cython.Build import cythonize
+    from Cython.Compiler.Options import default_options
 
+    always = ["-g0", "-w", "-ffp-contract=off"]
+    options = {"build_dir": "build/cython", "language_level": 3, "quiet": True}
     extensions = []
     for dotted, level in COMPILED.items():
         path = Path("core", *dotted.split("."))
         source = next(str(path.with_suffix(end)) for end in (".pyx", ".py") if (ROOT / path).with_suffix(end).exists())
-        arguments = [*level.split(), "-g0", "-w", "-ffp-contract=off"]
-        extensions.append(Extension(f"uncertain_lti.{dotted}", [source], extra_compile_args=arguments))
-    found: list[Extension] = cythonize(extensions, build_dir="build/cython", language_level=3, quiet=True)
+        extensions.append(Extension(f"uncertain_lti.{dotted}", [source], extra_compile_args=[*level.split(), *always]))
+    if "shared_utility_qualified_name" in default_options:
+        options["shared_utility_qualified_name"] = SHARED
+        extensions.append(Extension(SHARED, ["core/kernel/shared.c"], extra_compile_args=["-Og", *always]))
+    found: list[Extension] = cythonize(extensions, **options)
     return found
 
 
