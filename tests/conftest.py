@@ -23,7 +23,8 @@ from hypothesis import HealthCheck, settings
 from processes import adopt_orphans, children, end_children
 
 # A busy machine is no bug.
-settings.register_profile("here", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+_UNIMPORTANT = [HealthCheck.too_slow, HealthCheck.function_scoped_fixture, HealthCheck.data_too_large]
+settings.register_profile("here", deadline=None, suppress_health_check=_UNIMPORTANT)
 settings.load_profile("here")
 
 # No test is heard beyond this machine, whoever started it. The number of the domain is for each test to take.

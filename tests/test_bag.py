@@ -51,7 +51,7 @@ from bag_writer import (
     write,
     write_folder,
 )
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -90,11 +90,6 @@ MESSAGES = st.lists(
 ).map(lambda entries: [Message(topic, t, float64(i), t) for i, (topic, t) in enumerate(entries)])
 
 
-def examples(number: int) -> settings:
-    unimportant = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
-    return settings(max_examples=number, deadline=None, suppress_health_check=unimportant)
-
-
 def facts(raw: RawMessage) -> tuple[str, int, bytes]:
     return raw.topic, raw.log_time_ns, raw.data
 
@@ -125,7 +120,7 @@ def error_of(path: Path) -> str:
 # --- whole files --------------------------------------------------------------------------------------------
 
 
-@examples(80)
+@settings(max_examples=80)
 @given(messages=MESSAGES, layout=LAYOUTS)
 def test_any_file_reads_as_the_stable_sort_of_what_was_written(
     messages: list[Message], layout: Layout, tmp_path: Path
@@ -143,7 +138,7 @@ def test_any_file_reads_as_the_stable_sort_of_what_was_written(
     assert bag.warnings == []
 
 
-@examples(30)
+@settings(max_examples=30)
 @given(messages=MESSAGES, cuts=st.lists(st.integers(0, 60), max_size=3), layout=LAYOUTS)
 def test_parts_read_as_one_in_the_order_of_metadata_yaml(
     messages: list[Message], cuts: list[int], layout: Layout, tmp_path: Path
@@ -190,7 +185,7 @@ def count_by_mcap(data: bytes) -> int:
     return number
 
 
-@examples(100)
+@settings(max_examples=100)
 @given(messages=MESSAGES, layout=LAYOUTS, where=st.floats(0, 1, exclude_max=True))
 def test_a_cut_file_reads_as_a_prefix(messages: list[Message], layout: Layout, where: float, tmp_path: Path) -> None:
     file = write(TWO, messages, layout)

@@ -25,7 +25,7 @@ import pytest
 from bag_writer import COMPRESSIONS, Layout, Message, Topic, cdr, message, metadata_yaml, write, write_folder
 from by_message import read_stream_by_message
 from fuzz import damaged
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -54,11 +54,6 @@ LAYOUTS = st.builds(
     indexes=st.sampled_from([True, True, True, False]),
     checksums=st.booleans(),
 )
-
-
-def examples(number: int) -> settings:
-    unimportant = [HealthCheck.function_scoped_fixture, HealthCheck.too_slow, HealthCheck.data_too_large]
-    return settings(max_examples=number, deadline=None, suppress_health_check=unimportant)
 
 
 # --- message types ------------------------------------------------------------------------------------------
@@ -240,7 +235,7 @@ def assert_same(path: Path, signals: SignalMap) -> tuple[Any, ...]:
     return by_message
 
 
-@examples(60)
+@settings(max_examples=60)
 @given(
     tops=st.lists(types(), min_size=1, max_size=3),
     seed=st.integers(0, 2**32),

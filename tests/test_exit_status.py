@@ -12,6 +12,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -50,9 +51,11 @@ def commands(folder):
     return {"topics": ["topics", bag], "check": ["check", model, bag]}
 
 
-def run(arguments, **options):
-    program = "import sys; from uncertain_lti.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    return subprocess.run([sys.executable, "-c", program, *arguments], text=True, timeout=1200, **options)
+COMMAND = [sys.executable, "-m", "uncertain_lti.cli.main"]
+
+
+def run(arguments, command=COMMAND, **options):
+    return subprocess.run([*command, *arguments], text=True, timeout=1200, **options)
 
 
 @pytest.mark.parametrize("what", ["topics", "check"])
@@ -79,7 +82,7 @@ def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package
 @pytest.mark.parametrize(("module", "status"), [("uncertain_lti.cli.judge", 70), ("argparse", 70), ("nothing", 0)])
 def test_a_damaged_installation_is_no_alarm(module, status):
     broken = f"import sys; from uncertain_lti.cli.program import main; sys.modules[{module!r}] = None; sys.exit(main())"
-    done = subprocess.run([sys.executable, "-c", broken, "--help"], text=True, capture_output=True, timeout=1200)
+    done = run(["--help"], [sys.executable, "-c", broken], capture_output=True)
     assert done.returncode == status and ("the installation is damaged" in done.stderr) == (status == 70)
     assert "uncertain-lti = uncertain_lti.cli.program:main" in (ROOT / "setup.py").read_text()
 
@@ -92,7 +95,7 @@ def test_an_interrupt_before_there_is_a_program_is_said():
         "    return real(name, *rest)\n"
         "builtins.__import__ = interrupted; sys.exit(main())"
     )
-    done = subprocess.run([sys.executable, "-c", first, "play", "x.mcap"], text=True, capture_output=True, timeout=1200)
+    done = run(["play", "x.mcap"], [sys.executable, "-c", first], capture_output=True)
     assert (done.returncode, done.stderr) == (130, "uncertain-lti: interrupted before anything was begun\n")
 
 
@@ -100,10 +103,7 @@ def test_nobody_reads_what_is_said(folder):
     with open("/dev/full", "w") as full:
         assert run(["check", "nothing.model.json", "nothing.mcap"], stdout=full, stderr=full).returncode == 2
     for what in ("check", "topics"):
-        closed = (
-            f"{sys.executable} -c 'import sys; from uncertain_lti.cli.main import main; sys.exit(main(sys.argv[1:]))'"
-        )
-        line = " ".join([closed, *commands(folder)[what]])
+        line = shlex.join([*COMMAND, *commands(folder)[what]])
         done = subprocess.run(["sh", "-c", f"{line} >&- 2>&-"], timeout=1200)
         assert done.returncode in (0, 2), what
 
@@ -144,7 +144,7 @@ def test_in_the_environment_of_the_programs_the_remedy_is_one_command_of_run(tmp
 def without(packages, words):
     gone = f"import sys; sys.modules.update(dict.fromkeys({packages!r}))"
     program = f"{gone}; from uncertain_lti.cli.main import main; sys.exit(main())"
-    return subprocess.run([sys.executable, "-c", program, *words], text=True, capture_output=True, timeout=1200)
+    return run(words, [sys.executable, "-c", program], capture_output=True)
 
 
 def test_init_needs_no_solver(tmp_path):

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import optimum
 import pytest
+from test_identification import drawn, small_plant
 
 from uncertain_lti import OperatingPoint, Transient, read_transients
 from uncertain_lti.base.errors import FitError
@@ -84,14 +85,7 @@ def test_recordings_of_little_noise_reach_the_least_largest_width(bag, additive)
 
 def plant(seed, n, m, count, noise):
     """Recordings of a random linear plant."""
-    rng = np.random.default_rng(seed)
-    A, B = -np.diag(rng.uniform(1, 6, n)) + rng.uniform(-1, 1, (n, n)), rng.uniform(-3, 3, (n, m))
-    u = np.repeat(rng.uniform(-1, 1, (count // 10 + 1, m)), 10, axis=0)[: count + 1]
-    x = np.empty((count + 1, n))
-    x[0] = rng.uniform(-1, 1, n)
-    for k in range(count):
-        x[k + 1] = x[k] + 0.02 * (A @ x[k] + B @ u[k])
-    return Transient(np.arange(count + 1) * 0.02, x + noise * rng.standard_normal(x.shape), u)
+    return drawn(small_plant(seed, n, m), count, seed, noise, dt=0.02)
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])

@@ -369,6 +369,7 @@ def test_every_shipped_signals_file_loads(signals_folder: Path) -> None:
 
 
 X = "states:\n  - {name: x, topic: /a, field: data}\n"
+JOINTS = 'states:\n  - {for: [j0, j1], name: "{}", topic: /s, field: "position[{}]"}\n'
 
 
 def state(entry: str) -> str:
@@ -441,6 +442,16 @@ def control(entry: str) -> str:
         (control("field: 'lag(data, 0)'").replace("field: data, ", ""), "a lag is 1 to 1000000 samples, not 0"),
         (control("field: 'lag(data, 1)', delay: 2").replace("field: data, ", ""), "'u': lag\\(data, 1\\) has a delay"),
         ("states: [{name: x, topic: /a, field: diff(data)}]", "every state is a lag, diff or rate, .* list the field"),
+        (X + "schedule: [{signal: torque, knots: 3}]", "torque"),
+        (X + "schedule: [{signal: x, knots: 0}]", "knots"),
+        (X + "schedule: [{signal: x}]", "knots"),
+        (X + "schedule: [{signal: x, knots: [1, a]}]", r"knots\[1\]"),
+        (X + "schedule: [{signal: x, knots: [false, true]}]", r"knots\[0\]"),
+        (X + "schedule: {signal: x}", "list"),
+        (X + "scheduling: [{name: gear, topic: /g, field: data, delay: 2}]", "delay"),
+        ("states: [{for: [a, b], name: x, topic: /s, field: d}]", "name is 'x', the same for all of a"),
+        (X + "structure: own", "there are none"),
+        (JOINTS + "structure: [{for: [j0, j1], state: j0, from: j1, nominal: 0}]", "state is 'j0', the same"),
     ],
 )
 def test_a_wrong_signals_file_is_refused_in_one_sentence(text: str | bytes, words: str, tmp_path: Path) -> None:

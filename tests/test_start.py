@@ -74,13 +74,6 @@ def test_an_edited_signals_file_is_used_as_it_is(folder, capsys):
     assert data["fit"]["fit"]["transitions"] == 3 * 299 and data["report"] == "m.html"
 
 
-def test_what_is_to_note_of_a_recording_is_said_once(folder, capsys):
-    whole = (folder / HEALTHY[0]).read_bytes()
-    (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])
-    assert main(["start", *HEALTHY]) == 0
-    assert capsys.readouterr().err.count(f"{HEALTHY[0]}: cut after ") == 1
-
-
 def test_what_is_not_used_of_a_recording_is_said_as_fit_says_it(folder, capsys):
     """Also where the signals file is there already, so that `init` does not read the recordings."""
     messages = [Message(raw.topic, raw.log_time_ns, raw.data) for raw in Bag(folder / HEALTHY[1]).raw_messages()]

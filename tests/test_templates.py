@@ -78,28 +78,6 @@ def test_an_entry_for_many_is_as_many_entries() -> None:
     assert signals.controls[-1].valid == (-4.0, 4.0) and signals.structure is None
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        (
-            {"states": [{"for": ["a", "b"], "name": "x", "topic": "/s", "field": "d"}]},
-            "name is 'x', the same for all of a",
-        ),
-        (
-            {"states": [{"name": "x", "topic": "/s", "field": "d"}], "controls": [], "structure": "own"},
-            "there are none",
-        ),
-        (
-            {"structure": [{"for": ["j0", "j1"], "state": "j0", "from": "{}_u", "nominal": 0}]},
-            "state is 'j0', the same",
-        ),
-    ],
-)
-def test_a_template_without_a_place_or_members_is_refused(changes: dict[str, Any], words: str) -> None:
-    with pytest.raises(SignalError, match=words):
-        SignalMap.from_dict(joints(2) | changes)
-
-
 def test_own_leaves_each_state_its_own_signals_and_those_of_none() -> None:
     """The elements between members are 0 whatever the data, and a memory that is added later obeys."""
     rule = {"for": ["j0", "...", "j2"], "state": "{}", "from": "{}_u", "nominal": {"min": 0}}
