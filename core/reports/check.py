@@ -86,7 +86,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "recording": transient.name,
         "t_ns": int(transient.t_ns[0]),
         "samples": len(transient),
-        "seconds": float(np.abs(np.diff(transient.t_ns)).sum()) * 1e-9,
+        "seconds": _span(transient, 0, len(transient))["seconds"],
         "verdicts": judged,
         "no_verdict": _not_judged(verdicts),
         "violated": int(verdicts.violated.sum()),
