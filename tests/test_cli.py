@@ -18,13 +18,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from bag_writer import Topic, metadata_yaml, ramp, write, write_folder
+from bag_writer import Message, Topic, metadata_yaml, ramp, write, write_folder
 from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import STATE_TOPIC
+from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.reports.check import check_data
 
 
@@ -220,6 +221,24 @@ def test_an_older_page_or_layout_is_written_over(folder):
     pages += [["layout", model, f"--{kind}", str(folder / kind)] for kind in ("foxglove", "plotjuggler")]
     for arguments in [*pages, *pages]:
         assert main(arguments) == 0, arguments
+
+
+def test_a_recording_of_one_robot_of_several_is_checked_below_its_prefix(folder, tmp_path, capsys):
+    """As the node hears it with `topic_prefix`; the condition, too, is below it."""
+    plain, robot = Bag(folder / "bad.mcap"), tmp_path / "robot.mcap"
+    topics = [Topic(f"/robot1{topic}", info.type) for topic, info in plain.topics.items()]
+    messages = [Message(f"/robot1{m.topic}", m.log_time_ns, bytes(m.data)) for m in plain.raw_messages()]
+    write(topics, messages).save(robot)
+    enable = ["--enable", f"{STATE_TOPIC} position[fan_speed] > -100", "--json"]
+
+    def judged(*arguments):
+        assert main(["check", str(folder / "m.model.json"), *map(str, arguments), *enable]) == 1
+        (result,) = json.loads(capsys.readouterr().out)["recordings"]
+        return result["verdict_per_sample"], result["alarms"]
+
+    for prefix in ("/robot1", "robot1/"):
+        assert judged(robot, "--topic-prefix", prefix) == judged(folder / "bad.mcap")
+    assert "is /robot1/engine/state meant?" in refused(capsys, ["check", str(folder / "m.model.json"), str(robot)])
 
 
 def test_help_and_usage(capsys):

@@ -33,6 +33,7 @@ from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.outputs import VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
+from uncertain_lti.signals.signal_map import below
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
@@ -323,7 +324,7 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _there(self, topic: str) -> str:
         """Where a topic of the model, or of the enable condition, is heard; before remapping."""
-        return f"{self._prefix}/{topic.removeprefix('/')}" if self._prefix else topic
+        return below(self._prefix, topic)
 
     def _unsubscribe(self) -> None:
         self.intake.waiting(all_of_them=True)

@@ -187,6 +187,11 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--violations": _takes(f"alarm: number of violations {_OWN}", type=int),
     "--window": _takes(f"alarm: number of last verdicts they are counted in {_OWN}", type=int),
     "--margin": _takes(f"factor on the half-widths {_OWN}", type=float),
+    "--topic-prefix": _takes(
+        "the topics of the model, and that of --enable, are below this in the recording, such as /robot1",
+        "PREFIX",
+        default="",
+    ),
     "--masked": _takes("states, separated by commas, that never raise the alarm", "STATES", default=""),
     "--enable": _takes(
         "no alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, such as '/engine/mode data == 3'",
@@ -234,7 +239,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 RULES = ("--rules", "--violations", "--window", "--margin")
 """Another rule of containment, or other rules, than the model's."""
-DEPLOYED = (*RULES, "--masked", "--enable", "--grace", "--latch", "--from", "--to")
+DEPLOYED = (*RULES, "--topic-prefix", "--masked", "--enable", "--grace", "--latch", "--from", "--to")
 """The rules of the alarm and when they are armed, as the node has them as parameters."""
 
 

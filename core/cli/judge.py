@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -49,6 +50,7 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
     from uncertain_lti.model.model_file import read_rules
     from uncertain_lti.monitor.alarm import Condition
     from uncertain_lti.monitor.deployed import DeployedMonitor, listed_states
+    from uncertain_lti.signals.signal_map import below
 
     if options.rules is not None:
         rules = read_rules(options.rules)
@@ -56,8 +58,12 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
             model = model.replace(alarm=rules)
         except ModelError as error:
             raise ModelError(f"{options.rules}: does not fit the model: {error}") from None
+    if prefix := options.topic_prefix.strip("/"):
+        prefix = f"/{prefix}"
+        model = model.replace(signals=model.signals.below(prefix))
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin, listed_states(options.masked))
     condition = Condition.parse(options.enable)
+    condition = condition and replace(condition, topic=below(prefix, condition.topic))
     return DeployedMonitor(monitor, condition, options.grace, options.latch, options.start, options.stop)
 
 

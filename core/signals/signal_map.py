@@ -56,6 +56,11 @@ class UncarriedTopicError(SignalError):
         self.topics = topics
 
 
+def below(prefix: str, topic: str) -> str:
+    """A topic below a prefix such as `/robot1`; an empty prefix changes nothing."""
+    return f"{prefix.rstrip('/')}/{topic.removeprefix('/')}" if prefix else topic
+
+
 @dataclass(frozen=True)
 class SignalMap:
     """Which topic and field is which state or control, and how samples are cut from the messages.
@@ -410,6 +415,27 @@ class SignalMap:
             A new map.
         """
         return self.replace_signals([replace(s, type=types.get(s.topic, s.type)) for s in self.signals])
+
+    def below(self, prefix: str) -> SignalMap:
+        """The same signals on topics below a prefix.
+
+        Parameters
+        ----------
+        prefix : str
+            Such as `/robot1`; empty for none.
+
+        Returns
+        -------
+        SignalMap
+            A new map.
+        """
+        if not prefix:
+            return self
+        lists: dict[str, Any] = {
+            kind: tuple(replace(s, topic=below(prefix, s.topic)) for s in getattr(self, kind)) for kind in LISTS
+        }
+        time = {below(prefix, topic): source for topic, source in self.time.items()}
+        return replace(self, **lists, clock=self.clock and below(prefix, self.clock), time=time)
 
     def _repr_html_(self) -> str:
         """Where each signal is read, and its operating point; below, how samples are cut."""
