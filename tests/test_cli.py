@@ -131,6 +131,7 @@ REFUSED = [
     (FIT.replace("run", "lfs"), "git lfs pull"),
     (FIT.replace("signals.yaml", "nope.yaml"), "nope.yaml"),
     (FIT.replace("new", "no/m"), "make it first"),
+    (FIT.replace("new.model.json", "parts"), "parts: is a folder; name a file in it, for example"),
     (f"{FIT} --workers 0", "--workers is 0; give 1 or more"),
     (f"{FIT} --schedule fam", "is fan meant"),
     (f"{FIT} --schedule fan --schedule fan=3", "twice"),

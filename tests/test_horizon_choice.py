@@ -132,6 +132,8 @@ def test_an_empty_list_means_one_step_whatever_the_signals_file_asks_for() -> No
 
 
 def test_widths_without_horizons_and_weights_with_a_choice_are_refused() -> None:
+    with pytest.raises(FitError, match="widths is 'wide'; write auto, growing or constant"):
+        fit(RUNS, horizons=[3], widths="wide")
     with pytest.raises(FitError, match="no horizons are asked for"):
         fit(RUNS, widths="constant")
     with pytest.raises(FitError, match="transient_weights are for all"):
