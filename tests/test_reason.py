@@ -169,3 +169,5 @@ def test_where_no_verdict_was_possible_the_reason_comes_with_a_remedy(
     data = check_data(model, verdicts, samples=False)
     assert data["outcome"] == "unknown" and data["reason"].startswith("no verdict was possible, so nothing is known; ")
     assert remedy in data["reason"]
+    numbers = "fitted to (0.1 to 0.1 s), and most here take 3 s; "
+    assert (numbers in data["reason"]) == remedy.endswith("rate of the fit")

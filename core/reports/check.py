@@ -40,6 +40,7 @@ from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
+from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.charts import runs
 from uncertain_lti.sampling.clock import Status
@@ -310,7 +311,10 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     if not judged:
         met = Counter(verdicts.statuses())
         most = max(met, key=lambda s: (s not in (Status.FIRST, Status.UNASKED), met[s]), default=Status.FIRST)
-        return "; ".join(["no verdict was possible, so nothing is known", *data["unknown"], _REMEDIES[most]])
+        said = ["no verdict was possible, so nothing is known", *data["unknown"]]
+        if most is Status.STEP:
+            said.append(f"{why_not(most, model)}, and most here take {np.median(verdicts.transient.dt):.3g} s")
+        return "; ".join([*said, _REMEDIES[most]])
     if judged < JUDGED * steps:
         why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
         return f"only {judged} of {steps} steps could be judged{why}"
