@@ -22,9 +22,7 @@ from functools import partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy.linalg import lu_factor, lu_solve
-from scipy.signal import lfilter
-from scipy.stats import f as f_distribution
-from scipy.stats import norm
+from scipy.special import fdtri, ndtri  # scipy.stats and scipy.signal take a second to import
 
 Array = np.ndarray
 Score = Callable[[Array], Array]
@@ -113,6 +111,8 @@ def canonical(healthy: Sequence[Array], lags: int = 2) -> Score:
 
 def least_squares(healthy: Sequence[Array], n: int, fading: float = 1.0) -> Score:
     """Chi-square of the one-step residuals of x_next = [x u 1] theta, of one sample or faded (MEWMA)."""
+    from scipy.signal import lfilter
+
     mean, deviation = scaling(healthy)
 
     def split(rows: Array) -> tuple[Array, Array]:
@@ -154,7 +154,7 @@ def rolling(values: Array, window: int) -> Array:
 def limit_of_t2(components: int, count: int, p: float = 0.999) -> float:
     """Upper control limit of Hotelling's T2."""
     factor = components * (count - 1) * (count + 1) / (count * (count - components))
-    return float(factor * f_distribution.ppf(p, components, count - components))
+    return float(factor * fdtri(components, count - components, p))
 
 
 def t2(healthy: Array) -> Callable[[Array], Array]:
@@ -180,7 +180,7 @@ def t2_and_q(healthy: Array) -> Callable[[Array], Array]:
     kept = int(np.searchsorted(np.cumsum(values) / values.sum(), 0.85)) + 1
     left = float(np.linalg.eigvals(covariance)[kept:].sum())  # in the order of LAPACK, as there
     h = 1 - 2 * left * left**3 / (3 * left**4)
-    terms = 1 + norm.ppf(0.999) * h * math.sqrt(2 * left**2) / left + left**2 * h * (h - 1) / left**2
+    terms = 1 + ndtri(0.999) * h * math.sqrt(2 * left**2) / left + left**2 * h * (h - 1) / left**2
     limits = limit_of_t2(kept, len(healthy)), left * terms ** (1 / h)
 
     def of(rows: Array) -> Array:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from coil import coil_runs
 from engine_bag import SIGNALS, engine_bag
-from scipy import stats
 from tanks import Tanks
 
 from uncertain_lti import Transient, UncertainLTI
@@ -280,6 +279,8 @@ def test_the_interval_of_a_share_counts_clusters():
     assert quantile_share_interval(np.zeros(60), hits, 0.9)[1] == (0.0, 1.0)
     # their totals vary 36 / 5.4 times as much as of independent cases; those of units of nine hits each not at all
     for units, worth, count in ((np.arange(60) // 6, 9.0, 10), (np.arange(60) % 6, 60.0, 6)):
+        from scipy import stats
+
         tail, yes, no = stats.norm.cdf(stats.t.ppf(0.05, count - 1)), 0.9 * worth, 0.1 * worth
         limits = stats.beta.ppf(tail, yes, no + 1), stats.beta.isf(tail, yes + 1, no)
         assert quantile_share_interval(units, hits, 0.9)[1] == pytest.approx(limits, rel=1e-9)

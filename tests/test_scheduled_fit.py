@@ -9,7 +9,6 @@
 
 """Scheduled (piecewise-linear) models: exact, contained, and honest about what the recordings hold."""
 
-import cvxpy as cp
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -71,9 +70,11 @@ def written(transient, schedule, additive, weights=None):
 
 def optimum(transient, schedule, additive, criterion, weights=None):
     """Of the problem as written, by whichever of several solvers manages it."""
+    import cvxpy as cp
+
     problem = written(transient, schedule, additive, weights)
     tight = {"eps_abs": 1e-12, "eps_rel": 1e-12}
-    solvers = [(cp.HIGHS, {})] if criterion == "lp" else [(cp.PIQP, tight), (cp.CLARABEL, {})]
+    solvers = [("HIGHS", {})] if criterion == "lp" else [(cp.PIQP, tight), ("CLARABEL", {})]
     for solver, options in solvers:
         try:
             return solve_as_written(problem, criterion, solver, **options)[2]
@@ -162,6 +163,8 @@ def test_large_problem_reaches_the_same_optimum(criterion, monkeypatch):
 
 def test_five_knots_reach_the_least_largest_width_and_its_ties():
     """With fifty unknowns per row: the least largest width, and among its optima the least squared widths."""
+    import cvxpy as cp
+
     schedule = Schedule((Axis("u1", knots=(-1, -0.5, 0, 0.5, 1)),))
     transient = drawn(THREE, 1000, 6, noise=1e-4)
     model = fit(transient, "lp", additive="both", schedule=schedule)
@@ -177,7 +180,7 @@ def test_five_knots_reach_the_least_largest_width_and_its_ties():
         theta, d = cp.Variable(phi.shape[1]), cp.Variable(psi.shape[1], nonneg=True)
         room = [cp.abs(step / unit - phi @ theta) <= psi @ d, psi @ d <= half.max() / unit * (1 + 1e-8)]
         squares = cp.Problem(cp.Minimize(cp.sum_squares(psi @ d) / len(step)), room)
-        squares.solve(cp.CLARABEL)
+        squares.solve("CLARABEL")
         assert np.mean(half**2) / unit**2 < (1.0 + 1e-4) * squares.value
 
 
@@ -306,6 +309,8 @@ def test_structure_at_one_knot_and_shared_by_all():
 
 def test_structure_reaches_the_optimum_of_the_bounded_problem():
     """Elements that are shared, by the problem as written with that equality."""
+    import cvxpy as cp
+
     transient = drawn(THREE, 300, 12, noise=1e-3)
     shared = {"B": np.array([[True, False], [False, False]]), "dA": np.array([[False, True], [False, False]])}
     structure = Structure(2, 2, shared=shared)
@@ -322,7 +327,7 @@ def test_structure_reaches_the_optimum_of_the_bounded_problem():
         if criterion == "lp":
             limits.append(2 * half <= delta)
         programme = cp.Problem(cp.Minimize(delta if criterion == "lp" else cp.sum_squares(half)), limits)
-        programme.solve(solver=cp.CLARABEL, **CLARABEL)
+        programme.solve(solver="CLARABEL", **CLARABEL)
         model = fit(transient, criterion, additive="noise", schedule=THREE, structure=structure)
         d = np.concatenate([np.r_[model.dA[r, 0], model.dB[r, 0], model.v[r, 0]] for r in range(3)])
         half = 1e3 * psi @ d
