@@ -129,6 +129,12 @@ def test_real_recordings_fit_unedited(recordings, name):
         assert len(states) == 1
 
 
+def test_a_memory_that_covers_the_other_recording_is_proposed_though_one_is_left_outside_more_often(recordings):
+    """Without it all of the second is outside; of the rate, which pays too, and the value before the better is taken."""
+    proposal = propose([recordings / f"micro_gas_turbine/ex_{number}.mcap" for number in (1, 20)])
+    assert [state["field"] for state in yaml.safe_load(proposal.text)["states"]] == ["data", "lag(data, 1)"]
+
+
 def test_names_keep_the_letters_of_any_alphabet(tmp_path):
     x, path = 0.0, tmp_path / "a.csv"
     with open(path, "w", encoding="utf-8") as stream:

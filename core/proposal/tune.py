@@ -173,15 +173,15 @@ def memory_candidates(transients: Sequence[Transient], additive: Additive = "noi
 def choose_memories(transients: Sequence[Transient], additive: Additive) -> tuple[tuple[Remembered, ...], float]:
     """Which lags, rates or differences are worth having on left-out data, and the mean width over that without them.
 
-    Of the sets of `memory_candidates` those for the states are tried on about TRANSITIONS transitions, leaving out in
-    turn, then, beside the best of them, those for the controls; one is taken if the jumps seen are smaller by PAYS.
+    Of the sets of `memory_candidates` those for the states are tried on about 5 TRANSITIONS transitions, leaving out in
+    turn, then, beside the best of them, those for the controls; the best is taken if it sees jumps smaller by PAYS.
     """
     sets = memory_candidates(thinned(transients, 5 * TRANSITIONS), additive)
     if not sets:
         return (), 1.0
 
     def scored(memories: tuple[Remembered, ...]) -> Score:
-        runs = thinned(remember(transients, memories), TRANSITIONS)
+        runs = thinned(remember(transients, memories), 5 * TRANSITIONS)
         model = fitting.fit(runs, schedule={}, describe_data=False, additive=additive)
         return score_of(runs, model, None, FOLDS, {"additive": additive})[0]
 
@@ -191,12 +191,14 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
     except FitError:
         return (), 1.0
     for names in (transients[0].state_names, transients[0].control_names):
-        beside = chosen
+        found = list[tuple[Score, tuple[Remembered, ...]]]()
         for some in (s for s in sets if s[0].of in names):
             with suppress(FitError):
-                after = scored((*beside, *some))
-                if after.holds(before) and after.figure < PAYS * best.figure:
-                    best, chosen = after, (*beside, *some)
+                found.append((scored((*chosen, *some)), (*chosen, *some)))
+        found = [(after, beside) for after, beside in found if after.holds(before)]
+        after, beside = min(found, key=lambda pair: pair[0].figure, default=(best, chosen))
+        if after.figure < PAYS * best.figure:
+            best, chosen = after, beside
     return chosen, best.width / before.width
 
 
