@@ -174,7 +174,7 @@ REFUSED = [
     ("layout m.model.json", "--foxglove"),
     ("layout m.model.json --foxglove no/x.json", "make it first"),
     ("validate m.model.json run.mcap bad.mcap", "do not give this model again"),
-    ("validate m.model.json --false-alarms -1", "positive"),
+    ("validate m.model.json absent.mcap --false-alarms -1", "give a positive number per hour"),
     ("validate m.model.json --within 0", "positive number of seconds"),
     ("validate m.model.json --output no/m.json", "make it first"),
     ("signature m.model.json fan_damage --output new", "LABEL=BAG"),

@@ -130,7 +130,7 @@ def test_real_recordings_fit_unedited(recordings, name):
 
 
 def test_a_memory_that_covers_the_other_recording_is_proposed_though_one_is_left_outside_more_often(recordings):
-    """Without it all of the second is outside; of the rate, which pays too, and the value before the better is taken."""
+    """Without it all of the second is outside; of the rate, which pays too, and the value before the best is taken."""
     proposal = propose([recordings / f"micro_gas_turbine/ex_{number}.mcap" for number in (1, 20)])
     assert [state["field"] for state in yaml.safe_load(proposal.text)["states"]] == ["data", "lag(data, 1)"]
 

@@ -178,7 +178,7 @@ def test_an_index_whose_certificate_is_not_trusted(run, tmp_path):
     if shutil.which("openssl") is None:
         pytest.skip("openssl, which makes the certificate, is not installed")
     both = tmp_path / "own.pem"
-    make = "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=own -addext subjectAltName=IP:127.0.0.1"
+    make = "openssl req -x509 -newkey rsa:2048 -nodes -days 2 -subj /CN=own -addext subjectAltName=DNS:localhost"
     subprocess.run([*make.split(), "-keyout", both, "-out", tmp_path / "c.pem"], check=True, capture_output=True)
     both.write_text(both.read_text() + (tmp_path / "c.pem").read_text())
     context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
@@ -186,7 +186,7 @@ def test_an_index_whose_certificate_is_not_trusted(run, tmp_path):
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         server.socket = context.wrap_socket(server.socket, server_side=True)
         threading.Thread(target=server.serve_forever, daemon=True).start()
-        index = {"PIP_INDEX_URL": f"https://127.0.0.1:{server.server_address[1]}/simple", "PIP_RETRIES": "0"}
+        index = {"PIP_INDEX_URL": f"https://localhost:{server.server_address[1]}/simple", "PIP_RETRIES": "0"}
         sentence = refusal(run("setup", programs={"python3": this_python()}, **index))
         server.shutdown()
     assert "certificate of the package index is not trusted" in sentence and "export PIP_CERT=" in sentence

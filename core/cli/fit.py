@@ -257,10 +257,11 @@ def run_validate(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.model_text import validation_text
     from uncertain_lti.validation.detectable import check_within, detectable
     from uncertain_lti.validation.left_out import validate
-    from uncertain_lti.validation.panel import learn, promises
+    from uncertain_lti.validation.panel import check_rate, learn, promises
     from uncertain_lti.validation.part import fitted_parts
 
     check_within(options.within)
+    check_rate(options.false_alarms)
     model = UncertainLTI.load(options.model)
     sources = model.fit_summary.get("sources", [])
     bags = options.bags or list(dict.fromkeys(s["file"] for s in sources))

@@ -38,6 +38,7 @@ from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.values import Additive, HorizonRule, WidthChoice
 from uncertain_lti.validation.monitor_fit import choose_monitored, monitored_like, point_of
+from uncertain_lti.validation.panel import check_rate
 
 SAMPLE = 2e7
 """Numbers of the recordings of an archive that are left out in turn, at most: 160 MB."""
@@ -309,6 +310,7 @@ def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> Non
         raise FitError(f"alarm is {alarm!r}; it must be panel, containment, or a list of rules")
     if false_alarms is not None and alarm != "panel":
         raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")
+    check_rate(false_alarms)
 
 
 def _some(bags: Sequence[Recording], signals: SignalMap) -> list[Transient]:

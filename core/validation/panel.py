@@ -266,14 +266,19 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
     return [size if rule.kind == "mean" else np.sqrt(size) for rule, size in each]
 
 
+def check_rate(rate: float | None) -> None:
+    """Refuse what no rate of false alarms is."""
+    if rate is not None and not (math.isfinite(rate) and rate > 0):
+        raise FitError(f"false_alarms is {rate}; give a positive number per hour")
+
+
 def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = None) -> Panel:
     """The panel of a model, from what was left out of the fit and from the fit itself.
 
     `fitted`: what was fitted, judged by the model; `rate`: false alarms per hour, the upper limit with CONFIDENCE; the
     thresholds are as near to it as the data can show. Raises FitError if there is nothing to learn from.
     """
-    if rate is not None and not (math.isfinite(rate) and rate > 0):
-        raise FitError(f"false_alarms is {rate}; give a positive number per hour")
+    check_rate(rate)
     parts = [part for part in validation.parts if part.judged]
     if not parts:
         raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
