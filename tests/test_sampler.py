@@ -735,6 +735,19 @@ def test_min_step_thins_a_fast_stream_out() -> None:
     assert resolved.max_gap == pytest.approx(0.025)
 
 
+def test_a_lost_sample_is_a_gap_where_memories_look_back_over_it_but_jitter_is_none() -> None:
+    recalls = SignalMap((Signal("x", "/c", "data"), Signal("before", "/c", "lag(data, 1)")))
+    even = np.arange(1000) * TICK
+    even[500:] += TICK
+    for signals, instants, steps in (
+        (recalls, even, 1.5),
+        (replace(recalls, controls=()), even, 2.5),
+        (recalls, np.cumsum(np.where(np.arange(1000) % 50 == 0, 2, 1)) * TICK, 2.5),
+        (replace(recalls, max_gap=2 * TICK * 1e-9), even, 2.0),
+    ):
+        assert resolve(signals, {"/c": [instants]}, {"/c": "log"}).max_gap == pytest.approx(steps * TICK * 1e-9)
+
+
 def test_resolve_takes_the_slowest_state_topic_and_two_and_a_half_of_its_median_step() -> None:
     signals = SignalMap((Signal("a", "/fast", "data"), Signal("b", "/slow", "data")), (Signal("u", "/slower", "data"),))
     instants = {

@@ -54,6 +54,11 @@ class Status(StrEnum):
         return self in (Status.FIRST, Status.RESET, Status.GAP)
 
 
+_LONGEST, _LONGEST_REMEMBERED = 2.5, 1.5
+"""Median steps up to which a longer one is no gap; of signals that recall others one over a lost sample is: what they
+recall is of another time there."""
+_JITTERING = 0.01
+"""Share of steps beyond the shorter of these from which on it is jitter and no loss."""
 LATE, TOO_OLD, MISSING, INVALID = "late", "stale", "missing", "invalid"
 """Kinds that are counted per topic (late) or per signal."""
 
@@ -175,7 +180,12 @@ def resolve(
             f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
             f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         )
-    max_gap = signals.max_gap if signals.max_gap is not None else min(2.5 * step * 1e-9, LONGEST_S)
+    longest = _LONGEST
+    if signals.recalled:
+        steps = np.concatenate([_forward_steps(i, min_step_ns) for i in instants[clock]])
+        if np.mean(steps > _LONGEST_REMEMBERED * step) <= _JITTERING:
+            longest = _LONGEST_REMEMBERED
+    max_gap = signals.max_gap if signals.max_gap is not None else min(longest * step * 1e-9, LONGEST_S)
     constant = signals.step
     if constant == "constant":
         constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9

@@ -77,7 +77,7 @@ class SignalMap:
     clock : str or None, optional
         Topic whose messages define the sample instants; None for the slowest state topic.
     max_gap : float or None, optional
-        Longest step that is still a transition, s; None for 2.5 x the median step.
+        Longest step that is still a transition, s; None for 2.5 x the median step; 1.5 x with memories of even samples.
     min_step : float, default 0.0
         Shortest step, s; a message sooner than that is dropped.
     max_skew : float or None, optional
