@@ -179,6 +179,19 @@ def test_a_memory_that_pays_is_a_candidate_and_narrows_what_was_left_out() -> No
     assert widths[0] < 0.2 * widths[1]
 
 
+@pytest.mark.parametrize(("gap", "left"), [(None, 0.075), (0.2, 0.2)])
+def test_no_memory_looks_back_over_a_lost_sample_unless_somebody_says_so(gap: float | None, left: float) -> None:
+    run = oscillating(0)
+    there = np.arange(len(run)) != 500
+    signals = SignalMap((Signal("swing", "/s", "data"),), (Signal("push", "/u", "data"),), max_gap=gap or 0.125)
+    lost = Transient(run.t[there], run.x[there], run.u[there], signals=signals, max_gap=gap)
+    (plain,), (found,) = remember([lost], []), remember([lost], [Remembered("swing", Memory("lag"))])
+    assert plain.max_gap == lost.max_gap and plain.signals == signals
+    assert found.max_gap == pytest.approx(left, abs=1e-4) and found.signals is not None
+    assert found.signals.max_gap == found.max_gap
+    assert np.isnan(found.u[500, 1]) == (gap is None) and not np.isnan(found.u[501, 1])
+
+
 def test_no_memory_is_a_candidate_where_every_state_is_measured() -> None:
     runs = [oscillating(seed, blind=False) for seed in range(2)]
     assert not any(one.of.startswith("x") for some in memory_candidates(runs) for one in some)

@@ -33,6 +33,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of, thinned
+from uncertain_lti.sampling.clock import longest_step
 from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
@@ -136,8 +137,21 @@ def memories(transients: Sequence[Transient], best: Setting) -> Iterator[list[Se
 
 
 def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
-    """Recordings with further controls that follow from their own earlier samples."""
-    return [with_memories(t, {one.name: (one.of, one.memory) for one in memories}) for t in transients]
+    """Recordings with further controls that follow from their own earlier samples, which no lost sample parts."""
+    steps = np.concatenate([np.diff(t.t_ns) for t in transients])
+    steps = steps[steps > 0]
+    step = int(np.median(steps)) if len(steps) else 0
+    usual, longest = (longest_step(steps, step, recalls) for recalls in (False, bool(memories)))
+
+    def parted(t: Transient) -> Transient:
+        if not math.isclose(t.max_gap, usual, rel_tol=1e-3):  # as somebody said
+            return t
+        signals = t.signals
+        if signals is not None and signals.max_gap is not None:
+            signals = replace(signals, max_gap=longest)
+        return t.replace(max_gap=longest, signals=signals)
+
+    return [with_memories(parted(t), {one.name: (one.of, one.memory) for one in memories}) for t in transients]
 
 
 def memory_candidates(transients: Sequence[Transient], additive: Additive = "noise") -> list[tuple[Remembered, ...]]:

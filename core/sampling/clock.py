@@ -159,6 +159,15 @@ def coarse_ns(instants: Sequence[NDArray[np.int64]]) -> int | None:
     return unit if line and np.mean(line) >= 0.8 else None
 
 
+def longest_step(steps: NDArray[np.int64], step: int, recalls: bool) -> float:
+    """Longest step that is no gap where nobody says, s.
+
+    `steps` (K,): those recorded, ns; `step`: their median, ns; `recalls`: some signals are earlier values of others.
+    """
+    jitter = np.count_nonzero(steps > _LONGEST_REMEMBERED * step) > _JITTERING * len(steps)
+    return min((_LONGEST_REMEMBERED if recalls and not jitter else _LONGEST) * step * 1e-9, LONGEST_S)
+
+
 def resolve(
     signals: SignalMap,
     instants: Mapping[str, Sequence[NDArray[np.int64]]],
@@ -180,12 +189,10 @@ def resolve(
             f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
             f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         )
-    longest = _LONGEST
-    if signals.recalled:
+    max_gap = signals.max_gap
+    if max_gap is None:
         steps = np.concatenate([_forward_steps(i, min_step_ns) for i in instants[clock]])
-        if np.mean(steps > _LONGEST_REMEMBERED * step) <= _JITTERING:
-            longest = _LONGEST_REMEMBERED
-    max_gap = signals.max_gap if signals.max_gap is not None else min(longest * step * 1e-9, LONGEST_S)
+        max_gap = longest_step(steps, step, bool(signals.recalled))
     constant = signals.step
     if constant == "constant":
         constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9
