@@ -137,11 +137,9 @@ def memories(transients: Sequence[Transient], best: Setting) -> Iterator[list[Se
 
 
 def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) -> list[Transient]:
-    """Recordings with further controls that follow from their own earlier samples, which no lost sample parts."""
-    steps = np.concatenate([np.diff(t.t_ns) for t in transients])
-    steps = steps[steps > 0]
-    step = int(np.median(steps)) if len(steps) else 0
-    usual, longest = (longest_step(steps, step, recalls) for recalls in (False, bool(memories)))
+    """Recordings with further controls that follow from their own earlier samples, none over a lost one."""
+    instants = [t.t_ns for t in transients]
+    usual, longest = (longest_step(instants, recalls=recalls) for recalls in (False, bool(memories)))
 
     def parted(t: Transient) -> Transient:
         if not math.isclose(t.max_gap, usual, rel_tol=1e-3):  # as somebody said

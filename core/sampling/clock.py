@@ -100,8 +100,25 @@ def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) 
 
     `instants` (messages,): of each recording, ns.
     """
-    pooled = np.concatenate([np.empty(0, np.int64), *(_forward_steps(i, min_step_ns) for i in instants)])
+    pooled = _pooled(instants, min_step_ns)
     return int(np.median(pooled)) if pooled.size else None
+
+
+def longest_step(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0, recalls: bool = False) -> float:
+    """Longest step that is no gap where nobody says, s; inf without a forward step.
+
+    `instants` (messages,): of each recording, ns; `recalls`: some signals are earlier values of others.
+    """
+    steps = _pooled(instants, min_step_ns)
+    if not steps.size:
+        return math.inf
+    step = int(np.median(steps))
+    even = recalls and np.count_nonzero(steps > _LONGEST_REMEMBERED * step) <= _JITTERING * len(steps)
+    return min((_LONGEST_REMEMBERED if even else _LONGEST) * step * 1e-9, LONGEST_S)
+
+
+def _pooled(instants: Sequence[NDArray[np.int64]], min_step_ns: int) -> NDArray[np.int64]:
+    return np.concatenate([np.empty(0, np.int64), *(_forward_steps(i, min_step_ns) for i in instants)])
 
 
 def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.int64]:
@@ -159,15 +176,6 @@ def coarse_ns(instants: Sequence[NDArray[np.int64]]) -> int | None:
     return unit if line and np.mean(line) >= 0.8 else None
 
 
-def longest_step(steps: NDArray[np.int64], step: int, recalls: bool) -> float:
-    """Longest step that is no gap where nobody says, s.
-
-    `steps` (K,): those recorded, ns; `step`: their median, ns; `recalls`: some signals are earlier values of others.
-    """
-    jitter = np.count_nonzero(steps > _LONGEST_REMEMBERED * step) > _JITTERING * len(steps)
-    return min((_LONGEST_REMEMBERED if recalls and not jitter else _LONGEST) * step * 1e-9, LONGEST_S)
-
-
 def resolve(
     signals: SignalMap,
     instants: Mapping[str, Sequence[NDArray[np.int64]]],
@@ -191,8 +199,7 @@ def resolve(
         )
     max_gap = signals.max_gap
     if max_gap is None:
-        steps = np.concatenate([_forward_steps(i, min_step_ns) for i in instants[clock]])
-        max_gap = longest_step(steps, step, bool(signals.recalled))
+        max_gap = longest_step(instants[clock], min_step_ns, bool(signals.recalled))
     constant = signals.step
     if constant == "constant":
         constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9

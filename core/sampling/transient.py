@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.text import html_table, meant, named, number_text, plural
-from uncertain_lti.sampling.clock import Counters, Status, median_step_ns, to_ns
+from uncertain_lti.sampling.clock import Counters, Status, longest_step, to_ns
 from uncertain_lti.sampling.samples import (
     csv_columns,
     frame_columns,
@@ -199,9 +199,8 @@ class Transient:
             raise TransientError(f"{name}: step is {step}; it must be 1e-9 to {LONGEST_S:g} s, or recorded")
         self.step = None if isinstance(step, str) else float(step)
         min_step_ns = to_ns(min_step)
-        median = median_step_ns([t_ns], min_step_ns)
         if max_gap is None:
-            max_gap = min(2.5 * median * 1e-9, LONGEST_S) if median else math.inf
+            max_gap = longest_step([t_ns], min_step_ns)
         self.max_gap, self.min_step = float(max_gap), float(min_step)
         kept, self.segment = segments_of(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
         self.t_ns = t_ns
