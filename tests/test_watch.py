@@ -72,7 +72,7 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
     assert drawn(address)["title"] == "SILENT /envelope_monitor" and drawn(address)["top"][0]["note"] == ""
     monitor = world.monitor(tmp_path / "model.json")
     until(lambda: drawn(address)["note"].endswith("nothing is heard on /envelope_monitor/flags."), "the node")
-    world.command("play", DAMAGED, "--rate", "8", "--wait", "20").succeed()
+    world.command("play", DAMAGED, "--rate", "4", "--wait", "20").succeed()
     (run,) = read_transients([DAMAGED], model.signals)
     offline = EnvelopeMonitor(model).check(run)
     until(lambda: f"{len(run)} samples" in drawn(address)["note"], "every sample")
