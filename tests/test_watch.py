@@ -27,8 +27,11 @@ import pytest
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
+from builtin_interfaces.msg import Time
 from ros_processes import Process, own_domain, until
 from ros_processes import world as world
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.cli.main import main
@@ -76,6 +79,7 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
     (run,) = read_transients([DAMAGED], model.signals)
     offline = EnvelopeMonitor(model).check(run)
     until(lambda: f"{len(run)} samples" in drawn(address)["note"], "every sample")
+    until(lambda: np.isfinite(numbers(drawn(address)["top"][0]["values"]["least"])[-1]), "the last sample's statistics")
     said = drawn(address)
     score = numbers(said["top"][0]["values"]["least"])
     expected = np.fmax.reduce(np.abs(offline.statistics), axis=1)
@@ -111,6 +115,24 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
     assert drawn(address)["title"] == "ALARM SILENT /envelope_monitor"
     watch.signal(2)
     assert watch.wait() == 0
+
+
+def test_numbers_that_come_before_the_flags_of_their_sample_are_drawn(world):
+    address = address_of(world.command("watch", "--port", "0"))
+    flags, numbers_ = (world.publisher(JointState, f"/envelope_monitor/{name}") for name in ("flags", "statistics"))
+    world.subscribed(flags, numbers_)
+
+    def say(publisher: Any, at: int, name: str, value: float) -> None:
+        publisher.publish(JointState(header=Header(stamp=Time(sec=at)), name=[name], position=[value]))
+
+    say(flags, 1, "speed", 0.0)
+    until(lambda: drawn(address)["note"].startswith("1 sample,"), "a sample")
+    say(numbers_, 1, "energy/speed", 0.25)
+    say(numbers_, 2, "energy/speed", 0.5)
+    until(lambda: numbers(drawn(address)["top"][0]["values"]["least"])[-1] == 0.25, "its statistic")
+    say(flags, 2, "speed", 0.0)
+    until(lambda: drawn(address)["note"].startswith("2 samples,"), "the next sample")
+    np.testing.assert_array_equal(numbers(drawn(address)["top"][0]["values"]["least"]), [0.25, 0.5])
 
 
 def test_a_name_that_no_node_has_and_a_port_that_is_taken_are_refused(tmp_path, monkeypatch, capfd):

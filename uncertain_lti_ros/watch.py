@@ -56,6 +56,7 @@ class _Said:
         self.flags, self.utilisation = np.full((2, _MOST, len(names)), np.nan)
         self.statistics = np.empty((_MOST, 0))
         self.count = 0
+        self.early = dict[int, list[tuple[NDArray[Any], JointState]]]()  # by stamp: numbers that overtook their flags
 
     def rows(self) -> list[NDArray[Any]]:
         """Copies of all five, the oldest sample first."""
@@ -91,6 +92,8 @@ class Watched:
             said.alarm[row] = said.count and said.alarm[row - 1]
             said.utilisation[row] = said.statistics[row] = np.nan
             said.count += 1
+            for ring, early in said.early.pop(said.t_ns[row].item(), ()):
+                ring[row] = early.position
             self._heard = time.monotonic()
 
     def _violation(self, message: Bool) -> None:
@@ -111,13 +114,16 @@ class Watched:
             self._put(self._said.statistics, message)
 
     def _put(self, ring: NDArray[Any], message: JointState) -> None:
-        """Numbers of a sample that was flagged lately."""
-        newest, t_ns = self._said.count - 1, stamp_ns(message)
-        for back in range(min(newest + 1, _BEHIND)):
-            row = (newest - back) % _MOST
-            if self._said.t_ns[row] == t_ns:
+        """Numbers of a sample that was flagged lately, or will be: topics have no order among them."""
+        said, t_ns = self._said, stamp_ns(message)
+        for back in range(1, min(said.count, _BEHIND) + 1):
+            row = (said.count - back) % _MOST
+            if said.t_ns[row] == t_ns:
                 ring[row] = message.position
                 return
+        said.early.setdefault(t_ns, []).append((ring, message))
+        if len(said.early) > _BEHIND:
+            said.early.pop(next(iter(said.early)))
 
     def _why(self, message: String) -> None:
         with self._lock:
