@@ -135,6 +135,7 @@ def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypat
     """
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
     monkeypatch.setattr(programmes, "MANY", many)
+    monkeypatch.setattr(solvers, "MANY", many)
     monkeypatch.setattr(working_set, "_HELD_BYTES", held)
     transient = drawn(small_plant(8), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")
@@ -469,6 +470,28 @@ def test_a_fit_does_not_depend_on_the_number_of_threads(monkeypatch):
     several = fit(transient, "qp", additive="noise", describe_data=False)
     monkeypatch.setattr(fleet, "core_count", lambda: 1)
     assert fit(transient, "qp", additive="noise", describe_data=False).to_dict() == several.to_dict()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_an_interior_point_and_equations_end_where_the_active_set_method_does(seed, monkeypatch):
+    rng = np.random.default_rng(seed)
+    size = 20
+    M, G = rng.standard_normal((size, size)), rng.standard_normal((60, size))
+    h = G @ rng.uniform(0.1, 0.5, size) - rng.exponential(2.0, 60)
+    lower, upper = np.where(rng.random(size) < 0.6, 0.0, -np.inf), np.where(rng.random(size) < 0.6, 0.6, np.inf)
+    of = solvers.Programme(M @ M.T / size + 1e-6 * np.eye(size), 3.0 * rng.standard_normal(size), G, h, lower, upper)
+    expected = solvers.solve_qp(of)
+    assert {1, 3} <= set(expected.active[:size].tolist()) and expected.active[size:].any()
+    monkeypatch.setattr(solvers, "MANY", 1)
+    known = solvers.solve_qp(of, expected.active)
+    assert known.solver == "PIQP" and known.xi == pytest.approx(expected.xi, abs=1e-9)
+    for wrong in rng.choice(np.flatnonzero(expected.active), 3, replace=False):  # too few, or too many
+        without, more = expected.active.copy(), expected.active.copy()
+        without[wrong], more[size + rng.choice(np.flatnonzero(more[size:] == 0))] = 0, 3
+        for start in (without, more):
+            assert solvers.solve_qp(of, start).xi == pytest.approx(expected.xi, abs=1e-9)
+    begin = rng.standard_normal(size)
+    assert solvers.solve_near(of, begin, like=of[:2]).xi == pytest.approx(expected.xi, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -554,7 +554,12 @@ class Programmes:
                 row.lower[: row.r],
                 row.upper[: row.r],
             )
-            answer = solve_qp(programme, any_solver=False, feasible=FEASIBLE if row.refined else ROUGH)
+            feasible = FEASIBLE if row.refined else ROUGH
+            if row.r < MANY:
+                answer = solve_qp(programme, any_solver=False, feasible=feasible)
+            else:
+                begin = row.scaled()[0] if row.basis is None else np.zeros(row.r)
+                answer = solve_near(programme, begin, feasible=feasible, like=programme[:2])
         except FitError:  # the half-widths leave no room at all
             return
         row.store_theta(answer.xi)

@@ -40,8 +40,12 @@ MANY = 60
 """Unknowns from which on an interior point finds what is active sooner than an active-set method."""
 _ALONG, _FIXED = 1e-6, 1e-9
 """Relative singular value below which rows leave a direction, and relative size of a row that does not see it."""
-_ANEW, _NEAR_INSIDE = 0.02, 3
-"""Then: violated rows per unknown from which on it begins anew, and rows per unknown that it begins with."""
+_NEAR_INSIDE = 3
+"""Rows per unknown that a programme begins with then."""
+_ACCURATE = 1e-12
+"""Of an interior point: coarser, it takes for active what is only near."""
+_INDEPENDENT = 1e-10
+"""Relative size below which what a row adds to others is rounding."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +105,8 @@ def _solved(of: Programme, active: Sense | None, any_solver: bool, feasible: flo
     """The answer of the first solver that has a good one, and by how much it violates a row."""
     scaled, s = _scaled(of)
     best: tuple[float, Answer] | None = None
-    for name, solver in _SOLVERS if any_solver else _SOLVERS[:1]:
+    by_equations = (("PIQP", _by_equations),) * (len(of.f) >= MANY and active is not None)
+    for name, solver in by_equations + (_SOLVERS if any_solver else _SOLVERS[:1]):
         answer, found = solver(scaled, active)
         if answer is None or not np.isfinite(answer).all():
             continue
@@ -121,7 +126,8 @@ def _scaled(of: Programme) -> tuple[Programme, Array]:
     """A programme whose Hessian has a diagonal of ones, harmless to every solver, and the unit of each unknown."""
     s = 1.0 / np.sqrt(np.maximum(np.diagonal(of.H), 1e-300))
     G = of.G * s
-    norm = np.maximum(np.abs(G).max(axis=1, initial=0.0), 1e-300)
+    norm = np.abs(G).max(axis=1, initial=0.0)
+    norm[norm == 0.0] = 1.0
     return Programme(of.H * np.outer(s, s), of.f * s, G / norm[:, None], of.h / norm, of.lower / s, of.upper / s), s
 
 
@@ -136,7 +142,8 @@ def solve_near(
     """As `solve_qp`, with the rows that are near at ξ alone, and then those that the answer violates.
 
     A strictly convex programme has one minimiser, so it does not matter which other rows were left out. `like`: H and f
-    of a better conditioned objective whose minimiser has nearly the same rows active: an interior point starts there.
+    of a better conditioned objective whose minimiser has nearly the same rows active: an interior point finds those
+    wherever rows are violated.
     """
     (G, h), size = of[2:4], len(of.f)
     slack = G @ xi - h
@@ -148,7 +155,7 @@ def solve_near(
     while True:
         start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
         some = of._replace(G=G[wanted], h=h[wanted])
-        if like is not None and (start is None or np.count_nonzero(slack[wanted] < -_SLIGHT) > _ANEW * size):
+        if like is not None and (start is None or (slack[wanted] < -_SLIGHT).any()):
             start = _active_inside(some._replace(H=like[0], f=like[1]))
         answer = solve_qp(some, start, any_solver, feasible)
         if answer.active is None:
@@ -186,12 +193,41 @@ def _daqp(of: Programme, active: Sense | None) -> _Found:
     return None, None
 
 
-def _inside(of: Programme, accuracy: float) -> Any:
+def _by_equations(of: Programme, active: Sense | None) -> _Found:
+    """The minimiser where what an interior point says is active is so, by the equations of that, as multipliers prove.
+
+    With H = L Lᵀ and L⁻¹ Cᵀ = Q R, of what is active, C ξ = l: Lᵀ ξ = Q (R⁻ᵀ l + Qᵀ g) - g and R λ = R⁻ᵀ l + Qᵀ g,
+    g = L⁻¹ f.
+    """
+    from scipy.linalg import lapack, solve_triangular
+
+    assert active is not None
+    size = len(of.f)
+    low, high, rows = (np.flatnonzero(which) for which in (active[:size] == 3, active[:size] == 1, active[size:]))
+    unit, limits = np.eye(size), np.concatenate([of.lower[low], -of.upper[high], of.h[rows]])
+    L, failed = lapack.dpotrf(of.H, lower=1)
+    if failed or len(limits) > size:
+        return None, None
+    sides = np.column_stack([unit[:, low], -unit[:, high], of.G[rows].T, of.f])
+    *whitened, g = solve_triangular(L, sides, lower=True).T
+    Q, R = np.linalg.qr(np.array(whitened).reshape(-1, size).T)
+    diagonal = np.abs(np.diagonal(R))
+    if diagonal.min(initial=1.0) <= _INDEPENDENT * diagonal.max(initial=1.0):
+        return None, None
+    along = solve_triangular(R, limits, trans="T") + Q.T @ g
+    xi = solve_triangular(L, Q @ along - g, lower=True, trans="T")
+    within = np.concatenate(
+        [solve_triangular(R, along), *(each + _SLIGHT for each in (of.G @ xi - of.h, xi - of.lower, of.upper - xi))]
+    )
+    return (xi, active) if (within >= 0.0).all() else (None, None)
+
+
+def _inside(of: Programme) -> Any:
     import piqp
 
     solver = piqp.DenseSolver()
-    solver.settings.eps_abs = accuracy
-    solver.settings.eps_rel = accuracy
+    solver.settings.eps_abs = _ACCURATE
+    solver.settings.eps_rel = _ACCURATE
     solver.settings.max_iter = 500
     solver.setup(of.H, of.f, None, None, of.G, of.h, np.full(len(of.h), np.inf), of.lower, of.upper)
     done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
@@ -199,13 +235,13 @@ def _inside(of: Programme, accuracy: float) -> Any:
 
 
 def _piqp(of: Programme, _: Sense | None) -> _Found:
-    found = _inside(of, 1e-12)
+    found = _inside(of)
     return (None if found is None else np.array(found.x, dtype=np.float64)), None
 
 
 def _active_inside(of: Programme) -> Sense | None:
     """What an interior point says is active: by the ratio of multiplier and slack, as much as can be independent."""
-    found, size = _inside(_scaled(of)[0], 1e-9), len(of.f)
+    found, size = _inside(_scaled(of)[0]), len(of.f)
     if found is None:
         return None
     multiplier = np.concatenate([found.z_bl, found.z_bu, found.z_l])
