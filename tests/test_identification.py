@@ -135,7 +135,7 @@ def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypat
     """
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
     monkeypatch.setattr(programmes, "MANY", many)
-    monkeypatch.setattr(solvers, "MANY", many)
+    monkeypatch.setattr(programmes, "VERY_MANY", many)
     monkeypatch.setattr(working_set, "_HELD_BYTES", held)
     transient = drawn(small_plant(8), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")
@@ -473,7 +473,7 @@ def test_a_fit_does_not_depend_on_the_number_of_threads(monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_an_interior_point_and_equations_end_where_the_active_set_method_does(seed, monkeypatch):
+def test_an_interior_point_and_equations_end_where_the_active_set_method_does(seed):
     rng = np.random.default_rng(seed)
     size = 20
     M, G = rng.standard_normal((size, size)), rng.standard_normal((60, size))
@@ -482,16 +482,15 @@ def test_an_interior_point_and_equations_end_where_the_active_set_method_does(se
     of = solvers.Programme(M @ M.T / size + 1e-6 * np.eye(size), 3.0 * rng.standard_normal(size), G, h, lower, upper)
     expected = solvers.solve_qp(of)
     assert {1, 3} <= set(expected.active[:size].tolist()) and expected.active[size:].any()
-    monkeypatch.setattr(solvers, "MANY", 1)
-    known = solvers.solve_qp(of, expected.active)
+    known = solvers.solve_qp(of, expected.active, equations=True)
     assert known.solver == "PIQP" and known.xi == pytest.approx(expected.xi, abs=1e-9)
     for wrong in rng.choice(np.flatnonzero(expected.active), 3, replace=False):  # too few, or too many
         without, more = expected.active.copy(), expected.active.copy()
         without[wrong], more[size + rng.choice(np.flatnonzero(more[size:] == 0))] = 0, 3
         for start in (without, more):
-            assert solvers.solve_qp(of, start).xi == pytest.approx(expected.xi, abs=1e-9)
+            assert solvers.solve_qp(of, start, equations=True).xi == pytest.approx(expected.xi, abs=1e-9)
     begin = rng.standard_normal(size)
-    assert solvers.solve_near(of, begin, like=of[:2]).xi == pytest.approx(expected.xi, abs=1e-9)
+    assert solvers.solve_near(of, begin, like=of[:2], accurate=True).xi == pytest.approx(expected.xi, abs=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -24,6 +24,7 @@ from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
 from uncertain_lti.identification.solvers import (
     FEASIBLE,
     MANY,
+    VERY_MANY,
     Answer,
     Programme,
     Sense,
@@ -165,11 +166,12 @@ class Programmes:
             begin[: row.r] = row.scaled()[0]
         limits = *self._with_asked(G, h), lower, upper
         inside = len(lower) >= MANY and (kind != "regularised" or last is None)  # that moves on with its tie-break
+        accurate = len(lower) >= VERY_MANY and kind == "quadratic"
         for self.attempt in _ATTEMPTS:
             programme = Programme(*objective(*self.attempt), *limits)
             like = objective(_LIKE * self.attempt[0], self.attempt[1]) if inside else None
             try:
-                answer = solve_near(programme, begin, start, feasible, like=like)
+                answer = solve_near(programme, begin, start, feasible, like=like, accurate=accurate)
                 break
             except FitError:
                 continue

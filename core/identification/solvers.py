@@ -40,10 +40,10 @@ MANY = 60
 """Unknowns from which on an interior point finds what is active sooner than an active-set method."""
 _ALONG, _FIXED = 1e-6, 1e-9
 """Relative singular value below which rows leave a direction, and relative size of a row that does not see it."""
-_NEAR_INSIDE = 3
-"""Rows per unknown that a programme begins with then."""
-_ACCURATE = 1e-12
-"""Of an interior point: coarser, it takes for active what is only near."""
+_ANEW, _NEAR_INSIDE = 0.02, 3
+"""Then: violated rows per unknown from which on it begins anew, and rows per unknown that it begins with."""
+VERY_MANY = 150
+"""Unknowns of (10) from which on its accurate answers, proven by equations, take less time than to move on by steps."""
 _INDEPENDENT = 1e-10
 """Relative size below which what a row adds to others is rounding."""
 
@@ -80,19 +80,25 @@ class Programme(NamedTuple):
         return self._replace(H=self.H + hold * np.eye(len(xi)), f=self.f - hold * xi)
 
 
-def solve_qp(of: Programme, active: Sense | None = None, any_solver: bool = True, feasible: float = FEASIBLE) -> Answer:
-    """Minimise a programme.
+def solve_qp(
+    of: Programme,
+    active: Sense | None = None,
+    any_solver: bool = True,
+    feasible: float = FEASIBLE,
+    equations: bool = False,
+) -> Answer:
+    """Minimise a programme; `equations`: what is active may well be so to the last row.
 
     DAQP (dual active set, exact to rounding) first; PIQP if it gives up or returns what violates a row by more than
     `FEASIBLE`. DAQP's tolerance is one on rows in the metric of H, coarse where H hardly weighs an unknown: what it
     leaves is mended with the step held back.
     """
-    answer, violation = _solved(of, active, any_solver, feasible)
+    answer, violation = _solved(of, active, any_solver, feasible, equations)
     hold = _HOLD * float(np.diagonal(of.H).max(initial=0.0))
     for factor in _FIRMER:
         while violation > _MENDED and answer.active is not None:
             try:
-                nearer, left = _solved(of.held(factor * hold, answer.xi), answer.active, False, feasible)
+                nearer, left = _solved(of.held(factor * hold, answer.xi), answer.active, False, feasible, equations)
             except FitError:
                 break
             if left > 0.1 * violation:
@@ -101,12 +107,14 @@ def solve_qp(of: Programme, active: Sense | None = None, any_solver: bool = True
     return answer
 
 
-def _solved(of: Programme, active: Sense | None, any_solver: bool, feasible: float) -> tuple[Answer, float]:
+def _solved(
+    of: Programme, active: Sense | None, any_solver: bool, feasible: float, equations: bool = False
+) -> tuple[Answer, float]:
     """The answer of the first solver that has a good one, and by how much it violates a row."""
     scaled, s = _scaled(of)
     best: tuple[float, Answer] | None = None
-    by_equations = (("PIQP", _by_equations),) * (len(of.f) >= MANY and active is not None)
-    for name, solver in by_equations + (_SOLVERS if any_solver else _SOLVERS[:1]):
+    first = (("PIQP", _by_equations),) * (equations and active is not None)
+    for name, solver in first + (_SOLVERS if any_solver else _SOLVERS[:1]):
         answer, found = solver(scaled, active)
         if answer is None or not np.isfinite(answer).all():
             continue
@@ -138,12 +146,13 @@ def solve_near(
     feasible: float = FEASIBLE,
     any_solver: bool = False,
     like: tuple[Array, Array] | None = None,
+    accurate: bool = False,
 ) -> Answer:
     """As `solve_qp`, with the rows that are near at ξ alone, and then those that the answer violates.
 
     A strictly convex programme has one minimiser, so it does not matter which other rows were left out. `like`: H and f
-    of a better conditioned objective whose minimiser has nearly the same rows active: an interior point finds those
-    wherever rows are violated.
+    of a better conditioned objective whose minimiser has nearly the same rows active: an interior point starts there,
+    and if `accurate` again wherever rows are violated.
     """
     (G, h), size = of[2:4], len(of.f)
     slack = G @ xi - h
@@ -155,9 +164,10 @@ def solve_near(
     while True:
         start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
         some = of._replace(G=G[wanted], h=h[wanted])
-        if like is not None and (start is None or (slack[wanted] < -_SLIGHT).any()):
-            start = _active_inside(some._replace(H=like[0], f=like[1]))
-        answer = solve_qp(some, start, any_solver, feasible)
+        few = 0.0 if accurate else _ANEW * size
+        if like is not None and (start is None or np.count_nonzero(slack[wanted] < -_SLIGHT) > few):
+            start = _active_inside(some._replace(H=like[0], f=like[1]), 1e-12 if accurate else 1e-9)
+        answer = solve_qp(some, start, any_solver, feasible, accurate)
         if answer.active is None:
             active = None
         else:
@@ -222,12 +232,12 @@ def _by_equations(of: Programme, active: Sense | None) -> _Found:
     return (xi, active) if (within >= 0.0).all() else (None, None)
 
 
-def _inside(of: Programme) -> Any:
+def _inside(of: Programme, accuracy: float) -> Any:
     import piqp
 
     solver = piqp.DenseSolver()
-    solver.settings.eps_abs = _ACCURATE
-    solver.settings.eps_rel = _ACCURATE
+    solver.settings.eps_abs = accuracy
+    solver.settings.eps_rel = accuracy
     solver.settings.max_iter = 500
     solver.setup(of.H, of.f, None, None, of.G, of.h, np.full(len(of.h), np.inf), of.lower, of.upper)
     done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
@@ -235,13 +245,13 @@ def _inside(of: Programme) -> Any:
 
 
 def _piqp(of: Programme, _: Sense | None) -> _Found:
-    found = _inside(of)
+    found = _inside(of, 1e-12)
     return (None if found is None else np.array(found.x, dtype=np.float64)), None
 
 
-def _active_inside(of: Programme) -> Sense | None:
+def _active_inside(of: Programme, accuracy: float) -> Sense | None:
     """What an interior point says is active: by the ratio of multiplier and slack, as much as can be independent."""
-    found, size = _inside(_scaled(of)[0]), len(of.f)
+    found, size = _inside(_scaled(of)[0], accuracy), len(of.f)
     if found is None:
         return None
     multiplier = np.concatenate([found.z_bl, found.z_bu, found.z_l])
