@@ -317,3 +317,9 @@ def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, capsys
     titles = {panel["title"] for panel in data_of(page.read_text())[0]["views"]["values"]}
     assert main(["plot", run, "--signals", str(engine / "signals.yaml"), "--output", str(page), "-q"]) == 0
     assert {panel["title"] for panel in data_of(page.read_text())[0]["views"]["values"]} >= {"fan"} and len(titles) > 5
+    other = [str(tmp_path / name) for name in ("one.csv", "two.csv")]
+    for path in other:
+        Path(path).write_text("t,x\n0,1\n1,2\n")
+    page.unlink()
+    assert main(["plot", model, *other, "--output", str(page), "-q"]) == 2
+    assert "no recording could be checked, so nothing is drawn" in capsys.readouterr().err and not page.exists()
