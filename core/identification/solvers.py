@@ -216,7 +216,7 @@ def _by_equations(of: Programme, active: Sense | None) -> _Found:
     low, high, rows = (np.flatnonzero(which) for which in (active[:size] == 3, active[:size] == 1, active[size:]))
     unit, limits = np.eye(size), np.concatenate([of.lower[low], -of.upper[high], of.h[rows]])
     L, failed = lapack.dpotrf(of.H, lower=1)
-    if failed or len(limits) > size:
+    if failed or not 0 < len(limits) <= size:
         return None, None
     sides = np.column_stack([unit[:, low], -unit[:, high], of.G[rows].T, of.f])
     *whitened, g = solve_triangular(L, sides, lower=True).T
