@@ -40,8 +40,8 @@ MANY = 60
 """Unknowns from which on an interior point finds what is active sooner than an active-set method."""
 _ALONG, _FIXED = 1e-6, 1e-9
 """Relative singular value below which rows leave a direction, and relative size of a row that does not see it."""
-_ANEW, _NEAR_INSIDE = 0.02, 3
-"""Then: violated rows per unknown from which on it begins anew, and rows per unknown that it begins with."""
+_ANEW, _FAR, _NEAR_INSIDE = 0.02, 0.05, 3
+"""Then: violated rows per unknown from which on it begins anew, and those from which on it takes more rows, so many."""
 VERY_MANY = 150
 """Unknowns of (10) from which on its accurate answers, proven by equations, take less time than to move on by steps."""
 _INDEPENDENT = 1e-10
@@ -159,7 +159,8 @@ def solve_near(
     wanted = slack < -_SLIGHT
     if active is not None:
         wanted |= active[size:] > 0
-    near = (_NEAR if like is None else _NEAR_INSIDE) * size
+    far = like is not None and (active is None or np.count_nonzero(slack < -_SLIGHT) > _FAR * size)
+    near = (_NEAR_INSIDE if far else _NEAR) * size
     wanted[np.argpartition(slack, near)[:near] if len(slack) > near else slice(None)] = True
     while True:
         start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
