@@ -113,8 +113,10 @@ def _solved(
     """The answer of the first solver that has a good one, and by how much it violates a row."""
     scaled, s = _scaled(of)
     best: tuple[float, Answer] | None = None
-    first = (("PIQP", _by_equations),) * (equations and active is not None)
-    for name, solver in first + (_SOLVERS if any_solver else _SOLVERS[:1]):
+    in_turn = _SOLVERS if any_solver else _SOLVERS[:1]
+    if equations and active is not None:
+        in_turn = (("PIQP", _by_equations), *in_turn)
+    for name, solver in in_turn:
         answer, found = solver(scaled, active)
         if answer is None or not np.isfinite(answer).all():
             continue
@@ -157,15 +159,15 @@ def solve_near(
     (G, h), size = of[2:4], len(of.f)
     slack = G @ xi - h
     wanted = slack < -_SLIGHT
+    far = like is not None and (active is None or np.count_nonzero(wanted) > _FAR * size)
     if active is not None:
         wanted |= active[size:] > 0
-    far = like is not None and (active is None or np.count_nonzero(slack < -_SLIGHT) > _FAR * size)
     near = (_NEAR_INSIDE if far else _NEAR) * size
     wanted[np.argpartition(slack, near)[:near] if len(slack) > near else slice(None)] = True
+    few = 0.0 if accurate else _ANEW * size
     while True:
         start = None if active is None else np.concatenate([active[:size], active[size:][wanted]])
         some = of._replace(G=G[wanted], h=h[wanted])
-        few = 0.0 if accurate else _ANEW * size
         if like is not None and (start is None or np.count_nonzero(slack[wanted] < -_SLIGHT) > few):
             start = _active_inside(some._replace(H=like[0], f=like[1]), 1e-12 if accurate else 1e-9)
         answer = solve_qp(some, start, any_solver, feasible, accurate)
@@ -213,17 +215,14 @@ def _by_equations(of: Programme, active: Sense | None) -> _Found:
     from scipy.linalg import lapack, solve_triangular
 
     assert active is not None
-    size = len(of.f)
-    low, high, rows = (np.flatnonzero(which) for which in (active[:size] == 3, active[:size] == 1, active[size:]))
-    unit, limits = np.eye(size), np.concatenate([of.lower[low], -of.upper[high], of.h[rows]])
+    C, limits, _ = _binding(*of[2:], np.zeros_like(of.f), active)
     L, failed = lapack.dpotrf(of.H, lower=1)
-    if failed or not 0 < len(limits) <= size:
+    if failed or not 0 < len(limits) <= len(of.f):
         return None, None
-    sides = np.column_stack([unit[:, low], -unit[:, high], of.G[rows].T, of.f])
-    *whitened, g = solve_triangular(L, sides, lower=True).T
-    Q, R = np.linalg.qr(np.array(whitened).reshape(-1, size).T)
+    whitened = solve_triangular(L, np.column_stack([C, of.f]), lower=True)
+    (Q, R), g = np.linalg.qr(whitened[:, :-1]), whitened[:, -1]
     diagonal = np.abs(np.diagonal(R))
-    if diagonal.min(initial=1.0) <= _INDEPENDENT * diagonal.max(initial=1.0):
+    if diagonal.min() <= _INDEPENDENT * diagonal.max():
         return None, None
     along = solve_triangular(R, limits, trans="T") + Q.T @ g
     xi = solve_triangular(L, Q @ along - g, lower=True, trans="T")
