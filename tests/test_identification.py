@@ -484,11 +484,16 @@ def test_an_interior_point_and_equations_end_where_the_active_set_method_does(se
     assert {1, 3} <= set(expected.active[:size].tolist()) and expected.active[size:].any()
     known = solvers.solve_qp(of, expected.active, equations=True)
     assert known.solver == "PIQP" and known.xi == pytest.approx(expected.xi, abs=1e-9)
-    for wrong in rng.choice(np.flatnonzero(expected.active), 3, replace=False):  # too few, or too many
+    for wrong in np.flatnonzero(expected.active):  # too few, or too many
         without, more = expected.active.copy(), expected.active.copy()
         without[wrong], more[size + rng.choice(np.flatnonzero(more[size:] == 0))] = 0, 3
         for start in (without, more):
             assert solvers.solve_qp(of, start, equations=True).xi == pytest.approx(expected.xi, abs=1e-9)
+    far = of._replace(h=h - 100.0)  # bounds alone are active
+    at_bounds = solvers.solve_qp(far)
+    for wrong in np.flatnonzero(at_bounds.active):
+        start = np.where(np.arange(size + len(h)) == wrong, np.int32(0), at_bounds.active)
+        assert solvers.solve_qp(far, start, equations=True).xi == pytest.approx(at_bounds.xi, abs=1e-9)
     begin = rng.standard_normal(size)
     assert solvers.solve_near(of, begin, like=of[:2], accurate=True).xi == pytest.approx(expected.xi, abs=1e-9)
 
