@@ -79,9 +79,7 @@ class Judge:
         numbers: Sequence[Array | None],
         marks: NDArray[np.uint8],
     ) -> None: ...
-    def advance(
-        self, x: Array, time: Array, control: Array, z: Array, dt: Array, begin: Any, a: int, b: int
-    ) -> None: ...
+    def advance(self, runs: Array, z: Array, dt: Array, a: int, b: int, first: int, last: int) -> None: ...
 
 class Runs:
     count: int

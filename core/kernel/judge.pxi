@@ -187,7 +187,7 @@ cdef class Judge:
         cdef double* half = centre + _TOGETHER
         with nogil:
             for low from 0 <= low < count by _SORTED:
-                tiles.begin(count - low if count - low < _SORTED else _SORTED)
+                tiles.begin(0, count - low if count - low < _SORTED else _SORTED, 0)
                 for q in range(tiles.count):
                     beyond[q], lasts[q] = 0, steps[low + q]
                 for i in range(n):
@@ -301,35 +301,46 @@ cdef class Judge:
             self.s[i] = z[self.positions[i] * stride]
         return self.blocks.find(self.s, self.places, self.weights)
 
-    def advance(
-        self, double[:, ::1] x, double[::1] time, double[:, ::1] control, z, dt, const long long[::1] begin,
-        Py_ssize_t a, Py_ssize_t b,
-    ):
-        """Take runs of the nominal model from a steps to b, the run k being the one that begins at transition k.
+    def advance(self, double[:, ::1] runs, z, dt, Py_ssize_t a, Py_ssize_t b, Py_ssize_t first, Py_ssize_t last):
+        """Take runs first to last - 1 of the nominal model from a steps to b, run k being that from transition k on.
 
-        Of a transition at which a run may not go on, what is computed for that run has no meaning.
+        Where transitions do not follow one another, what is computed for a run across has no meaning.
 
-        `x` (n, N): state of each run after a steps, normalised; takes the result; `time` (N,): Σ Δt of the steps so
-        far, s; takes the result; `control` (m, N): Σ Δt u of the steps so far; takes the result; `z` (n + m + q, N):
-        normalised [x; u; s] of the transitions, in order of time; `dt` (N,): s; `begin` (N,): of each transition the
-        first of those that follow one another without a break up to it.
+        `runs` (n + m + 1, N): state of each run after a steps, normalised, Σ Δt u and Σ Δt of them; takes the result;
+        `z` (n + m + q, N): normalised [x; u; s] of the transitions, in order of time; `dt` (N,): s.
         """
-        cdef const double[:, ::1] rows = np.ascontiguousarray(z.T, dtype=np.float64)
-        cdef const double[::1] step = np.ascontiguousarray(dt, dtype=np.float64)
-        cdef Py_ssize_t i, low, count = step.shape[0]
-        fits = x.shape[0] == self.n and control.shape[0] == self.size - self.n and rows.shape[1] == self.total
-        if not (fits and x.shape[1] == control.shape[1] == time.shape[0] == rows.shape[0] == begin.shape[0] == count):
+        cdef Py_ssize_t i, j, q, low, high, n = self.n, p = self.elements.p, size = self.size, count = runs.shape[1]
+        if not (z.shape[0] == self.total and z.shape[1] == len(dt) == count and runs.shape[0] == size + 1):
             raise ValueError("the runs do not fit the transitions")
-        if not 0 <= a <= b:
+        if not (0 <= a <= b and 0 <= first <= last <= count):
             raise ValueError("the runs do not fit the transitions")
-        cdef double* controls = &control[0, 0] if count and self.size > self.n else NULL
+        at_schedule = z[[self.positions[i] for i in range(self.blocks.axes)]]
+        cdef Tiles tiles = Tiles(size + 1, p, z[:size], dt, runs, None, self.blocks, at_schedule)
+        cdef double* rates = room_for(n or 1)
+        cdef double* start = tiles.start
         with nogil:
-            for i in range(count):  # transition after transition: blended once for all the runs that it takes further
-                low = begin[i] if begin[i] > i - b + 1 else i - b + 1
-                low = low if low > 0 else 0
-                if low <= i - a:
-                    self.take(&rows[i, 0], 1)
-                    self.step(&x[0, 0], &time[0], controls, count, low, i - a + 1, step[i])
+            for low from first <= low < last by _SORTED:
+                for i in range(a, b):
+                    high = min(low + _SORTED, last, count - i)
+                    if high <= low:
+                        break
+                    tiles.begin(low, high, i)
+                    while tiles.take():
+                        memcpy(tiles.phi, start, n * _TOGETHER * sizeof(double))
+                        for j in range(n):
+                            tiles.sum(self.elements.theta, j, n, p, tiles.phi, rates + j * _TOGETHER)
+                        for j in range(n):
+                            for q in range(tiles.many):
+                                start[j * _TOGETHER + q] = centre_of(
+                                    start[j * _TOGETHER + q], tiles.step[q], rates[j * _TOGETHER + q]
+                                )
+                        for j in range(n, size):
+                            for q in range(tiles.many):
+                                start[j * _TOGETHER + q] += tiles.phi[j * _TOGETHER + q] * tiles.step[q]
+                        for q in range(tiles.many):
+                            start[size * _TOGETHER + q] += tiles.step[q]
+                        tiles.put(start, runs)
+        free(rates)
 
     cdef void step(
         self, double* x, double* time, double* control, Py_ssize_t stride, Py_ssize_t low, Py_ssize_t high, double dt

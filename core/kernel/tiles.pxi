@@ -43,6 +43,30 @@ cdef extern from *:
         }
     }
 
+    /* the same of tables that are blended, sum_c tables[places_c][j n] weights[c apart + q], of 8 at a time */
+    FOR_EACH_PROCESSOR static void add_up_blended(
+        const double *tables, Py_ssize_t size, const Py_ssize_t *places, Py_ssize_t corners, const double *weights,
+        Py_ssize_t n, Py_ssize_t columns, const double *values, Py_ssize_t apart, Py_ssize_t count, double *total
+    ) {
+        for (Py_ssize_t q = 0; q < count; q += 8) {
+            four a = {0.0, 0.0, 0.0, 0.0}, b = a;
+            for (Py_ssize_t j = 0; j < columns; j++) {
+                const double *element = tables + j * n;
+                const four *weight = (const four *)(weights + q), *value = (const four *)(values + j * apart + q);
+                four low = element[places[0] * size] * weight[0], high = element[places[0] * size] * weight[1];
+                for (Py_ssize_t c = 1; c < corners; c++) {
+                    weight = (const four *)(weights + c * apart + q);
+                    low += element[places[c] * size] * weight[0];
+                    high += element[places[c] * size] * weight[1];
+                }
+                a = j ? a + low * value[0] : low * value[0];
+                b = j ? b + high * value[1] : high * value[1];
+            }
+            four *into = (four *)(total + q);
+            into[0] = a, into[1] = b;
+        }
+    }
+
     /* sum_q a_q b_q in eight lanes, and then these from the first to the last */
     FOR_EACH_PROCESSOR static double dot(const double *a, const double *b, Py_ssize_t count) {
         four low = {0.0, 0.0, 0.0, 0.0}, high = low;
@@ -61,6 +85,10 @@ cdef extern from *:
         const double* table, Py_ssize_t n, Py_ssize_t columns, const double* values, Py_ssize_t apart, Py_ssize_t count,
         double* total
     ) noexcept nogil
+    void add_up_blended(
+        const double* tables, Py_ssize_t size, const Py_ssize_t* places, Py_ssize_t corners, const double* weights,
+        Py_ssize_t n, Py_ssize_t columns, const double* values, Py_ssize_t apart, Py_ssize_t count, double* total
+    ) noexcept nogil
     double dot(const double* a, const double* b, Py_ssize_t count) noexcept nogil
 
 
@@ -78,6 +106,7 @@ cdef class Tiles:
     cdef Blocks blocks
     cdef Py_ssize_t n, p, count, corners
     cdef Py_ssize_t at, sorted, gone  # next transition to look at; of those sorted: how many, and how many were taken
+    cdef Py_ssize_t ahead  # z, dt and s are of the transition so many later
     cdef list _keep
     cdef Py_ssize_t* order  # (_SORTED,): transitions, those of the same blocks side by side
     cdef Py_ssize_t* first  # (_SORTED,): the first block that holds, of each transition
@@ -127,9 +156,9 @@ cdef class Tiles:
         self.order = self.ends + self.blocks.count + 2
         self.first, self.found, self.held = self.order + _SORTED, self.order + 2 * _SORTED, self.order + 3 * _SORTED
 
-    cdef void begin(self, Py_ssize_t count) noexcept nogil:
-        """Walk the first transitions again, after others were put there."""
-        self.count, self.at, self.sorted, self.gone = count, 0, 0, 0
+    cdef void begin(self, Py_ssize_t first, Py_ssize_t end, Py_ssize_t ahead) noexcept nogil:
+        """Walk the transitions first to end - 1, with z, dt and s of those so many later."""
+        self.count, self.at, self.sorted, self.gone, self.ahead = end, first, 0, 0, ahead
 
     cdef bint take(self) noexcept nogil:
         """Fill in the next tile; False at the end."""
@@ -157,11 +186,11 @@ cdef class Tiles:
         if not self.many:
             return False
         self.whole = (self.many + _LANES - 1) // _LANES * _LANES
-        self.gather(self.z, self.p, self.phi)
-        self.gather(self.base, self.n, self.start)
-        self.gather(self.after, self.after.shape[0], self.end)
+        self.gather(self.z, self.p, self.ahead, self.phi)
+        self.gather(self.base, self.n, 0, self.start)
+        self.gather(self.after, self.after.shape[0], 0, self.end)
         for q in range(self.many):
-            self.step[q] = self.dt[self.index[q]]
+            self.step[q] = self.dt[self.index[q] + self.ahead]
         for q in range(self.many, self.whole):
             self.step[q] = 0.0
             for i in range(self.corners):
@@ -178,7 +207,7 @@ cdef class Tiles:
             self.ends[r] = 0
         for k in range(self.sorted):
             for axis in range(self.blocks.axes):
-                here[axis] = self.s[axis, self.at + k]
+                here[axis] = self.s[axis, self.at + self.ahead + k]
             self.found[k] = self.blocks.find(here, self.held + k * _CORNERS, self.shares + k * _CORNERS)
             if self.found[k] < 0:
                 for r in range(self.corners):  # a mode that is not listed: nothing is known
@@ -194,9 +223,9 @@ cdef class Tiles:
             self.ends[self.first[k]] += 1
         self.at += self.sorted
 
-    cdef void gather(self, const double[:, :] rows, Py_ssize_t count, double* to) noexcept nogil:
-        """Some rows of the transitions of this tile."""
-        cdef Py_ssize_t i, q, first = self.index[0]
+    cdef void gather(self, const double[:, :] rows, Py_ssize_t count, Py_ssize_t ahead, double* to) noexcept nogil:
+        """Some rows of the transitions of this tile, or of those so many later."""
+        cdef Py_ssize_t i, q, first = self.index[0] + ahead
         cdef double* into
         for i in range(count):
             into = to + i * _TOGETHER
@@ -204,35 +233,31 @@ cdef class Tiles:
                 memcpy(into, &rows[i, first], self.many * sizeof(double))
             else:
                 for q in range(self.many):
-                    into[q] = rows[i, self.index[q]]
+                    into[q] = rows[i, self.index[q] + ahead]
             for q in range(self.many, self.whole):
                 into[q] = 0.0
+
+    cdef void put(self, const double* values, double[:, ::1] rows) noexcept nogil:
+        """Put rows of this tile where its transitions are."""
+        cdef Py_ssize_t i, q
+        for i in range(rows.shape[0]):
+            if not self.corners:
+                memcpy(&rows[i, self.index[0]], values + i * _TOGETHER, self.many * sizeof(double))
+                continue
+            for q in range(self.many):
+                rows[i, self.index[q]] = values[i * _TOGETHER + q]
 
     cdef void sum(
         self, const double* table, Py_ssize_t i, Py_ssize_t n, Py_ssize_t columns, const double* values, double* total
     ) noexcept nogil:
         """total (_TOGETHER,) = row i of `add_columns` of each transition; table: (blocks, columns, n), blended."""
-        cdef Py_ssize_t c, j, l, q, size = n * columns
-        cdef double element
-        cdef double blended[_LANES]
-        cdef double lane[_LANES]
-        cdef const double* value
-        if not self.corners:
+        if self.corners:
+            add_up_blended(
+                table + i, n * columns, self.places, self.corners, self.weights, n, columns, values, _TOGETHER,
+                self.many, total,
+            )
+        else:
             add_up(table + i, n, columns, values, _TOGETHER, self.many, total)
-            return
-        for q from 0 <= q < self.many by _LANES:
-            for j in range(columns):
-                value, element = values + j * _TOGETHER + q, table[self.places[0] * size + j * n + i]
-                for l in range(_LANES):
-                    blended[l] = element * self.weights[q + l]
-                for c in range(1, self.corners):
-                    element = table[self.places[c] * size + j * n + i]
-                    for l in range(_LANES):
-                        blended[l] += element * self.weights[c * _TOGETHER + q + l]
-                for l in range(_LANES):
-                    lane[l] = blended[l] * value[l] + (lane[l] if j else -0.0)  # -0 + a = a, to the sign of 0
-            for l in range(_LANES):
-                total[q + l] = lane[l]
 
     cdef void bounds(
         self, Elements elements, Py_ssize_t i, const double* psi, double* centre, double* half

@@ -11,12 +11,13 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import WORTH_THREADS, Array, core_count, on_cores
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
@@ -192,21 +193,25 @@ class Envelope(Elements):
         `k` (N,): sample that each transition begins with; where one does not follow the one before, windows end; `z`
         (n + m + q, N): normalised, in order of time; `dt` (N,): s; `steps`: lengths, increasing.
         """
-        judge, vectors, n, m = self._runner(), z[self.scheduling_positions], self.n, self.m
+        vectors, n, rows, count = z[self.scheduling_positions], self.n, self.n + self.m, len(dt)
         begin = unbroken_over(k, vectors, self.schedule)
-        run, time, control = np.array(z[:n], order="C"), np.zeros(len(dt)), np.zeros((m, len(dt)))
-        done, kept, by_transition = 0, None, np.asfortranarray(z)  # as `advance` reads them
+        runs = np.concatenate([z[:n], np.zeros((self.m + 1, count))])
+        runner, edges = self._runner(), np.linspace(0, count, core_count() + 1).astype(int).tolist()
+        done = 0
+        kept: Array | None = None
         for length in steps:
-            judge.advance(run, time, control, by_transition, dt, begin, done, length)
+            tasks = [(runs, z, dt, done, length, *part) for part in itertools.pairwise(edges)]
+            on_cores(runner.advance, tasks, count * (length - done) > WORTH_THREADS)
             done = length
-            start = np.arange(len(dt) - length + 1)
+            start = np.arange(count - length + 1)
             whole = begin[start + (length - 1)] <= start
+            run, control, time = runs[:n], runs[n:rows], runs[rows]
             if whole.all():
-                count = len(start)
+                many = len(start)
                 if kept is None:  # of a window but its controls are the same for all lengths
                     kept = np.concatenate([z[:n], control, vectors])
-                np.divide(control[:, :count], time[:count], out=kept[n : n + m, :count])
-                yield Windows(length, start, kept[:, :count], run[:, :count], time[:count])
+                np.divide(control[:, :many], time[:many], out=kept[n:rows, :many])
+                yield Windows(length, start, kept[:, :many], run[:, :many], time[:many])
             else:
                 start = start[whole]
                 of_each = np.concatenate([z[:n, start], control[:, start] / time[start], vectors[:, start]])
