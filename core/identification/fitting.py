@@ -188,9 +188,7 @@ def fit(
     if not horizons:
         model = model.replace(fit_summary=facts)
         plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
-        return (
-            model.replace(memory=_memory(model, problem, transients, fleet.sums)) if plain and describe_data else model
-        )
+        return model.replace(memory=_memory(model, problem, transients, fleet)) if plain and describe_data else model
     lengths = [int(h) for h in horizons]
     model = model.replace(run=better_run(model, problem, lengths, structure))
     over, facts["horizons"], dropped, solvers = fit_horizons(model, problem, lengths, widths, criterion, progress)
@@ -203,13 +201,13 @@ def fit(
 
 
 def _memory(
-    model: UncertainLTI, problem: Problem, transients: Sequence[Transient], sums: Moments
+    model: UncertainLTI, problem: Problem, transients: Sequence[Transient], fleet: Fleet
 ) -> dict[str, Any] | None:
     """What the file of a plain model keeps of its recordings."""
     edges = np.searchsorted(problem.source, np.arange(len(transients) + 1)).tolist()
     each = zip(transients, edges[:-1], edges[1:], strict=True)
     recordings = [Recording.of(t.name, problem.subset(slice(a, b))) for t, a, b in each]
-    return remembered(model, problem, recordings, sums)
+    return remembered(model, problem, recordings, fleet)
 
 
 @one_thread_each()
@@ -261,6 +259,7 @@ def fit_fleet(
         )
 
     found = optimum(engine, criterion, build, [s.name for s in signals.states], method)
+    fleet.nearest = engine.nearest
     del engine  # with the samples that its rows hold
     model, judged, solution = found.envelope, found.judged, found.solution
     facts: dict[str, Any] = {

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import WORTH_THREADS, Array, Index, on_cores
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.passes import Candidate, Moments, moments, scan
+from uncertain_lti.identification.passes import Moments, moments
 from uncertain_lti.identification.problem import Block, Columns, Problem
 from uncertain_lti.kernel.arithmetic import boxes_of
 from uncertain_lti.model.terms import ARRAYS
@@ -39,8 +39,6 @@ BYTES, _PER_STATE, _MOST = 720_000, 90_000, 8_000_000
 """What is kept at most, of all and per state, unless those that decide take more; in the file it takes a third more."""
 _STEPS = 254
 """In so many steps the range of a value is divided in the file; with one to round outwards they fill a byte."""
-_MANY = 20_000
-"""Transitions from which on it is first seen in about so many how near the nearest are, and how wide the widest."""
 _LOOKED_AT = 1000
 """Transitions at least by which a recording is recognised, if it has as many."""
 _AGAIN = "fit again with all recordings"
@@ -227,14 +225,14 @@ def remembered(
     model: UncertainLTI,
     problem: Problem,
     recordings: Sequence[Recording],
-    sums: Moments,
+    fleet: Fleet,
     rest: Moments | None = None,
     boxes: Boxes | None = None,
 ) -> dict[str, Any] | None:
     """What the file of a model keeps of transitions, beside what was kept of others already.
 
     None if there is no room for those that decide. `problem`: `source` being the number of the recording, rising;
-    `sums`: over its transitions; `boxes`: with the room that the model leaves.
+    `fleet`: that the model was fitted to, `rest` included; `boxes`: with the room that the model leaves.
     """
     n, p, widths = model.n, problem.p, model.fit_summary["criterion"] == "lp"
     unknowns, each, box = problem.columns.unknowns(p), 8 * (p + n + 3), 2 * (p + 1) + (3 if widths else 2) * n
@@ -246,7 +244,8 @@ def remembered(
         if most <= n * unknowns:
             return None
         widest = 0.5 * np.asarray(model.fit_summary["max_width"]) if widths else None
-        kept = _nearest(model, problem, sums if rest is None else sums + rest, widest, most)
+        sums = fleet.sums if rest is None else fleet.sums + rest
+        kept = _nearest(model, problem, sums, fleet.nearest, widest, most)
         left = np.ones(problem.N, dtype=bool)
         left[kept] = False
         if not problem.columns.half:  # at rest there is no room, and no model changes that
@@ -263,34 +262,23 @@ def remembered(
                 tasks.append((model, block, problem.source[part], widest, numbers))
         parts = [] if boxes is None else [boxes.fewer(0, share)]
         parts += on_cores(Boxes.of, tasks, problem.N > WORTH_THREADS)
-        others = sums - moments(chosen)[0]
+        others = fleet.sums - moments(chosen)[0]
         problem, rest, boxes = chosen, others if rest is None else rest + others, Boxes.join(parts)
     return Memory(problem, rest, boxes, tuple(recordings)).to_dict(model)
 
 
-def _nearest(model: UncertainLTI, problem: Problem, sums: Moments, widest: Array | None, most: int) -> Index:
+def _nearest(
+    model: UncertainLTI, problem: Problem, sums: Moments, held: Sequence[Index], widest: Array | None, most: int
+) -> Index:
     """The transitions of least room for their size, in each row alike, and those of the largest widths; so many.
+
+    `held`: of each row those to choose from, in order.
 
     The size of a transition is (Δt φ)ᵀ P⁻¹ (Δt φ) + (Δt ψ)ᵀ Q⁻¹ (Δt ψ), its root, P and Q the means of the squares
     over all: by so much its room may change as the elements do.
     """
     n, count = model.n, -(-4 * most // model.n)
-    theta, d = _elements(model, problem.columns)
-    some = np.arange(problem.N)
-    if problem.N > _MANY:
-        unit, reach = 1.0 / np.where(sums.psi_scale > 0.0, sums.psi_scale, np.inf), np.full(n, np.inf)
-        few = problem.subset(np.arange(0, problem.N, -(-problem.N // _MANY)))  # they tell how near and how wide
-        wanted = min(2 * count * few.N // problem.N + 50, few.N - 1)
-        candidate = Candidate(theta, d, unit, np.ones(n), None, reach, reach, wanted, np.arange(n))
-        reach = np.array([least for _, least in scan(few, candidate)])
-        candidate = replace(candidate, reach=reach, most=count)
-        found = [samples.index for samples, _ in Fleet.of(problem).scan(candidate)]
-        if widest is not None:
-            halves = (d.T @ (block.dt * problem.columns.psi(block.z, block.dt, None)) for block in problem.blocks())
-            least = np.partition(d.T @ (few.psi().T * few.dt), -wanted, axis=1)[:, [-wanted]]
-            rows = [np.flatnonzero(row) for row in np.hstack([half >= least for half in halves])]
-            found += [row[:: max(1, len(row) // (4 * count))] for row in rows]  # all of them where widths are constant
-        some = np.unique(np.concatenate(found))
+    some = np.unique(np.concatenate([of_row[: 2 * count] for of_row in held]))
     of = problem.subset(some)
     phi, psi = of.phi().T * of.dt, of.psi().T * of.dt
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))

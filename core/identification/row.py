@@ -381,6 +381,11 @@ class Row:
         inside, room = self.slacks()
         return inside if room is None else np.minimum(inside, room)
 
+    def nearest(self, count: int) -> Index:
+        """Positions among all transitions of so many held samples, those of least slack of either kind first."""
+        each = [np.argsort(slack)[:count] for slack in self.slacks() if slack is not None]
+        return np.asarray(self.samples.index[np.column_stack(each).ravel()])
+
     def trial(self) -> Row:
         """A row that can be solved on its own, sharing what is only read."""
         trial = copy.copy(self)

@@ -151,7 +151,7 @@ def updated(
         alarm=model.alarm,
     )
     boxes = fleet.boxes_after(found, np.asarray(found.fit_summary["max_width"]))
-    data = remembered(found, _joined([here, new]), every, fleet.sums, memory.rest, boxes)
+    data = remembered(found, _joined([here, new]), every, fleet, memory.rest, boxes)
     if data is None:
         words = "the room for what an update needs is used up; fit all recordings the next time"
         found.fit_summary["messages"].append(words)

@@ -19,7 +19,7 @@ from time import perf_counter
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array, on_cores, one_by_one
+from uncertain_lti.base.arrays import Array, Index, on_cores, one_by_one
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.base.text import plural
@@ -41,6 +41,8 @@ MAX_ROUNDS, FEW_ROUNDS = 200, 60
 Settle = Callable[[Row], None]
 _HELD_BYTES = 180_000_000
 """Memory for the samples of the rows that are proven together, about."""
+_NEAREST = 4_000
+"""Samples of a row, about, that are told of after its proof: those of least slack."""
 _SILENCE = 2.0
 """After so long, s, a word on how far the rows are."""
 _REMEDY = "a state may follow from the others exactly: leave it out, or fix its row by structure"
@@ -108,6 +110,7 @@ class WorkingSet:
         self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
+        self.nearest: list[Index] = [np.empty(0, dtype=np.intp)] * fleet.n  # of each row that is proven, in order
         self.keeps = False  # working sets of rows that are done, which choosing what to discard looks into
         self._together = False  # (10) with full weights: the rows meet in the objective
         self._like: Row | None = None  # the row that held samples last
@@ -428,9 +431,10 @@ class WorkingSet:
         self._each(rows, settle)
         if not self.whole:
             self._prove(settle, rows)
+        for row in rows:
+            self.nearest[row.i] = row.nearest(_NEAREST)
             if self._in_groups:
-                for row in rows:
-                    self.programmes[row.i].release(self.keeps)
+                self.programmes[row.i].release(self.keeps)
 
     def _prove(self, settle: Settle, rows: list[Row]) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
