@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Any, TextIO
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.text import printable
-from uncertain_lti.signals.values import CHOICES
+from uncertain_lti.signals.values import CHOICES, CRITERIA
 
 if TYPE_CHECKING:
     from uncertain_lti import Transient, UncertainLTI
@@ -128,7 +128,8 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--json": _flag("print JSON"),
     # how to fit
     "--criterion": _takes(
-        "(10) squared or (11) largest width (default: what sees smaller jumps on left-out data)", choices=("qp", "lp")
+        "(10) squared or (11) largest width (default: what sees smaller jumps on left-out data)",
+        choices=tuple(CRITERIA),
     ),
     "--additive": _takes(
         "further terms: disturbance c with its half-width, measurement noise (default: the signals file's, else "

@@ -32,7 +32,7 @@ from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
 from uncertain_lti.identification.memory import Recording, remembered
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Problem, Regimes
+from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
@@ -47,7 +47,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
-from uncertain_lti.signals.values import Additive
+from uncertain_lti.signals.values import Additive, Criterion
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""
@@ -55,7 +55,7 @@ SMALL = 1e-4
 
 def fit(
     transients: Sequence[Transient] | Transient,
-    criterion: Literal["qp", "lp"] = "qp",
+    criterion: Criterion = "qp",
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
     additive: Additive | None = None,
     operating_point: OperatingPoint | None = None,
@@ -79,8 +79,7 @@ def fit(
     `drop_horizons`: a horizon that the recordings cannot carry is left out with a message, not refused.
     """
     transients = listed_transients(transients)
-    if criterion not in ("qp", "lp"):
-        raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
+    check_criterion(criterion)
     if method not in ("working-set", "cvxpy"):
         raise FitError(f"method is {method!r}; it must be working-set or cvxpy")
     if horizons and method != "working-set":

@@ -20,10 +20,9 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
-from uncertain_lti.identification.passes import Envelope, Judged, Moments
+from uncertain_lti.identification.passes import Envelope, Judged
 from uncertain_lti.identification.problem import Problem, solve_as_written
 from uncertain_lti.identification.programmes import GOOD
-from uncertain_lti.identification.row import LEAST
 from uncertain_lti.identification.working_set import Solution, WorkingSet
 
 E = TypeVar("E", bound=Envelope)
@@ -125,7 +124,7 @@ class Optimum(Generic[E]):
     def reached(self) -> dict[str, Any]:
         """How good it is, for the model file."""
         return {
-            "objective": float(self.objective[0]) if self.criterion == "qp" else self.objective,
+            "objective": self.objective if self.criterion == "lp" else float(self.objective[0]),
             "optimality_gap": self.gap if np.isfinite(self.gap) else None,
         }
 
@@ -152,45 +151,20 @@ def optimum(
 
     `sizes` (n,): as in `repair`.
     """
-    sums = engine.sums
     if method == "working-set":
         solution = engine.solve(criterion)
     else:
         solution = _as_written(engine, criterion)
     envelope, d, judged = repair(build, engine, solution, names, sizes, False)
-    reference = _objective(engine, criterion, solution.d, judged) if solution.delta is None else solution.delta
-    if not _relative(_objective(engine, criterion, d, judged), reference, criterion, sums, judged) <= GOOD:
+    reference = engine.objective(criterion, solution.d, judged) if solution.delta is None else solution.delta
+    if not engine.above(criterion, engine.objective(criterion, d, judged), reference, judged) <= GOOD:
         gentler = repair(build, engine, solution, names, sizes, True)
-        if (_objective(engine, criterion, *gentler[1:]) < _objective(engine, criterion, d, judged)).any():
+        if (engine.objective(criterion, *gentler[1:]) < engine.objective(criterion, d, judged)).any():
             envelope, d, judged = gentler
-    objective = _objective(engine, criterion, d, judged)
-    gap = _relative(objective, reference, criterion, sums, judged) + (solution.gap or 0.0)
-    mean_width = 2.0 * (sums.width_sum @ d) / sums.count
+    objective = engine.objective(criterion, d, judged)
+    gap = engine.above(criterion, objective, reference, judged) + (solution.gap or 0.0)
+    mean_width = 2.0 * (engine.sums.width_sum @ d) / engine.sums.count
     return Optimum(envelope, criterion, objective, gap, judged, mean_width, solution)
-
-
-def _objective(engine: WorkingSet, criterion: str, d: Array, judged: Judged) -> Array:
-    """Value of (10), (1,), or of δ in every row of (11), (n,)."""
-    if criterion == "lp":
-        return judged.weighted
-    sums, weights = engine.sums, engine.fleet.weights
-    if sums.coupled is not None:
-        flat = d.T.ravel()
-        return np.array([4.0 * flat @ sums.coupled @ flat])
-    parts = []
-    for i, half in enumerate(d.T):
-        each = sums.plain_gram * (1.0 if weights is None else weights[i]) if sums.gram is None else sums.gram[i]
-        parts.append(4.0 * half @ each @ half)
-    return np.array([sum(parts)])
-
-
-def _relative(objective: Array, reference: Array, criterion: str, sums: Moments, judged: Judged) -> float:
-    """How far an objective is above its reference at most, relative; an envelope that is rounding has no distance."""
-    least = LEAST * sums.rate_scale
-    floor = least * judged.weighted / np.where(judged.largest > 0, judged.largest, 1.0)
-    if criterion == "qp":
-        floor = np.array([float(floor @ floor) * sums.count])
-    return float(np.max((objective - reference) / np.maximum(np.maximum(objective, floor), 1e-300), initial=0.0))
 
 
 def _as_written(engine: WorkingSet, criterion: str) -> Solution:

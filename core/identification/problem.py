@@ -24,7 +24,7 @@ from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, TERMS, Term
 from uncertain_lti.signals.signal_map import SignalMap
-from uncertain_lti.signals.values import CHOICES, CHOICES_TEXT, Additive
+from uncertain_lti.signals.values import CHOICES, CHOICES_TEXT, CRITERIA, Additive
 
 BLOCK = 32768
 """Transitions that a pass takes at a time, and that are read from disk together."""
@@ -366,6 +366,12 @@ class DiskPartition:
                 start += size
 
 
+def check_criterion(criterion: str) -> None:
+    """Refuse a criterion that there is not."""
+    if criterion not in CRITERIA:
+        raise FitError(f"criterion is {criterion!r}; it must be {' or '.join(CRITERIA)}")
+
+
 Partition = Problem | DiskPartition
 """What the passes over all data take."""
 
@@ -414,7 +420,7 @@ def solve_as_written(
         _run(programme, solver or cp.HIGHS, options)
         values = np.asarray(delta.value) * unit_y
     else:
-        raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
+        raise ValueError(f"criterion {criterion!r} is not written out")
     return (
         np.asarray(theta.value) / unit_phi[:, None] * unit_y,
         np.maximum(np.asarray(d.value), 0.0) / unit_psi[:, None] * unit_y,

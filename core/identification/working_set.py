@@ -24,7 +24,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.passes import Candidate, Samples
+from uncertain_lti.identification.passes import Candidate, Judged, Samples
 from uncertain_lti.identification.programmes import GOOD, WIDTH_SLACK, Programmes
 from uncertain_lti.identification.regimes import tied_blocks
 from uncertain_lti.identification.row import JOIN, LEAST, InfeasibleError, Row
@@ -118,6 +118,27 @@ class WorkingSet:
     def solve(self, criterion: str) -> Solution:
         """Solve (10), or (11)."""
         return self.quadratic() if criterion == "qp" else self.linear()
+
+    def objective(self, criterion: str, d: Array, judged: Judged) -> Array:
+        """Value of (10), (1,), or of δ in every row of (11), (n,); `d` (q, n): half-widths, as they were judged."""
+        if criterion == "lp":
+            return judged.weighted
+        if self.sums.coupled is not None:
+            flat = d.T.ravel()
+            return np.array([4.0 * flat @ self.sums.coupled @ flat])
+        parts, sums, weights = [], self.sums, self.fleet.weights
+        for i, half in enumerate(d.T):
+            each = sums.plain_gram * (1.0 if weights is None else weights[i]) if sums.gram is None else sums.gram[i]
+            parts.append(4.0 * half @ each @ half)
+        return np.array([sum(parts)])
+
+    def above(self, criterion: str, objective: Array, reference: Array, judged: Judged) -> float:
+        """How far above its reference at most, relative; an envelope that is rounding has no distance."""
+        least = LEAST * self.sums.rate_scale
+        floor = least * judged.weighted / np.where(judged.largest > 0, judged.largest, 1.0)
+        if criterion == "qp":
+            floor = np.array([float(floor @ floor) * self.sums.count])
+        return float(np.max((objective - reference) / np.maximum(np.maximum(objective, floor), 1e-300), initial=0.0))
 
     def quadratic(self) -> Solution:
         """Solve (10)."""

@@ -23,6 +23,7 @@ from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.archive import fit_archive, refuse_auto
+from uncertain_lti.identification.problem import check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of, unused
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import Rule
@@ -36,7 +37,7 @@ from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.reading import load_signals, read_transients, refuse_copies
 from uncertain_lti.sampling.transient import Transient, listed_transients
 from uncertain_lti.signals.signal_map import SignalMap
-from uncertain_lti.signals.values import Additive, HorizonRule, WidthChoice
+from uncertain_lti.signals.values import Additive, Criterion, HorizonRule, WidthChoice
 from uncertain_lti.validation.monitor_fit import choose_monitored, monitored_like, point_of
 from uncertain_lti.validation.panel import check_rate
 
@@ -46,7 +47,7 @@ SAMPLE = 2e7
 
 def fit(
     transients: Sequence[Transient] | Transient,
-    criterion: Literal["qp", "lp"] | None = None,
+    criterion: Criterion | None = None,
     weights: ArrayLike | Sequence[ArrayLike] | None = None,
     additive: Additive | None = None,
     operating_point: OperatingPoint | None = None,
@@ -151,8 +152,8 @@ def fit(
     transients = listed_transients(transients)
     if not transients:
         raise FitError("no transients; give at least one recording")
-    if criterion not in (None, "qp", "lp"):
-        raise FitError(f"criterion is {criterion!r}; it must be qp or lp")
+    if criterion is not None:
+        check_criterion(criterion)
     _check_alarm(alarm, false_alarms)
     first, signals = transients[0], transients[0].signals
     names = [*first.state_names, *first.control_names, *first.scheduling_names]
@@ -261,7 +262,7 @@ def _saying(
 def fit_many(
     paths: Sequence[str | os.PathLike[str]],
     signals: SignalMap | str | os.PathLike[str],
-    criterion: Literal["qp", "lp"] | None = None,
+    criterion: Criterion | None = None,
     additive: Additive | None = None,
     *,
     schedule: Schedule | Mapping[str, Knots] | None = None,

@@ -25,6 +25,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.likeness import Learnt
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.values import CRITERIA
 
 MOST_SHOWN = 20
 """Signals whose elements, and discarded transitions that are printed."""
@@ -46,10 +47,9 @@ def fit_text(model: UncertainLTI) -> str:
         blocks += schedule_blocks(choice)
     if choice := facts.get("horizon_choice"):
         blocks += horizon_blocks(choice)
-    criterion = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}[facts["criterion"]]
     gap = facts.get("optimality_gap")
     blocks += [
-        f"criterion {criterion}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
+        f"criterion {CRITERIA[facts['criterion']]}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
         f"{facts['violations']} outside, optimality gap {'not known' if gap is None else f'{gap:.1e}'}",
         *_widths(model),
         *_dynamics(model),

@@ -224,6 +224,9 @@ class HorizonRule:
             raise SignalError(f"{where}: {str(error).removeprefix('horizons: ')}") from None
 
 
+Criterion = Literal["qp", "lp"]
+CRITERIA: dict[Criterion, str] = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}
+"""What a fit minimises, in words."""
 Additive = Literal["none", "disturbance", "noise", "both"]
 CHOICES: tuple[Additive, ...] = get_args(Additive)
 CHOICES_TEXT = f"{', '.join(CHOICES[:-1])} or {CHOICES[-1]}"
