@@ -134,7 +134,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--additive": _takes(
         "further terms: disturbance c with its half-width, measurement noise (default: the signals file's, else "
         "noise, and the disturbance where it narrows the envelope clearly)",
-        choices=CHOICES,
+        choices=tuple(CHOICES),
     ),
     "--alarm": _takes(
         "a small fixed panel of rules learnt on left-out data (default), or a sample outside its bounds",

@@ -155,9 +155,12 @@ class Columns:
         """
         if additive not in CHOICES:
             raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
-        names = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c v" if constant_dt else "c dc v"}
-        drift = () if regimes is None or additive == "none" else ("c",)
-        return cls(frozenset((*names[additive].split(), *drift)), regimes)
+        names = set(CHOICES[additive].split())
+        if constant_dt and "v" in names:
+            names.discard("dc")
+        if regimes is not None and names:
+            names.add("c")
+        return cls(frozenset(names), regimes)
 
 
 @dataclass(frozen=True)

@@ -49,8 +49,9 @@ def fit_text(model: UncertainLTI) -> str:
         blocks += horizon_blocks(choice)
     gap = facts.get("optimality_gap")
     blocks += [
-        f"criterion {CRITERIA[facts['criterion']]}; additive: {facts['additive']}; {plural(facts['transitions'], 'transition')}, "
-        f"{facts['violations']} outside, optimality gap {'not known' if gap is None else f'{gap:.1e}'}",
+        f"criterion {CRITERIA[facts['criterion']]}; additive: {facts['additive']}; "
+        f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, optimality gap "
+        f"{'not known' if gap is None else f'{gap:.1e}'}",
         *_widths(model),
         *_dynamics(model),
     ]

@@ -228,8 +228,9 @@ Criterion = Literal["qp", "lp"]
 CRITERIA: dict[Criterion, str] = {"qp": "(10), least squared widths", "lp": "(11), least largest width"}
 """What a fit minimises, in words."""
 Additive = Literal["none", "disturbance", "noise", "both"]
-CHOICES: tuple[Additive, ...] = get_args(Additive)
-CHOICES_TEXT = f"{', '.join(CHOICES[:-1])} or {CHOICES[-1]}"
+CHOICES: dict[Additive, str] = {"none": "", "disturbance": "c dc", "noise": "v", "both": "c dc v"}
+"""Arrays of the additive terms that are unknown with each choice."""
+CHOICES_TEXT = " or ".join(", ".join(CHOICES).rsplit(", ", 1))
 """The choices as a part of a sentence."""
 
 
