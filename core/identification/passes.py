@@ -121,17 +121,20 @@ def occupied(partition: Partition, least: Array, greatest: Array, cells: int, st
     return found
 
 
-def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Samples]]:
+Numbered = tuple[Index, Block]
+"""Positions among all transitions, and these."""
+
+
+def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments, list[Numbered]]:
     """One pass for everything in `Moments`, and a sample of the transitions."""
-    columns, n, p = part.columns, part.n, part.p
+    columns, n = part.columns, part.n
     sums: Moments | None = None
-    sampled: list[Block] = []
-    index: list[Index] = []
+    sampled: list[Numbered] = []
     for block in part.blocks():
         if stride:
             first = -(block.start + offset) % stride
-            sampled.append(block.every(first, stride))
-            index.append(np.arange(first, len(block), stride) + (block.start + offset))
+            index = np.arange(first, len(block), stride) + (block.start + offset)
+            sampled.append((index, block.every(first, stride)))
         weights, (i, j) = block.weights, np.triu_indices(n)
         factors = None if weights.ndim == 1 else weights.T if weights.ndim == 2 else weights[:, i, j].T
         plain, grams, centre, target, square, width, visits = sums_of(
@@ -148,13 +151,14 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
         sums = found if sums is None else sums + found
     if sums is None:
         raise ValueError("a partition without transitions")
-    return sums, _per_row(sampled, index, n, p)
+    return sums, sampled
 
 
-def _per_row(blocks: list[Block], index: list[Index], n: int, p: int) -> list[Samples]:
-    """Transitions as every row sees them."""
-    if not blocks:
+def by_row(numbered: Sequence[Numbered], n: int, p: int) -> list[Samples]:
+    """Transitions as every row sees them, what is not its own held once for all."""
+    if not numbered:
         return [Samples.join([], p)] * n
+    index, blocks = zip(*numbered, strict=True)
     z, dt = np.hstack([b.z for b in blocks]), np.concatenate([b.dt for b in blocks])
     rate = (np.hstack([b.x_next for b in blocks]) - np.hstack([b.origin for b in blocks])) / dt
     root = np.hstack([np.broadcast_to(b.root_weights(), (n, len(b))) for b in blocks])
