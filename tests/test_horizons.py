@@ -80,6 +80,25 @@ def test_a_horizon_of_another_number_of_states_or_blocks_is_refused() -> None:
             model.replace(horizons=[horizon(rng, 3, **other)])
 
 
+@pytest.mark.parametrize("schedule", [None, SPEED, Schedule((SPEED.axes[0], Axis("x2", knots=(-1.0, 1.0))))])
+def test_a_window_is_the_same_alone_and_among_many(schedule: Schedule | None) -> None:
+    rng, count, steps = np.random.default_rng(5), 6000, (3, 40)
+    model = with_horizons(rng, steps, schedule)
+    z, dt, k = rng.normal(size=(3, count)), rng.uniform(0.005, 0.015, count), np.arange(count)
+    k[4000:] += 1  # a break
+    for windows in model.windows(k, z, dt, steps):
+        length = windows.steps
+        assert len(windows.start) == count - 2 * (length - 1) and 4000 - length in windows.start
+        assert not np.isin(np.arange(4001 - length, 4000), windows.start).any()
+        for start in (0, 2047, 2048, 2980, 2999, 3000, 4000 - length, 4000, count - length):
+            part = slice(start, start + length)
+            (alone,) = model.windows(k[part], z[:, part], dt[part], [length])
+            (at,) = np.flatnonzero(windows.start == start)
+            for name in ("run", "z", "time"):
+                among, own = getattr(windows, name)[..., at], getattr(alone, name)[..., 0]
+                assert among.tobytes() == own.tobytes()
+
+
 # --- the same bits live and offline -------------------------------------------------------------------------------
 
 TICK = 10_000_000  # ns
