@@ -9,6 +9,7 @@
 
 """Fixtures that several test files share, and what holds for every test: loopback only, no process left behind."""
 
+import json
 import os
 import shutil
 import signal
@@ -121,6 +122,27 @@ def recordings() -> Path:
 @pytest.fixture(scope="session")
 def signals_folder() -> Path:
     return ROOT / "config" / "signals"
+
+
+class Command:
+    """Run a command of `uncertain-lti` here: what is on standard output and error, once its status is as wanted."""
+
+    def __init__(self, capsys: pytest.CaptureFixture[str]) -> None:
+        self._capsys = capsys
+
+    def __call__(self, *words: Any, status: int = 0) -> Any:
+        from uncertain_lti.cli.main import main
+
+        assert main([*map(str, words)]) == status
+        return self._capsys.readouterr()
+
+    def json(self, *words: Any, status: int = 0) -> Any:
+        return json.loads(self(*words, "--json", status=status).out)
+
+
+@pytest.fixture
+def cli(capsys: pytest.CaptureFixture[str]) -> Command:
+    return Command(capsys)
 
 
 @pytest.fixture(scope="session")

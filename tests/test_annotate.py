@@ -29,7 +29,6 @@ from rosbags.highlevel import AnyReader
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.cli.main import main
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor import outputs
 from uncertain_lti.monitor.outputs import NODE, RECORDED
@@ -301,17 +300,16 @@ def test_statistics_of_the_alarm_are_in_the_copy(engine, tmp_path):
 # --- the command ------------------------------------------------------------------------------------------------
 
 
-def test_the_command_writes_and_says_so(engine, tmp_path, capsys):
+def test_the_command_writes_and_says_so(engine, tmp_path, cli):
     folder, model = engine
     model_file, bad = str(folder / "m.model.json"), str(folder / "bad.mcap")
-    assert main(["check", model_file, bad, "--write", str(tmp_path / "out.mcap")]) == 1
-    assert f"{NODE} written to {tmp_path / 'out.mcap'}" in capsys.readouterr().out
+    said = cli("check", model_file, bad, "--write", tmp_path / "out.mcap", status=1).out
+    assert f"{NODE} written to {tmp_path / 'out.mcap'}" in said
     same_recording(bad, tmp_path / "out.mcap")
     # a folder for several; the alarm rule of the command line is what is told
-    rule = ["--violations", "250", "--window", "250", "--json"]
+    rule = ["--violations", 250, "--window", 250]
     both = [bad, str(folder / "run.mcap")]
-    assert main(["check", model_file, *both, "--write", str(tmp_path / "all"), *rule]) == 0
-    said = json.loads(capsys.readouterr().out)["recordings"]
+    said = cli.json("check", model_file, *both, "--write", tmp_path / "all", *rule)["recordings"]
     assert [Path(r["written"]["file"]).name for r in said] == ["bad_annotated.mcap", "run_annotated.mcap"]
     (bag,) = group_recordings([bad])
     names = [path.name for path in targets(tmp_path / "new", [bag, bag])]

@@ -34,19 +34,17 @@ def folder(engine_copy):
     return engine_copy
 
 
-def refused(capsys, arguments):
+def refused(cli, *words):
     """Status 2 and one sentence on standard error, no traceback, nothing on standard output."""
-    assert main(arguments) == 2
-    said = capsys.readouterr()
+    said = cli(*words, status=2)
     assert said.err.count("\n") == 1 and "Traceback" not in said.err, said.err
     return said.err
 
 
-def test_check_tells_when_and_how_long(folder, capsys):
+def test_check_tells_when_and_how_long(folder, cli):
     """A sensor that jumps for three samples: two transitions of the jump and nothing else."""
     bad = folder / "bad.mcap"
-    assert main(["check", str(folder / "m.model.json"), str(bad), "--json"]) == 1
-    (result,) = json.loads(capsys.readouterr().out)["recordings"]
+    (result,) = cli.json("check", folder / "m.model.json", bad, status=1)["recordings"]
     fan = result["states"]["fan"]
     assert fan["first_violation"]["k"] == 100 and fan["first_violation"]["t"] == pytest.approx(2.5)
     assert fan["first_violation"]["t_ns"] == 10**18 + 2_500_000_000
@@ -55,8 +53,7 @@ def test_check_tells_when_and_how_long(folder, capsys):
     assert flags[100, 0] == 1 and flags[103, 0] == 1 and np.nansum(flags[:100]) == 0
     assert fan["violations"] == np.nansum(flags[:, 0])
     assert result["alarm"] and result["alarms"][0]["k"] == 100
-    assert main(["check", str(folder / "m.model.json"), str(bad)]) == 1
-    assert "ALARM" in capsys.readouterr().out
+    assert "ALARM" in cli("check", folder / "m.model.json", bad, status=1).out
     # an alarm rule of the command line in place of the model's: 250 of 250 never comes true
     rule = ["--violations", "250", "--window", "250"]
     assert main(["check", str(folder / "m.model.json"), str(bad), *rule]) == 0
@@ -150,11 +147,7 @@ REFUSED = [
     ("layout leibov2006 --foxglove /sys/x.json", "/sys/x.json"),
     ("reproduce --output text.mcap", "cannot be written"),
     # nothing but an older file of its kind is written over, whatever the option was meant to be
-    *(
-        (f"{words} {name}", "choose another name")
-        for words in WRITERS
-        for name in ("run.mcap", "signals.yaml", "lfs.mcap")
-    ),
+    *((f"{words} {name}", "choose another name") for words in WRITERS for name in VICTIMS),
     ("check m.model.json bad.mcap --write bad.mcap", "is the recording itself"),
     ("check m.model.json bad.mcap --write link.mcap", "is the recording itself"),
     ("check m.model.json bad.mcap --write text.mcap", "is there already"),
@@ -188,7 +181,7 @@ REFUSED = [
 
 
 @pytest.mark.parametrize(("words", "said"), REFUSED)
-def test_bad_input_gets_one_sentence_and_changes_nothing(folder, words, said, monkeypatch, capsys):
+def test_bad_input_gets_one_sentence_and_changes_nothing(folder, words, said, monkeypatch, cli):
     for name, ((old, new, *count), _) in WRONG_SIGNALS.items():
         (folder / f"{name}.yaml").write_text(SIGNALS.replace(old, new, *count))
     (folder / "empty.mcap").write_bytes(b"")
@@ -199,47 +192,44 @@ def test_bad_input_gets_one_sentence_and_changes_nothing(folder, words, said, mo
     write_folder(folder / "parts", parts, metadata_yaml(parts))
     monkeypatch.chdir(folder)
     before = {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))}
-    assert said in refused(capsys, words.split())
+    assert said in refused(cli, *words.split())
     assert {path: path.is_file() and path.read_bytes() for path in sorted(folder.rglob("*"))} == before
 
 
-def test_a_condition_that_cannot_hold_is_no_quiet(folder, tmp_path, capsys):
+def test_a_condition_that_cannot_hold_is_no_quiet(folder, tmp_path, cli):
     """An alarm that is never armed says nothing of the machine."""
     model, run = str(folder / "m.model.json"), folder / "run.mcap"
     for words in (["--enable", f"{STATE_TOPIC} position[fan_speed] > 1e9"], ["--grace", "1000"]):
-        assert main(["check", model, str(run), *words]) == 3
-        assert "UNKNOWN: the alarm was armed at no verdict" in capsys.readouterr().out
+        assert "UNKNOWN: the alarm was armed at no verdict" in cli("check", model, run, *words, status=3).out
     assert main(["check", model, str(run), "--enable", f"{STATE_TOPIC} position[fan_speed] < 1e9"]) == 0
     silent = engine_bag(tmp_path / "silent.mcap", more=[Topic("/engine/mode")])
-    assert "/engine/mode has no message" in refused(
-        capsys, ["check", model, str(silent), "--enable", "/engine/mode data == 3"]
-    )
+    said = refused(cli, "check", model, silent, "--enable", "/engine/mode data == 3")
+    assert "/engine/mode has no message" in said
 
 
-def test_an_older_page_or_layout_is_written_over(folder):
-    model, run = str(folder / "m.model.json"), str(folder / "run.mcap")
-    pages = [["report", model, run, "--output", str(folder / "page.html"), "-q"]]
-    pages += [["layout", model, f"--{kind}", str(folder / kind)] for kind in ("foxglove", "plotjuggler")]
-    for arguments in [*pages, *pages]:
-        assert main(arguments) == 0, arguments
+def test_an_older_page_or_layout_is_written_over(folder, cli):
+    model = folder / "m.model.json"
+    pages = [["report", model, folder / "run.mcap", "--output", folder / "page.html", "-q"]]
+    pages += [["layout", model, f"--{kind}", folder / kind] for kind in ("foxglove", "plotjuggler")]
+    for words in [*pages, *pages]:
+        cli(*words)
 
 
-def test_a_recording_of_one_robot_of_several_is_checked_below_its_prefix(folder, tmp_path, capsys):
+def test_a_recording_of_one_robot_of_several_is_checked_below_its_prefix(folder, tmp_path, cli):
     """As the node hears it with `topic_prefix`; the condition, too, is below it."""
     plain, robot = Bag(folder / "bad.mcap"), tmp_path / "robot.mcap"
     topics = [Topic(f"/robot1{topic}", info.type) for topic, info in plain.topics.items()]
     messages = [Message(f"/robot1{m.topic}", m.log_time_ns, bytes(m.data)) for m in plain.raw_messages()]
     write(topics, messages).save(robot)
-    enable = ["--enable", f"{STATE_TOPIC} position[fan_speed] > -100", "--json"]
+    enable = ["--enable", f"{STATE_TOPIC} position[fan_speed] > -100"]
 
     def judged(*arguments):
-        assert main(["check", str(folder / "m.model.json"), *map(str, arguments), *enable]) == 1
-        (result,) = json.loads(capsys.readouterr().out)["recordings"]
+        (result,) = cli.json("check", folder / "m.model.json", *arguments, *enable, status=1)["recordings"]
         return result["verdict_per_sample"], result["alarms"]
 
     for prefix in ("/robot1", "robot1/"):
         assert judged(robot, "--topic-prefix", prefix) == judged(folder / "bad.mcap")
-    assert "is /robot1/engine/state meant?" in refused(capsys, ["check", str(folder / "m.model.json"), str(robot)])
+    assert "is /robot1/engine/state meant?" in refused(cli, "check", folder / "m.model.json", robot)
 
 
 def test_help_and_usage(capsys):
@@ -253,80 +243,69 @@ def test_help_and_usage(capsys):
         assert stopped.value.code == status and "usage" in "".join(capsys.readouterr())
 
 
-def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, capsys):
+def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, cli):
     """Inside all bounds, and most of it where nothing vouches for them: said loudly, and in the JSON by a word."""
     path = folder / "m.model.json"
     model = json.loads(path.read_text())
-    assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 0
-    printed = json.loads(capsys.readouterr().out)
+    printed = cli.json("check", path, folder / "run.mcap")
     assert (printed["outcome"], printed["exit_status"]) == ("quiet", 0)
     middle = np.median([s["state"][0] for s in printed["recordings"][0]["verdict_per_sample"]])
     model["domain"]["x_max"][0] = float(middle)  # half of what was seen is now beyond what was fitted
     path.write_text(json.dumps(model))
-    assert main(["check", str(path), str(folder / "run.mcap")]) == 3
-    first, *_, last = capsys.readouterr().out.splitlines()
+    first, *_, last = cli("check", path, folder / "run.mcap", status=3).out.splitlines()
     assert first.startswith("UNKNOWN: 4") or first.startswith("UNKNOWN: 5")
     assert "outside the fitted domain, where nothing vouches for the bounds" in first and "says nothing" in last
     assert re.search(r"that reach as far: \w+ at [\d.-]+ to [\d.-]+ \(fitted: [\d.-]+ to [\d.-]+\)$", first)
-    assert main(["report", str(path), str(folder / "run.mcap"), "--json"]) == 3
-    assert json.loads(capsys.readouterr().out)["recordings"][0]["outcome"] == "unknown"
-    assert main(["check", str(path), str(folder / "run.mcap"), "--json"]) == 3
-    printed = json.loads(capsys.readouterr().out)
+    assert cli.json("report", path, folder / "run.mcap", status=3)["recordings"][0]["outcome"] == "unknown"
+    printed = cli.json("check", path, folder / "run.mcap", status=3)
     assert (printed["outcome"], printed["exit_status"], printed["alarm"]) == ("unknown", 3, False)
     (recording,) = printed["recordings"]
     assert 0.4 < recording["outside_domain_share"] < 0.6 and "nothing vouches" in recording["reason"]
-    main(["report", str(path), str(folder / "run.mcap"), "--json"])
-    (happened,) = json.loads(capsys.readouterr().out)["happened"]
+    (happened,) = cli.json("report", path, folder / "run.mcap", status=3)["happened"]
     assert happened["state"] == "unknown" and "nothing vouches" in happened["text"]
 
 
-def test_a_model_is_written_over_with_force_alone(folder, capsys):
-    before = (folder / "m.model.json").read_bytes()
-    another = ["fit", str(folder / "run.mcap"), "--signals", str(folder / "signals.yaml"), "--additive", "both"]
-    another += ["--output", str(folder / "m.model.json")]
-    said = refused(capsys, another)
+def test_a_model_is_written_over_with_force_alone(folder, cli):
+    model = folder / "m.model.json"
+    before = model.read_bytes()
+    another = ["fit", folder / "run.mcap", "--signals", folder / "signals.yaml", "--additive", "both"]
+    said = refused(cli, *another, "--output", model)
     assert "a model is there already; choose another name, or write over it with --force" in said
-    assert (folder / "m.model.json").read_bytes() == before
-    assert main([*another, "--force"]) == 0
-    assert (folder / "m.model.json").read_bytes() != before
-    shutil.copy(folder / "m.model.json", folder / "other.model.json")
-    capsys.readouterr()
-    validate = ["validate", str(folder / "m.model.json"), "--output"]
-    assert "with --force" in refused(capsys, [*validate, str(folder / "other.model.json")])
-    assert main([*validate, str(folder / "m.model.json")]) == 0  # the model itself gets its validation
+    assert model.read_bytes() == before
+    cli(*another, "--output", model, "--force")
+    assert model.read_bytes() != before
+    shutil.copy(model, folder / "other.model.json")
+    assert "with --force" in refused(cli, "validate", model, "--output", folder / "other.model.json")
+    cli("validate", model, "--output", model)  # the model itself gets its validation
 
 
-def test_of_several_recordings_one_that_lacks_a_topic_keeps_none_from_being_checked(folder, tmp_path, capsys):
+def test_of_several_recordings_one_that_lacks_a_topic_keeps_none_from_being_checked(folder, tmp_path, cli):
     other = write([Topic("/elsewhere")], ramp("/elsewhere", range(3))).save(tmp_path / "other.mcap")
     run, model = str(folder / "run.mcap"), str(folder / "m.model.json")
     shutil.copy(run, tmp_path / "again.mcap")
-    assert main(["check", model, run, str(other), str(tmp_path / "again.mcap")]) == 2
-    said = capsys.readouterr()
+    said = cli("check", model, run, other, tmp_path / "again.mcap", status=2)
     assert said.out.count(" verdicts, ") == 2
     assert "other.mcap: there is no topic /engine/" in said.err and "1 of 3 recordings not checked" in said.err
-    assert main(["check", model, str(other), run, "--json"]) == 2
-    data = json.loads(capsys.readouterr().out)
+    data = cli.json("check", model, other, run, status=2)
     assert data["outcome"] == "unknown" and len(data["recordings"]) == 1
     assert [r["recording"] for r in data["not_checked"]] == [str(other)]
-    assert "1 of 3" not in refused(capsys, ["check", model, str(other)])
+    assert "1 of 3" not in refused(cli, "check", model, other)
     page = tmp_path / "page.html"
     for command in ("report", "plot"):
-        assert main([command, model, str(other), run, "--output", str(page)]) == 2
-        assert "1 of 2 recordings not checked" in capsys.readouterr().err and page.exists()
+        said = cli(command, model, other, run, "--output", page, status=2).err
+        assert "1 of 2 recordings not checked" in said and page.exists()
         page.unlink()
         shutil.copy(other, tmp_path / "third.mcap")
-        assert main([command, model, str(other), str(tmp_path / "third.mcap"), "--output", str(page)]) == 2
-        assert "2 of 2 recordings not checked" in capsys.readouterr().err and not page.exists()
+        said = cli(command, model, other, tmp_path / "third.mcap", "--output", page, status=2).err
+        assert "2 of 2 recordings not checked" in said and not page.exists()
 
 
-def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, capsys):
+def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, cli):
     """Three messages within a microsecond, twice a second."""
     times = [k * 500_000_000 + j * 300 for k in range(20) for j in range(3)]
     path = write([Topic("/a")], ramp("/a", times)).save(tmp_path / "a.mcap")
-    assert main(["topics", str(path)]) == 0
-    assert re.search(r"/a .* 60 +6\.\d+ in bursts ", capsys.readouterr().out)
-    assert main(["topics", str(path), "--json"]) == 0
-    (topic,) = json.loads(capsys.readouterr().out)["topics"]
+    assert re.search(r"/a .* 60 +6\.\d+ in bursts ", cli("topics", path).out)
+    (topic,) = cli.json("topics", path)["topics"]
     assert topic["bursts"] and topic["rate"] == pytest.approx(60 / 9.5, rel=0.05)
 
 
@@ -361,13 +340,11 @@ def test_a_near_miss_names_one_option(words, said, capsys):
     assert said in error and " or --" not in error.rpartition("error: ")[2]
 
 
-def test_what_is_proposed_and_written_as_json(folder, tmp_path, capsys):
-    assert main(["init", str(folder / "run.mcap"), "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+def test_what_is_proposed_and_written_as_json(folder, tmp_path, cli):
+    data = cli.json("init", folder / "run.mcap")
     assert {"name", "topic", "field"} <= set(data["states"][0]) and data["text"].startswith("# Proposed by")
     layout = tmp_path / "l.json"
-    assert main(["layout", str(folder / "m.model.json"), "--foxglove", str(layout), "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["layouts"] == [str(layout)]
+    assert cli.json("layout", folder / "m.model.json", "--foxglove", layout)["layouts"] == [str(layout)]
 
 
 def test_an_alarm_is_red_where_colours_are_wanted(monkeypatch, capsys):
@@ -381,11 +358,10 @@ def test_an_alarm_is_red_where_colours_are_wanted(monkeypatch, capsys):
         assert lines[0] == "bag: 3 verdicts" and ("\x1b[1;31mALARM" in lines[1]) == red
 
 
-def test_completion(tmp_path, capsys):
+def test_completion(tmp_path, cli):
     pytest.importorskip("shtab", reason="shtab, of the extra completion, is not installed")
-    assert main(["completion", "zsh"]) == 0 and "validate" in capsys.readouterr().out
-    assert main(["completion", "bash"]) == 0
-    (tmp_path / "script").write_text(capsys.readouterr().out)
+    assert "validate" in cli("completion", "zsh").out
+    (tmp_path / "script").write_text(cli("completion", "bash").out)
     ask = "COMP_WORDS=(uncertain-lti fit --crit); COMP_CWORD=2; _shtab_uncertain_lti; echo ${COMPREPLY[@]}"
     done = subprocess.run(["bash", "-c", f"source {tmp_path}/script; {ask}"], capture_output=True, text=True)
     assert done.stdout.split() == ["--criterion"]

@@ -87,7 +87,7 @@ def run(tmp_path):
 
 
 @pytest.mark.usefixtures("tables")
-def test_a_format_added_to_the_table_serves_every_command(run, tmp_path, capsys):
+def test_a_format_added_to_the_table_serves_every_command(run, tmp_path, cli):
     assert isinstance(open_recording(run), Table)
     signals = tmp_path / "signals.yaml"
     signals.write_text(
@@ -99,8 +99,7 @@ def test_a_format_added_to_the_table_serves_every_command(run, tmp_path, capsys)
     model = tmp_path / "m.model.json"
     assert main(["topics", str(run)]) == 0
     assert main(["fit", str(run), "--signals", str(signals), "--additive", "noise", "--output", str(model)]) == 0
-    assert main(["check", str(model), str(run)]) == 0
-    assert "599 verdicts, 100.000% inside all bounds" in capsys.readouterr().out
+    assert "599 verdicts, 100.000% inside all bounds" in cli("check", model, run).out
     assert main(["init", str(run)]) in (0, 2)  # one topic cannot be both state and command: a file or a sentence
 
 

@@ -20,7 +20,6 @@ from tanks import Tanks
 from uncertain_lti import Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import text_of
-from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.plants.leibov import leibov2006, transient
@@ -297,27 +296,24 @@ def test_the_interval_of_a_share_counts_clusters():
 # --- where it is said ---
 
 
-def test_validate_info_and_report_say_which_faults_are_seen(tmp_path, capsys):
+def test_validate_info_and_report_say_which_faults_are_seen(tmp_path, cli):
     (tmp_path / "signals.yaml").write_text(SIGNALS)
     engine_bag(tmp_path / "run.mcap", steps=400)
     name = str(tmp_path / "m.model.json")
     words = ["--signals", str(tmp_path / "signals.yaml"), "--additive", "noise", "--output", name]
-    assert main(["fit", str(tmp_path / "run.mcap"), *words]) == 0
+    cli("fit", tmp_path / "run.mcap", *words)
     page = tmp_path / "page.html"
-    report = ["report", name, str(tmp_path / "run.mcap"), "--output", str(page), "-q"]
-    assert main(report) == 0
+    report = ["report", name, tmp_path / "run.mcap", "--output", page, "-q"]
+    cli(*report)
     text = page.read_text()
     assert f"`uncertain-lti validate {name} --output {name}` finds it out" in text
     assert f"<li>{UncertainLTI.load(name).fit_summary['alarm']['promises'][1]}</li>" in text
-    capsys.readouterr()
-    assert main(["validate", name, "--within", "0.5", "--output", name]) == 0
-    said = capsys.readouterr().out
+    said = cli("validate", name, "--within", "0.5", "--output", name).out
     assert "smallest fault seen in 90% of the cases within 0.5 s" in said and "off by" in said
     data = UncertainLTI.load(name).validation["detectable"]
     fan = next(f for f in data["faults"] if (f["kind"], f["signal"]) == ("bias", "fan"))
     assert fan["size"] > 0 and f"{fan['size']:.3g}" in said
-    assert main(["info", name]) == 0
-    assert f"fan: off by {fan['size']:.3g}" in capsys.readouterr().out
-    assert main(report) == 0
+    assert f"fan: off by {fan['size']:.3g}" in cli("info", name).out
+    cli(*report)
     assert "Which faults would it see?" in page.read_text() and f"off by {fan['size']:.3g}" in page.read_text()
     assert detectable_data({}) is None and detectable_data({"detectable": {"faults": [{"kind": "bias"}]}}) is None

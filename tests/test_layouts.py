@@ -108,11 +108,11 @@ def test_plotjuggler_names_what_is_there(annotated):
         assert int(splitter.get("count")) == len(splitter) == len(splitter.get("sizes").split(";"))
 
 
-def test_shipped_layouts_are_what_the_command_writes(annotated, tmp_path, capsys):
+def test_shipped_layouts_are_what_the_command_writes(annotated, tmp_path, cli):
     name, model, _ = annotated
     files = [tmp_path / "l.json", tmp_path / "l.xml"]
-    assert main(["layout", str(model), "--foxglove", str(files[0]), "--plotjuggler", str(files[1])]) == 0
-    assert all(str(file) in capsys.readouterr().out or file.exists() for file in files)
+    said = cli("layout", model, "--foxglove", files[0], "--plotjuggler", files[1]).out
+    assert all(str(file) in said and file.exists() for file in files)
     assert files[0].read_text() == (LAYOUTS / f"{name}.foxglove.json").read_text()
     assert files[1].read_text() == (LAYOUTS / f"{name}.plotjuggler.xml").read_text()
     assert main(["layout", str(model), "--foxglove", str(files[0]), "--topics", "robot/monitor/"]) == 0

@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import Command
 from test_event_log import Rig
 
 import uncertain_lti
@@ -236,22 +237,18 @@ def test_signatures_without_a_common_horizon_are_not_alike() -> None:
     assert closeness(Signature("a", [1], ones), Signature("b", [1], 3 * ones)) == pytest.approx(1.0)
 
 
-def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from uncertain_lti.cli.main import main
-
+def test_the_command(tmp_path: Path, cli: Command) -> None:
     bags = Path(__file__).resolve().parents[1] / "bags"
     model, taught = str(tmp_path / "m.model.json"), str(tmp_path / "s.model.json")
     noise = [str(p) for p in sorted(bags.glob("turbofan_*_noise.mcap"))]
     signals = str(bags.parent / "config" / "signals" / "turbofan.yaml")
     words = ["--signals", signals, "--output", model, "--criterion", "lp", "--additive", "noise"]
-    assert main(["fit", *noise, *words]) == 0
+    cli("fit", *noise, *words)
     rule = ["--violations", "2", "--window", "5"]
     labelled = [f"{kind}={bags / f'turbofan_{kind}.mcap'}" for kind in ("fan_damage", "fuel_stuck", "nozzle_stuck")]
-    assert main(["signature", model, *labelled, "--output", taught, *rule]) == 0
-    assert "fan_damage" in capsys.readouterr().out
+    assert "fan_damage" in cli("signature", model, *labelled, "--output", taught, *rule).out
     for text in labelled:
         label, _, bag = text.partition("=")
-        assert main(["check", taught, bag, *rule]) == 1
-        assert f"looks like {label} (match " in capsys.readouterr().out
-    assert main(["signature", taught, labelled[0], "--output", str(tmp_path / "t.model.json"), *rule]) == 2
-    assert "another label" in capsys.readouterr().err
+        assert f"looks like {label} (match " in cli("check", taught, bag, *rule, status=1).out
+    said = cli("signature", taught, labelled[0], "--output", tmp_path / "t.model.json", *rule, status=2).err
+    assert "another label" in said

@@ -108,11 +108,10 @@ def engine(engine_folder, tmp_path_factory):
 # --- report ----------------------------------------------------------------------------------------------------------
 
 
-def test_the_page_answers_first(engine, tmp_path, capsys):
+def test_the_page_answers_first(engine, tmp_path, cli):
     out = tmp_path / "page.html"
     model = str(engine / "m.model.json")
-    assert main(["report", model, str(engine / "bad.mcap"), str(engine / "other.mcap"), "--output", str(out)]) == 1
-    said = capsys.readouterr().out
+    said = cli("report", model, engine / "bad.mcap", engine / "other.mcap", "--output", out, status=1).out
     assert "may I rely on it? unknown" in said and str(out) in said
     page = needs_nothing_else(out.read_text(encoding="utf-8"))
     text = " ".join(page.text)
@@ -127,12 +126,10 @@ def test_the_page_answers_first(engine, tmp_path, capsys):
     assert {r["name"] for r in data_of(out.read_text()) if r["alarms"]} >= {"bad.mcap"}
 
 
-def test_json_has_the_facts_of_the_page(engine, tmp_path, capsys):
+def test_json_has_the_facts_of_the_page(engine, tmp_path, capsys, cli):
     model, bags = str(engine / "m.model.json"), [str(engine / name) for name in ("bad.mcap", "other.mcap")]
-    assert main(["report", model, *bags, "--json"]) == 1
-    facts = json.loads(capsys.readouterr().out)
-    assert main(["check", model, *bags, "--json"]) == 1
-    checked = json.loads(capsys.readouterr().out)["recordings"]
+    facts = cli.json("report", model, *bags, status=1)
+    checked = cli.json("check", model, *bags, status=1)["recordings"]
     for said, recording in zip(facts["recordings"], checked, strict=True):
         assert {key: said[key] for key in ("verdicts", "violated", "alarm", "alarms", "inside")} == {
             key: recording[key] for key in ("verdicts", "violated", "alarm", "alarms", "inside")
@@ -144,13 +141,12 @@ def test_json_has_the_facts_of_the_page(engine, tmp_path, capsys):
     assert len(facts["model"]["sha256"]) == 64 and facts["recordings"][0]["files"][0]["file"] == bags[0]
     assert facts["rely"]["answer"] in (UNKNOWN, NO) and facts["validation"] is None
     out = tmp_path / "p.html"
-    assert main(["report", model, *bags, "--json", "--output", str(out)]) == 1
-    assert json.loads(capsys.readouterr().out) == facts and out.exists()
+    assert cli.json("report", model, *bags, "--output", out, status=1) == facts and out.exists()
     assert main(["report", model, str(engine / "other.mcap"), "--output", str(out), "--quiet"]) in (0, 1)
     assert capsys.readouterr().out == ""
 
 
-def test_what_was_fitted_proves_nothing(engine, capsys, tmp_path):
+def test_what_was_fitted_proves_nothing(engine, cli, tmp_path):
     """And a validated model says how it did on what was left out."""
     runs = read_transients([engine / "run.mcap", engine / "other.mcap"], engine / "signals.yaml")
     model = fit(runs, additive="noise")
@@ -158,8 +154,7 @@ def test_what_was_fitted_proves_nothing(engine, capsys, tmp_path):
     model.save(tmp_path / "v.model.json")
     source = {"file": "elsewhere/run.mcap", "sha256": sha256(engine / "run.mcap")}
     model.replace(fit_summary={**model.fit_summary, "sources": [source]}).save(tmp_path / "v.model.json")
-    assert main(["report", str(tmp_path / "v.model.json"), str(engine / "run.mcap"), "--json"]) == 0
-    facts = json.loads(capsys.readouterr().out)
+    facts = cli.json("report", tmp_path / "v.model.json", engine / "run.mcap")
     reasons = {r["about"]: r for r in facts["rely"]["reasons"] if r["about"] != "fit"}
     assert "proves nothing" in reasons["recordings"]["text"]
     inside = model.validation["inside"]
@@ -299,15 +294,14 @@ def test_a_long_recording_fits_into_a_page_of_two_megabytes():
     assert 500_000 < len(page) < 2_000_000
 
 
-def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, capsys):
+def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, cli):
     model, bad, run = (str(engine / name) for name in ("m.model.json", "bad.mcap", "run.mcap"))
     (tmp_path / "m.png").write_bytes(b"\x89PNG of before, which gives way")
     for name, head in (("m.png", b"\x89PNG\r"), ("m.svg", b"<?xml"), ("m.pdf", b"%PDF")):
         assert main(["plot", model, "--output", str(tmp_path / name), "-q"]) == 0
         assert (tmp_path / name).read_bytes().startswith(head)
     page = tmp_path / "p.html"
-    assert main(["plot", model, bad, run, "--output", str(page), "--json"]) == 1
-    said = json.loads(capsys.readouterr().out)
+    said = cli.json("plot", model, bad, run, "--output", page, status=1)
     assert said == {"plot": str(page), "recordings": [bad, run], "alarm": True, "exit_status": 1}
     first, second = data_of(page.read_text())
     assert first["name"] == "bad.mcap" and first["alarms"] and not second["alarms"]
@@ -321,5 +315,5 @@ def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, capsys
     for path in other:
         Path(path).write_text("t,x\n0,1\n1,2\n")
     page.unlink()
-    assert main(["plot", model, *other, "--output", str(page), "-q"]) == 2
-    assert "no recording could be checked, so nothing is drawn" in capsys.readouterr().err and not page.exists()
+    said = cli("plot", model, *other, "--output", page, "-q", status=2).err
+    assert "no recording could be checked, so nothing is drawn" in said and not page.exists()

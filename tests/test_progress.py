@@ -83,35 +83,30 @@ def test_a_terminal_sees_bars_that_are_gone_at_the_end(long_run):
     assert (status, written) == (0, "")
 
 
-def test_no_terminal_no_bars(folder, capsys):
-    assert main(fit_arguments(folder)) == 0
-    said = capsys.readouterr()
+def test_no_terminal_no_bars(folder, cli):
+    said = cli(*fit_arguments(folder))
     assert "model written" in said.out
     far = ("note: ", "reading: ", "fitting: ")  # how far long work is, which a busy machine prints
     assert "%|" not in said.err and all(line.startswith(far) for line in said.err.splitlines())
-    assert main([*fit_arguments(folder), "--quiet"]) == 0
-    said = capsys.readouterr()
+    said = cli(*fit_arguments(folder), "--quiet")
     assert (said.out, said.err) == ("", "")
 
 
-def test_quiet_keeps_errors_data_and_status(folder, capsys):
+def test_quiet_keeps_errors_data_and_status(folder, cli):
     model, run, bad = (str(folder / name) for name in ("m.model.json", "run.mcap", "bad.mcap"))
     assert main(["check", model, bad, "-q"]) == 1
-    assert main(["validate", model, run, "-q"]) == 0
-    assert capsys.readouterr() == ("", "")
-    assert main(["check", model, run, "-q", "--json"]) == 0
-    said = capsys.readouterr()
+    assert cli("validate", model, run, "-q") == ("", "")
+    said = cli("check", model, run, "-q", "--json")
     assert json.loads(said.out)["alarm"] is False and not said.err
-    assert main(["check", model, str(folder / "none.mcap"), "-q"]) == 2
-    assert capsys.readouterr().err.count("\n") == 1
+    assert cli("check", model, folder / "none.mcap", "-q", status=2).err.count("\n") == 1
     with pytest.raises(SystemExit) as refusal:
         main(["check", model, run, "-q", "-v"])
     assert refusal.value.code == 2
 
 
-def test_verbose_tells_every_step(folder, capsys):
-    assert main([*fit_arguments(folder), "--verbose"]) == 0
-    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
+def test_verbose_tells_every_step(folder, cli):
+    said = cli(*fit_arguments(folder), "--verbose").err.splitlines()
+    lines = [line for line in said if not line.startswith("note: ")]
     assert sum("fitting: fit" in line for line in lines) == 5  # blocks left out, by one way only
     assert any("reading: " in line and "messages" in line for line in lines)
     times = [float(line.split()[0]) for line in lines]

@@ -24,7 +24,6 @@ from hypothesis import strategies as st
 
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
-from uncertain_lti.cli.main import main
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.proposal.candidates import Candidate, Source, Steps
 from uncertain_lti.proposal.choosing import _function, _may_follow, _may_move_with, _moves_with, choose
@@ -322,7 +321,7 @@ def test_nothing_to_propose_is_said(tmp_path):
         propose([path])
 
 
-def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, capsys):
+def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, cli):
     """`init` proposed one of them without a word, and `fit` of all said to check the signals file."""
     messages, x = [], np.zeros(2)
     rng = np.random.default_rng(0)
@@ -341,13 +340,13 @@ def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, capsys):
     )
     proposal = propose([path])
     assert [state.path for state in proposal.states] == ["position[hand]"] and proposal.warnings == (apart,)
-    assert main(["topics", str(path)]) == 0 and apart in capsys.readouterr().err
+    assert apart in cli("topics", path).err
     entries = [{"name": name, "topic": "/joint_states", "field": f"position[{name}]"} for name in ("arm", "hand")]
     with pytest.raises(FitError, match="no message of /joint_states has all of arm, hand; fit a model for those that"):
         fit(read_transients(path, SignalMap.from_dict({"states": entries})))
 
 
-def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path, capsys):
+def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     """Nothing before tells of its changes: `fit` said to take away the `judged: true` that `init` wrote."""
     rng, x, rows = np.random.default_rng(0), 0.0, ["time,Pump_speed_cmd,Valve_cmd,Flow"]
     for k, speed in enumerate(np.repeat(rng.uniform(0.2, 1.0, 15), 60).tolist()):
@@ -422,20 +421,16 @@ def test_effects_that_are_found_at_once_are_those_one_by_one(seed):
 # --- the command ------------------------------------------------------------------------------------------------
 
 
-def test_init_then_fit_then_what_is_next(tmp_path, capsys):
+def test_init_then_fit_then_what_is_next(tmp_path, cli):
     """The two lines it prints are the ones to type."""
     path = save(tmp_path / "run one.mcap", driven(), {})
     target = tmp_path / "signals.yaml"
-    assert main(["init", str(path), "--output", str(target)]) == 0
-    said = capsys.readouterr().out
+    said = cli("init", path, "--output", target).out
     assert "states: state" in said and "--signals" in said
-    assert main(["init", str(path), "--output", str(target)]) == 2, "it never writes over an edited file"
-    assert "is there already" in capsys.readouterr().err
+    assert "is there already" in cli("init", path, "--output", target, status=2).err, "it never writes over a file"
     model = tmp_path / "machine.model.json"
-    assert main(["fit", str(path), "--signals", str(target), "--output", str(model)]) == 0
-    assert "next" in capsys.readouterr().out
-    assert main(["init", str(path)]) == 0
-    assert capsys.readouterr().out == target.read_text()
+    assert "next" in cli("fit", path, "--signals", target, "--output", model).out
+    assert cli("init", path).out == target.read_text()
 
 
 # --- whatever comes ---------------------------------------------------------------------------------------------
@@ -515,13 +510,12 @@ def test_noise_is_no_state(tmp_path):
     assert "noise: one sample predicts" in line or "the controls do not show" in line
 
 
-def test_a_recording_of_noise_alone_says_so(tmp_path, capsys):
+def test_a_recording_of_noise_alone_says_so(tmp_path, cli):
     rng = np.random.default_rng(3)
     messages = [f64("/plant/state", 10**18 + k * 20 * MS, 1.0 + 0.1 * rng.normal()) for k in range(500)]
     path, proposal = proposed(tmp_path, messages)
     assert len(proposal.states) == 1 and "# Beware: nothing here is more than noise" in proposal.text
-    assert main(["init", str(path)]) == 0
-    assert "record the machine at work" in capsys.readouterr().err
+    assert "record the machine at work" in cli("init", path).err
 
 
 @pytest.mark.parametrize("late", [0, 4])

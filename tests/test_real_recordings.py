@@ -9,15 +9,12 @@
 
 """Real recordings of real machines, from bag to verdict through the commands a user types."""
 
-import json
-
 import numpy as np
 import pytest
 from scipy.linalg import expm
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.sampling.reading import read_as_fitted
 
@@ -78,16 +75,13 @@ def test_go2_fit_on_every_other_second_holds_on_the_others(recordings, signals_f
     assert (model.fit_summary["mean_width_recorded"] < 0.6 * np.ptp(transient.transitions().x, axis=0)).all()
 
 
-def test_commands_from_bag_to_verdict(recordings, signals_folder, tmp_path, capsys):
+def test_commands_from_bag_to_verdict(recordings, signals_folder, tmp_path, cli):
     model, bag = tmp_path / "go2.model.json", recordings / "go2/test_3.mcap"
     arguments = ["fit", str(bag), "--signals", str(signals_folder / "go2_joint.yaml"), "--output", str(model)]
-    assert main([*arguments, "--additive", "none"]) == 2
-    assert "--additive noise" in capsys.readouterr().err and not model.exists()
-    assert main(arguments) == 0  # the signals file says noise
-    assert "0 outside" in capsys.readouterr().out
-    assert main(["check", str(model), str(bag)]) == 0
-    assert main(["check", str(model), str(bag), "--json", "--margin", "0.5"]) == 1
-    data = json.loads(capsys.readouterr().out.partition("\n{")[2].join(["{", ""]))
+    assert "--additive noise" in cli(*arguments, "--additive", "none", status=2).err and not model.exists()
+    assert "0 outside" in cli(*arguments).out  # the signals file says noise
+    cli("check", model, bag)
+    data = cli.json("check", model, bag, "--margin", 0.5, status=1)
     (result,) = data["recordings"]
     assert result["alarm"] and len(result["verdict_per_sample"]) == result["samples"] == 10449
     flags = [s["flags"] for s in result["verdict_per_sample"] if s["status"] == "ok"]

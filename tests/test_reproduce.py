@@ -52,14 +52,12 @@ def test_the_direct_search_contains_every_sample_and_never_beats_the_exact_solve
     assert found.rows.sum() == pytest.approx(found.objective)
 
 
-def test_the_published_model_is_known_to_the_commands_by_name(capsys):
+def test_the_published_model_is_known_to_the_commands_by_name(cli):
     """It contains its own shipped recording up to the sample after which that leaves the intervals, and not beyond."""
-    assert main(["check", "leibov2006", str(ROOT / "bags/leibov_check.mcap"), "--json"]) == 1
-    (result,) = json.loads(capsys.readouterr().out)["recordings"]
+    (result,) = cli.json("check", "leibov2006", ROOT / "bags/leibov_check.mcap", status=1)["recordings"]
     first = [k for k, v in enumerate(result["verdict_per_sample"]) if 1.0 in v["flags"]][0]
     assert first == 1201
-    assert main(["info", "leibov2006"]) == 0
-    assert "-15.59-17j" in capsys.readouterr().out
+    assert "-15.59-17j" in cli("info", "leibov2006").out
 
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -9,8 +9,6 @@
 
 """`uncertain-lti start` does what `init`, `fit` and `report` do one after another."""
 
-import json
-
 import numpy as np
 import pytest
 from bag_writer import Message, Topic, write
@@ -34,9 +32,8 @@ def folder(tmp_path, monkeypatch):
 HEALTHY = [f"healthy_{seed}.mcap" for seed in (1, 2, 3)]
 
 
-def test_start_gives_the_files_of_the_three_commands(folder, capsys):
-    assert main(["start", *HEALTHY, "--check", "damaged.mcap"]) == 1
-    printed = capsys.readouterr().out
+def test_start_gives_the_files_of_the_three_commands(folder, cli):
+    printed = cli("start", *HEALTHY, "--check", "damaged.mcap", status=1).out
     assert "The alarm was raised" in printed and (folder / "machine.html").as_uri() in printed
     assert printed.splitlines()[-3:] == [
         "  scp machine.model.json ROBOT:",
@@ -60,21 +57,18 @@ def test_a_model_that_is_not_worth_having_is_not_sent_to_the_robot(folder, capsy
     assert printed.splitlines()[-1].startswith("not on the robot yet: mend what is said above, in rare.yaml or by")
 
 
-def test_an_edited_signals_file_is_used_as_it_is(folder, capsys):
-    assert main(["start", *HEALTHY, "--output", "m", "--quiet"]) == 0
-    assert capsys.readouterr().out == ""
+def test_an_edited_signals_file_is_used_as_it_is(folder, cli):
+    assert cli("start", *HEALTHY, "--output", "m", "--quiet").out == ""
     text = (folder / "m.yaml").read_text()
     (folder / "m.yaml").write_text(text.replace("name: fan_speed", "name: fan"))
-    assert main(["start", *HEALTHY, "--output", "m"]) == 2
-    assert "write over it with --force" in capsys.readouterr().err
-    assert main(["start", *HEALTHY, "--output", "m", "--force", "--json"]) == 0
-    data = json.loads(capsys.readouterr().out)
+    assert "write over it with --force" in cli("start", *HEALTHY, "--output", "m", status=2).err
+    data = cli.json("start", *HEALTHY, "--output", "m", "--force")
     assert "init" not in data and data["exit_status"] == 0 and not data["findings"]["alarm"]
     assert "fan" in UncertainLTI.load("m.model.json").state_names
     assert data["fit"]["fit"]["transitions"] == 3 * 299 and data["report"] == "m.html"
 
 
-def test_what_is_not_used_of_a_recording_is_said_as_fit_says_it(folder, capsys):
+def test_what_is_not_used_of_a_recording_is_said_as_fit_says_it(folder, cli):
     """Also where the signals file is there already, so that `init` does not read the recordings."""
     messages = [Message(raw.topic, raw.log_time_ns, raw.data) for raw in Bag(folder / HEALTHY[1]).raw_messages()]
     of_state = next(m for m in messages[100:] if m.topic == STATE_TOPIC)
@@ -82,10 +76,8 @@ def test_what_is_not_used_of_a_recording_is_said_as_fit_says_it(folder, capsys):
     write(topics, sorted([*messages, of_state], key=lambda m: m.log_time)).save(folder / HEALTHY[1])
     whole = (folder / HEALTHY[0]).read_bytes()
     (folder / HEALTHY[0]).write_bytes(whole[: len(whole) * 9 // 10])
-    assert main(["start", *HEALTHY]) == 0
-    said = capsys.readouterr()
-    assert main(["start", *HEALTHY, "--force"]) == 0
-    again = capsys.readouterr()
+    said = cli("start", *HEALTHY)
+    again = cli("start", *HEALTHY, "--force")
     for one in (said, again):
         assert f"{HEALTHY[1]}: " in one.out and "1 dropped (equal stamp))" in one.out
         assert f"{HEALTHY[2]}: " not in one.out.partition("may I rely")[0]

@@ -135,25 +135,22 @@ def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_pa
     assert np.allclose(table.columns["y"], 1.25 + np.arange(9)) and table.columns["z"].dtype == object
 
 
-def test_every_command_takes_them(tables, shipped, names, tmp_path, capsys):
+def test_every_command_takes_them(tables, shipped, names, tmp_path, cli):
     path, model, signals = str(tables[".csv"]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
-    assert main(["topics", path]) == 0
-    assert f"/table: {', '.join(names)}" in capsys.readouterr().out
+    assert f"/table: {', '.join(names)}" in cli("topics", path).out
     assert main(["init", path, "--output", str(tmp_path / "init.yaml")]) == 0
     SignalMap.load(tmp_path / "init.yaml")
     signals.write_text(signals_of(names, len(shipped.signals.states)))
     words = ["--signals", str(signals), "--output", model, "--criterion", "lp", "--alarm", "containment"]
     assert main(["fit", path, *words]) == 0
-    assert main(["check", model, path]) == 0
-    assert "100.000% inside all bounds" in capsys.readouterr().out
+    assert "100.000% inside all bounds" in cli("check", model, path).out
     cut = tmp_path / "cut.csv"
     cut.write_text(f"{tables['.csv'].read_text()}30.5,6")
-    assert main(["check", model, str(cut)]) == 0
-    assert "1 line with another number of cells left out" in capsys.readouterr().err
+    assert "1 line with another number of cells left out" in cli("check", model, cut).err
     assert main(["validate", model]) == 0
     assert main(["report", model, path, "--output", str(tmp_path / "r.html"), "-q"]) == 0
-    assert main(["check", model, path, "--write", str(tmp_path / "out.mcap")]) == 2
-    assert "a table, and only ROS recordings are copied; leave out --write" in capsys.readouterr().err
+    said = cli("check", model, path, "--write", tmp_path / "out.mcap", status=2).err
+    assert "a table, and only ROS recordings are copied; leave out --write" in said
     (expected,) = UncertainLTI.load(model).fit_summary["sources"]
     assert expected["file"] == path and len(expected["sha256"]) == 64
 
@@ -276,22 +273,19 @@ def many(tmp_path):
     return tmp_path / "many.csv"
 
 
-def test_runs_in_one_file_are_recordings(many, tmp_path, capsys):
+def test_runs_in_one_file_are_recordings(many, tmp_path, cli):
     runs = read_transients(many, tmp_path / "s.yaml")
     assert [Path(r.name).name for r in runs] == ["many.csv[3]", "many.csv[1]", "many.csv[2]"]
     assert [len(r) for r in runs] == [200] * 3 and not any(r.counters["equal stamp"] for r in runs)
     model = tmp_path / "m.model.json"
-    assert main(["fit", str(many), "--signals", str(tmp_path / "s.yaml"), "--output", str(model)]) == 0
-    assert "left out one recording at a time (3 recordings)" in capsys.readouterr().out
+    said = cli("fit", many, "--signals", tmp_path / "s.yaml", "--output", model).out
+    assert "left out one recording at a time (3 recordings)" in said
     loaded = UncertainLTI.load(model)
     assert loaded.signals.table == TableLayout("clock", "ms", "trial")
     assert len(loaded.fit_summary["sources"]) == 1 and loaded.fit_summary["transients"] == 3
-    assert main(["check", str(model), str(many)]) == 0
-    assert capsys.readouterr().out.count("199 verdicts") == 3
-    assert main(["check", str(model), f"{many}[1]"]) == 0
-    assert capsys.readouterr().out.count("199 verdicts") == 1
-    assert main(["validate", str(model)]) == 0
-    assert "(3 recordings)" in capsys.readouterr().out
+    assert cli("check", model, many).out.count("199 verdicts") == 3
+    assert cli("check", model, f"{many}[1]").out.count("199 verdicts") == 1
+    assert "(3 recordings)" in cli("validate", model).out
     assert main(["validate", str(model), "--group", r"name=\[(\d)\]"]) == 0
     cached = tmp_path / "c.model.json"
     words = ["--signals", str(tmp_path / "s.yaml"), "--output", str(cached), "--cache", str(tmp_path / "cache")]

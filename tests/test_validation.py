@@ -434,7 +434,7 @@ def test_fit_prints_and_stores_what_leaving_out_gives(folder):
     assert stored["kind"] == "transients" and stored["parts"] == 6 and len(stored["false_alarms"]) == 2
 
 
-def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
+def test_groups_of_a_fit_are_those_of_its_validation(folder, cli):
     """Folder, metadata and name group; what the fit was told, validate goes by."""
     bags = []
     for seed in range(6):
@@ -451,11 +451,8 @@ def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     model = str(folder / "grouped.json")
     command = ["fit", *map(str, bags), "--signals", str(folder / "signals.yaml"), "--output", model, "--force"]
     command += ["--criterion", "lp"]  # given, nothing is tried
-    capsys.readouterr()
-    assert main([*command]) == 0
-    assert "lie in 3 folders" in capsys.readouterr().out
-    assert main([*command, "--group", "metadata=machine"]) == 0
-    printed = capsys.readouterr().out
+    assert "lie in 3 folders" in cli(*command).out
+    printed = cli(*command, "--group", "metadata=machine").out
     assert "left out one group at a time (6 recordings in 3 groups, by metadata=machine)" in printed
     assert "lie in 3 folders" not in printed
     runs = uncertain_lti.read_transients(bags, folder / "signals.yaml")
@@ -464,8 +461,7 @@ def test_groups_of_a_fit_are_those_of_its_validation(folder, capsys):
     outside = uncertain_lti.read_transients(folder / "run0.mcap", folder / "signals.yaml")
     assert group_names([*outside, *runs], "folder") == [folder.name, *["day0", "day1", "day2"] * 2]
     assert group_names(runs, "name=_m(\\d)") == ["0", "1"] * 3 and group_names(runs, "name=_m") == ["_m"] * 6
-    assert main([*command, "--group", "metadata=pilot"]) == 2
-    said = capsys.readouterr().err
+    said = cli(*command, "--group", "metadata=pilot", status=2).err
     assert "no 'pilot' to group by; there is about/machine, machine" in said.splitlines()[-1]
 
 
