@@ -493,6 +493,14 @@ def put(data: dict[str, Any], place: str, value: Any) -> Any:
         ("alarm.latch", True, "unknown field 'alarm.latch'"),
         ("fit", [], "field 'fit' is not an object"),
         ("validation", "good", "field 'validation' is not an object"),
+        # what the arithmetic cannot carry
+        ("A.0.0", 1e300, r"field 'A' holds a number above 1e\+50"),
+        ("v.0", 1e200, r"field 'v' holds a number above 1e\+50"),
+        ("sampling.max_gap", 1e308, r"max_gap' is 1e\+308; it must be a positive number, at most 9e\+09"),
+        ("sampling.dt_median", 1e300, r"dt_median' is 1e\+300; it must be a positive number, at most 9e\+09"),
+        ("states.0.scale", 1e-320, r"scale is 1e-320; it must be .*, 1e-50 to 1e\+50"),
+        ("states.0.steady", 1e308, r"steady is 1e\+308; it must be .*, up to 1e\+50"),
+        ("alarm.margin", 1e308, r"margin is 1e\+308; it must be .*, 1e-50 to 1e\+50"),
     ],
 )
 def test_a_damaged_file_is_refused_by_file_and_field(place: str, value: Any, words: str, tmp_path: Path) -> None:
