@@ -9,8 +9,7 @@
 
 """Recordings of the published engine, written without ROS."""
 
-import numpy as np
-from bag_writer import Message, Topic, cdr, header, write
+from bag_writer import Message, Topic, joint_state, write
 
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC, transient
 
@@ -24,25 +23,13 @@ controls:
 """
 
 
-def joint_state(names, values, stamp_ns):
-    empty = np.empty(0)
-    return cdr(
-        "sensor_msgs/msg/JointState",
-        header=header(stamp_ns),
-        name=list(names),
-        position=np.array(values),
-        velocity=empty,
-        effort=empty,
-    )
-
-
 def engine_bag(path, steps=300, seed=1, change=lambda k, x: x, more=(), **run):
     """A run of the published engine as a bag, state before control at every instant, and topics with no message."""
     plant = transient(steps, seed, start_ns=10**18, **run)
     messages = []
     for k, t in enumerate(plant.t_ns.tolist()):
         x = change(k, plant.x[k])
-        messages.append(Message(STATE_TOPIC, t, joint_state(plant.state_names, x, t), t))
-        messages.append(Message(CONTROL_TOPIC, t, joint_state(plant.control_names, plant.u[k], t), t))
+        messages.append(Message(STATE_TOPIC, t, joint_state(t, x, plant.state_names), t))
+        messages.append(Message(CONTROL_TOPIC, t, joint_state(t, plant.u[k], plant.control_names), t))
     topics = [Topic(STATE_TOPIC, "sensor_msgs/msg/JointState"), Topic(CONTROL_TOPIC, "sensor_msgs/msg/JointState")]
     return write([*topics, *more], messages).save(path)

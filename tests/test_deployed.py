@@ -14,12 +14,10 @@ import json
 import numpy as np
 import perturbed
 import pytest
-from bag_writer import Message, Topic, float64, write
-from engine_bag import joint_state
+from bag_writer import Message, Topic, float64, joint_state, write
 from perturbed import GEAR as MODE
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
-from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.monitor.alarm import Arming, Condition
@@ -48,10 +46,10 @@ def messages_of(plant, modes=(), names=None):
     messages, hot = [], plant.state_names.index("turbine_exit_total_temperature")
     for k, t in enumerate(plant.t_ns.tolist()):
         messages += [Message(MODE, t - 1, float64(value), t - 1) for value in dict(modes).get(k, ())]
-        messages.append(Message("/engine/hot", t, joint_state(["temperature"], plant.x[k, [hot]], t), t))
-        state = joint_state(plant.state_names, plant.x[k], t) if names is None else names(k, t)
+        messages.append(Message("/engine/hot", t, joint_state(t, plant.x[k, [hot]], ["temperature"]), t))
+        state = joint_state(t, plant.x[k], plant.state_names) if names is None else names(k, t)
         messages += [Message(STATE, t, state, t)]
-        messages.append(Message(CONTROL, t, joint_state(plant.control_names, plant.u[k], t), t))
+        messages.append(Message(CONTROL, t, joint_state(t, plant.u[k], plant.control_names), t))
     return messages
 
 
@@ -67,12 +65,6 @@ def machine(tmp_path_factory):
     model = fit(read_transients(folder / "healthy.mcap", folder / "signals.yaml"), alarm_rule=AlarmRule(2, 5))
     model.save(folder / "m.model.json")
     return model, folder, messages
-
-
-def checked(folder, path, capsys, *words):
-    """Status of a check and what it says as JSON."""
-    status = main(["check", str(folder / "m.model.json"), str(path), "--json", *words])
-    return status, json.loads(capsys.readouterr().out)
 
 
 def alarms_of(data):
@@ -92,39 +84,36 @@ def live(model, messages, rule):
         {"enable": f"{STATE} position[fan_speed] > 0.01", "latch": True},
     ],
 )
-def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, options, capsys):
+def test_a_recording_is_judged_as_the_session_judges_its_messages(machine, options, cli):
     model, folder, messages = machine
     expected = live(model, messages, Rule(**options))
     words = [w for k, v in options.items() for w in ([f"--{k}"] if v is True else [f"--{k}", str(v)])]
-    status, data = checked(folder, folder / "run.mcap", capsys, *words)
-    assert alarms_of(data) == expected
     raised = [alarm for _, alarm in expected]
-    assert status == int(any(raised)) and 0 < sum(raised) < len(raised)
-    assert main(["report", str(folder / "m.model.json"), str(folder / "run.mcap"), "--json", *words]) == status
-    report = json.loads(capsys.readouterr().out)
+    data = cli.json("check", folder / "m.model.json", folder / "run.mcap", *words, status=1)
+    assert alarms_of(data) == expected and 0 < sum(raised) < len(raised)
+    report = cli.json("report", folder / "m.model.json", folder / "run.mcap", *words, status=1)
     assert report["recordings"][0]["alarms"] == data["recordings"][0]["alarms"]
     assert report["rule"]["conditions"] == data["deployed"]
 
 
 @pytest.mark.parametrize("enable", ["", f"{STATE} position[fan_speed] > 0.01", f"{STATE} position[gripper] > 0.5"])
-def test_messages_of_another_publisher_with_other_names_do_not_count(machine, enable, tmp_path, capsys):
+def test_messages_of_another_publisher_with_other_names_do_not_count(machine, enable, tmp_path, cli):
     """A gripper on the topic of the joints, in turn with them, first and last."""
     model, folder, messages = machine
     rng, mixed = np.random.default_rng(2), []
     for message in messages:
         mixed += [message] if message.topic != STATE or mixed else []
         t = message.log_time + int(rng.integers(0, 20_000_000))
-        mixed.append(Message(STATE, message.log_time, joint_state(["gripper"], [float(len(mixed) > 200)], t), t))
+        mixed.append(Message(STATE, message.log_time, joint_state(t, [float(len(mixed) > 200)], ["gripper"]), t))
     path = write(TOPICS, mixed).save(tmp_path / "two.mcap")
     expected = live(model, mixed, Rule(enable=enable))
     assert "gripper" in enable or expected == live(model, messages, Rule(enable=enable))
     assert 0 < sum(alarm for _, alarm in expected) < len(expected) > 290
-    status, data = checked(folder, path, capsys, "--enable", enable)
-    assert status == 1 and alarms_of(data) == expected
+    assert alarms_of(cli.json("check", folder / "m.model.json", path, "--enable", enable, status=1)) == expected
 
 
 @pytest.mark.parametrize("whole_model", [True, False])
-def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whole_model, tmp_path, capsys):
+def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whole_model, tmp_path, cli):
     model, folder, _ = machine
     other = model.replace(alarm=[AlarmRule(3, 4, 1.5), StatisticRule("energy", 0.5, 0.3)])
     other.save(tmp_path / "other.model.json")
@@ -133,28 +122,21 @@ def test_rules_of_a_file_are_judged_by_as_if_they_were_the_model_s(machine, whol
     else:
         given = tmp_path / "rules.json"
         given.write_text(json.dumps({"rules": [rule.to_dict() for rule in other.alarm]}))
-    before = (folder / "m.model.json").read_bytes()
-    run = [str(folder / "run.mcap"), "--json"]
-    said = []
-    for words in (["other.model.json"], ["m.model.json", "--rules", str(given)], ["m.model.json"]):
-        place = tmp_path if words[0].startswith("other") else folder
-        status = main(["check", str(place / words[0]), *run, *words[1:]])
-        data = json.loads(capsys.readouterr().out)
-        said.append((status, data["recordings"]))
+    mine, run = folder / "m.model.json", folder / "run.mcap"
+    before, words = mine.read_bytes(), ([tmp_path / "other.model.json"], [mine, "--rules", given], [mine])
+    said = [cli.json("check", model, run, *more, status=1)["recordings"] for model, *more in words]
     assert said[0] == said[1] != said[2]
-    assert (folder / "m.model.json").read_bytes() == before
-    assert main(["report", str(folder / "m.model.json"), *run, "--rules", str(given)]) == said[0][0]
-    report = json.loads(capsys.readouterr().out)
-    assert report["recordings"][0]["alarms"] == said[0][1][0]["alarms"]
+    assert mine.read_bytes() == before
+    report = cli.json("report", mine, run, "--rules", given, status=1)
+    assert report["recordings"][0]["alarms"] == said[0][0]["alarms"]
 
 
-def test_from_and_to_judge_that_time_alone(machine, capsys):
+def test_from_and_to_judge_that_time_alone(machine, cli):
     model, folder, _ = machine
     name = [str(folder / "m.model.json"), str(folder / "run.mcap")]
     (run,) = read_transients(folder / "run.mcap", model.signals)
     whole = EnvelopeMonitor(model).check(run)
-    assert main(["check", *name, "--from", "1.0", "--to", "1.5", "--json"]) == 3  # outside the fitted domain
-    data = json.loads(capsys.readouterr().out)["recordings"][0]
+    data = cli.json("check", *name, "--from", 1.0, "--to", 1.5, status=3)["recordings"][0]  # outside the fitted domain
     inside = (run.t >= 1.0) & (run.t <= 1.5)
     first = int(np.flatnonzero(inside)[0])
     assert data["verdicts"] == inside.sum() - 1
@@ -165,8 +147,7 @@ def test_from_and_to_judge_that_time_alone(machine, capsys):
     k = first + 5
     assert data["verdict_per_sample"][k]["lower"] == whole.lower[k].tolist()  # the time of a row stays its own
     assert data["verdict_per_sample"][k]["t_ns"] == run.t_ns[k]
-    assert main(["check", *name, "--from", "3.0"]) == 1
-    said = capsys.readouterr().out
+    said = cli("check", *name, "--from", "3.0", status=1).out
     assert "from 3 s" in said and "first at" in said
     first_alarm = float(said.split("first at ")[1].split()[0])
     assert first_alarm >= 3.0
@@ -199,15 +180,14 @@ def test_from_a_time_on_the_condition_is_the_last_that_was_heard(values):
         (["--rules", "odd.json"], "odd.json: field 'alarm.rules[0].kind' is 'median'"),
     ],
 )
-def test_what_cannot_be_deployed_is_refused(machine, options, words, capsys, tmp_path, monkeypatch):
+def test_what_cannot_be_deployed_is_refused(machine, options, words, cli, tmp_path, monkeypatch):
     _, folder, _ = machine
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty.json").write_text("[]")
     (tmp_path / "odd.json").write_text('{"rules": [{"kind": "median", "window_s": 1.0, "threshold": 1.0}]}')
     far = {"kind": "mean", "window_s": 1.0, "threshold": 1.0, "horizon": 50}
     (tmp_path / "far.json").write_text(json.dumps({"rules": [far]}))
-    assert main(["check", str(folder / "m.model.json"), str(folder / "run.mcap"), *options]) == 2
-    said = capsys.readouterr().err
+    said = cli("check", folder / "m.model.json", folder / "run.mcap", *options, status=2).err
     assert words in said and said.count("\n") == 1, said
 
 
@@ -223,7 +203,7 @@ def test_a_looped_recording_starts_the_grace_over():
     assert armed.cleared.tolist() == [True, False, False, True]  # it went off and on between two samples
 
 
-def test_of_a_name_that_is_there_twice_the_first_counts_live_and_offline(machine, tmp_path, capsys):
+def test_of_a_name_that_is_there_twice_the_first_counts_live_and_offline(machine, tmp_path, cli):
     """With names that move from one message to the next, and a condition on another topic."""
     model, folder, _ = machine
     rng, plant, first = np.random.default_rng(1), transient(200, 2, start_ns=10**18), []
@@ -233,12 +213,12 @@ def test_of_a_name_that_is_there_twice_the_first_counts_live_and_offline(machine
         order = rng.permutation([*range(n), *rng.integers(0, n, 2)])
         x = plant.x[k][order] + 1e-4 * np.arange(n + 2)  # of places, not of names
         first.append(x[order.tolist().index(plant.state_names.index("fan_speed"))])
-        return joint_state([plant.state_names[i] for i in order], x, t)
+        return joint_state(t, x, [plant.state_names[i] for i in order])
 
     messages = messages_of(plant, {0: [3]}, moving)
     path = write(TOPICS, messages).save(tmp_path / "twice.mcap")
     condition = f"{MODE} data > 1"
-    _, data = checked(folder, path, capsys, "--enable", condition)
+    data = cli.json("check", folder / "m.model.json", path, "--enable", condition, status=1)
     assert alarms_of(data) == live(model, messages, Rule(enable=condition))
     read = read_transients([path], folder / "signals.yaml")[0]
     assert read.x[:, 0].tolist() == first[: len(read)]

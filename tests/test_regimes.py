@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import Message, Topic, cdr, write
-from engine_bag import joint_state
+from bag_writer import Message, Topic, cdr, joint_state, write
 from test_pages import needs_nothing_else
 from test_schedule import GEAR, SPEED
 from test_schedule import scheduled as by_hand
@@ -98,8 +97,8 @@ def recording(path: Path, strange: bool = False) -> Path:
     messages = []
     for k, t in enumerate((START + STEP * np.arange(COUNT)).tolist()):
         messages.append(Message("/gear", t, cdr("std_msgs/msg/Float64", data=float(gear[k])), t))
-        messages.append(Message("/control", t, joint_state(["c"], u[k], t), t))
-        messages.append(Message("/state", t, joint_state(["speed", "b"], x[k], t), t + 1))
+        messages.append(Message("/control", t, joint_state(t, u[k], ["c"]), t))
+        messages.append(Message("/state", t, joint_state(t, x[k], ["speed", "b"]), t + 1))
     types = {"/state": "sensor_msgs/msg/JointState", "/control": "sensor_msgs/msg/JointState"}
     topics = [Topic(name, kind) for name, kind in {**types, "/gear": "std_msgs/msg/Float64"}.items()]
     return Path(write(topics, messages).save(path))
