@@ -311,9 +311,9 @@ def decoders() -> tuple[Callable[[str], Any], Callable[[str, Any], MessageReader
     return type_fields, reader
 
 
-def session_of(model: UncertainLTI, rule: Rule, **options: Any) -> Session:
+def session_of(model: UncertainLTI, rule: Rule, now: float = 0.0, **options: Any) -> Session:
     type_fields, reader = decoders()
-    session = Session(model, rule, topic_types(model, "the model", type_fields), type_fields, reader, 0.0, **options)
+    session = Session(model, rule, topic_types(model, "the model", type_fields), type_fields, reader, now, **options)
     if rule.enable and not session.enable_type:
         session.found_enable_type(KIND[session.enable_topic])
     return session

@@ -19,18 +19,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from perturbed import session_of
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
-from rclpy.serialization import deserialize_message
 from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, float64, joint_state, vector
 
-from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule, Session, topic_types
-from uncertain_lti.recordings.message_reader import MessageReader
-from uncertain_lti_ros.topics import live_fields, message_class
+from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule
 
 TIMEOUT = 1.0
 STEP = STEP_NS * 1e-9
@@ -51,12 +49,7 @@ class Rig:
         self.watch(model, Rule(**rule))
 
     def watch(self, model: UncertainLTI, rule: Rule) -> None:
-        def reader(type_name: str, paths: Any) -> MessageReader:
-            kind = message_class(type_name)
-            return MessageReader(type_name, paths, live_fields, lambda data: deserialize_message(data, kind))
-
-        types = topic_types(model, "by hand", live_fields)
-        self.session = Session(model, rule, types, live_fields, reader, self.now, catch_up=0.0)
+        self.session = session_of(model, rule, self.now, catch_up=0.0)
         self.event_log.begin(self.session, self.now)
 
     def take(self, topic: str, data: bytes) -> None:
