@@ -308,8 +308,8 @@ class Sends:
             monotonic=lambda: self.now, thread_time=lambda: self.used, time_ns=time.time_ns, sleep=time.sleep
         )
         monkeypatch.setattr(its_module, "time", clock)
-        self.model = stream_cases.saved(tmp_path / "m.json", 2, np.random.default_rng(5))
-        self.node = stream_cases.Node(tmp_path / "m.json")
+        self.model = by_hand(alarm_rule=AlarmRule(3, 20))
+        self.node = stream_cases.Node(saved(self.model, tmp_path))
         self.sender = self.node.outputs.sender
         self.sent: Counter[str] = Counter()
         self.alarms = [False]
@@ -327,11 +327,11 @@ class Sends:
 
         return send
 
-    def run(self, messages: int, step: float = 5e-4) -> int:
-        """Verdicts on so many messages; each change of the alarm is published at once."""
-        for arrival, topic, data in stream_cases.stream(self.model, np.random.default_rng(6), messages, 0.02):
+    def run(self, samples: int, step: float = 5e-4) -> int:
+        """Verdicts on so many samples; each change of the alarm is published at once."""
+        for message in stream_cases.stream(self.model, samples):
             self.now += step
-            self.node.arrive(arrival, topic, data)
+            self.node.arrive(*message)
             assert self.alarms[-1] == self.node.session.alarm
         return int(self.node.session.verdicts)
 

@@ -19,28 +19,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import perturbed
 import pytest
+from bag_writer import joint_state
+from perturbed import Disorder
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import rclpy
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from rclpy.serialization import serialize_message
 from ros_processes import own_domain
 from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from test_live import EPOCH_NS, JOINT_STATE, STATE, STEP_NS, by_hand, saved
 
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.base.arrays import LONGEST_S
-from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti_ros import envelope_monitor as node_module
-
-STATE, CONTROL, SETPOINT = "/state", "/control", "/setpoint"
-VECTOR, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
-START_NS, STEP_NS = 10**18, 10_000_000
 
 
 class Input:
@@ -127,49 +124,10 @@ def end(nodes: list[Node]) -> None:
         node.destroy_node()
 
 
-def saved(path: Path, n: int, rng: np.random.Generator) -> UncertainLTI:
-    """n states; two controls by stamps, one by arrival; bounds that the signals of `stream` seldom leave."""
-    m, steady, scale = 3, rng.normal(size=n + 3), rng.uniform(0.5, 2.0, n + 3)
-    kinds = [(f"x{i}", STATE, VECTOR, f"position[x{i}]", None) for i in range(n)]
-    kinds += [("u0", CONTROL, VECTOR, "position[u0]", 0.08), ("u1", CONTROL, VECTOR, "position[u1]", None)]
-    kinds += [("w", SETPOINT, ARRAY, "data[1]", 0.3)]
-    every = tuple(
-        Signal(name, topic, path, float(steady[k]), float(scale[k]), type=kind, max_hold=hold)
-        for k, (name, topic, kind, path, hold) in enumerate(kinds)
-    )
-    time = {STATE: "header", CONTROL: "header", SETPOINT: "log"}
-    model = UncertainLTI(
-        rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.uniform(0, 0.3, (n, n)), rng.uniform(0, 0.3, (n, m)),
-        c=rng.normal(size=n), dc=rng.uniform(0, 0.1, n), v=rng.uniform(0.3, 0.5, n),
-        signals=SignalMap(every[:n], every[n:], clock=STATE, max_gap=0.055, min_step=0.002, time=time),
-        sampling=Sampling(0.01), alarm_rule=AlarmRule(3, 20),
-    )  # fmt: skip
-    model.save(path)
-    return model
-
-
-def vector(t_ns: int, values: dict[str, float]) -> bytes:
-    message = JointState(name=list(values), position=list(values.values()))
-    message.header.stamp.sec, message.header.stamp.nanosec = divmod(t_ns, 10**9)
-    return serialize_message(message)
-
-
-def stream(
-    model: UncertainLTI, rng: np.random.Generator, count: int, outside: float = 0.0
-) -> Iterator[tuple[int, str, bytes]]:
-    """Arrival, topic and message; `outside`: how often a state leaves its bounds."""
-    n, point = model.n, model.operating_point
-    for k in range(count):
-        t = START_NS + k * STEP_NS
-        x = point.x_s + point.X * rng.normal(0, 0.05, n)
-        u = point.u_s[:2] + point.U[:2] * rng.normal(0, 0.05, 2)
-        if rng.random() < outside:
-            x[rng.integers(n)] += 5.0
-        if k % 5 == 0:
-            setpoint = Float64MultiArray(data=(0.0, point.steady[n + 2] + rng.normal(0, 0.1), 1.0))
-            yield t - 500_000, SETPOINT, serialize_message(setpoint)
-        yield t - 200_000, CONTROL, vector(t, {"u0": u[0], "u1": u[1]})
-        yield t, STATE, vector(t, {f"x{i}": x[i] for i in range(n)})
+def stream(model: UncertainLTI, samples: int) -> list[tuple[int, str, bytes]]:
+    """Arrival, topic and message, in order and whole; states leave their bounds now and then."""
+    sent = perturbed.stream(model, np.random.default_rng(11), samples, Disorder(order=False, time=False))
+    return [(m.log_time, m.topic, m.data) for m in sent if m.topic in model.signals.topics]
 
 
 def played(path: Path, messages: Sequence[Any]) -> Node:
@@ -185,15 +143,14 @@ def played(path: Path, messages: Sequence[Any]) -> Node:
 
 
 def test_an_output_that_fails_is_reported_and_the_node_goes_on(ros: None, tmp_path: Path) -> None:
-    rng = np.random.default_rng(6)
-    model = saved(tmp_path / "model.json", 3, rng)
-    node = Node(tmp_path / "model.json")
+    model = by_hand()
+    node = Node(saved(model, tmp_path))
 
     def fail(data: bytes) -> None:
         raise RuntimeError("the publisher is gone")
 
     kept = node.outputs.publishers["upper"].send
-    for k, message in enumerate(stream(model, rng, 60)):
+    for k, message in enumerate(stream(model, 60)):
         if k == 60:
             node.outputs.publishers["upper"].send = fail
             node.outputs.sender.changed()
@@ -208,13 +165,12 @@ def test_an_output_that_fails_is_reported_and_the_node_goes_on(ros: None, tmp_pa
 
 def at_work(folder: Path) -> tuple[Node, tuple[int, str, bytes]]:
     """A node that has judged a stream, and the message that comes next."""
-    rng = np.random.default_rng(6)
-    model = saved(folder / "model.json", 3, rng)
-    node = Node(folder / "model.json")
-    *messages, last = stream(model, rng, 60)
+    model = by_hand()
+    node = Node(saved(model, folder))
+    *messages, last = stream(model, 62)
     for message in messages:
         node.arrive(*message)
-    assert node.session.verdicts > 40
+    assert node.session.verdicts > 40 and last[1] == STATE
     return node, last
 
 
@@ -243,32 +199,29 @@ def test_a_node_that_is_put_away_leaves_nothing(ros: None, tmp_path: Path) -> No
 
 def test_the_shortest_messages_are_taken(ros: None, tmp_path: Path) -> None:
     """A UInt8 takes five bytes; rclpy sends eight of them, others need not."""
-    level = Signal("u", SETPOINT, "data", type="std_msgs/msg/UInt8")
+    level = Signal("u", "/level", "data", type="std_msgs/msg/UInt8")
     signals = SignalMap(
-        (Signal("x0", STATE, "position[x0]", type=VECTOR),), (level,), clock=STATE, max_gap=0.055,
-        time={STATE: "header", SETPOINT: "log"},
+        (Signal("a", STATE, "position[a]", type=JOINT_STATE),), (level,), clock=STATE, max_gap=0.055,
+        time={STATE: "header", "/level": "log"},
     )  # fmt: skip
-    sampling = Sampling(0.01)
-    UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[1.0], signals=signals, sampling=sampling).save(
-        tmp_path / "model.json"
-    )
+    model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[1.0], signals=signals, sampling=Sampling(0.01))
     messages: list[Any] = []
     for k in range(60):
-        at = START_NS + k * STEP_NS
-        messages += [(at, SETPOINT, bytes([0, 1, 0, 0, k])), (at, STATE, vector(at, {"x0": 3.0 * (k % 7 == 0)})), None]
-    node = played(tmp_path / "model.json", messages)
+        at, value = EPOCH_NS + k * STEP_NS, 3.0 * (k % 7 == 0)
+        messages += [(at, "/level", bytes([0, 1, 0, 0, k])), (at, STATE, joint_state(at, [value], ["a"])), None]
+    node = played(saved(model, tmp_path), messages)
     assert node.verdicts == 59 and not node.failures.count and node.sent
 
 
 @pytest.mark.parametrize("name", ["max_hold", "max_gap", "dt_median"])
 def test_durations_without_end_are_as_good_as_others(ros: None, tmp_path: Path, name: str) -> None:
-    rng = np.random.default_rng(10)
-    model = saved(tmp_path / "model.json", 3, rng)
-    content = json.loads((tmp_path / "model.json").read_text())
+    model = by_hand()
+    path = saved(model, tmp_path)
+    content = json.loads(path.read_text())
     if name == "max_hold":
         content["controls"][0][name] = LONGEST_S
     else:
         content["sampling"][name] = LONGEST_S
-    (tmp_path / "model.json").write_text(json.dumps(content))
-    node = played(tmp_path / "model.json", [*stream(model, rng, 60), None])
+    path.write_text(json.dumps(content))
+    node = played(path, [*stream(model, 60), None])
     assert not node.failures.count and node.verdicts > 0
