@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""What keeps tests apart: the processes of one are ended with it, and its ROS domain is its own meanwhile."""
+"""What keeps tests apart: the processes of one are ended with it, and its ROS domain is its own meanwhile; limits."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import random
 import signal
 import sys
 import time
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -126,3 +127,21 @@ def _kill_tree(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
     for child in below:
         _kill_tree(child)
+
+
+@contextmanager
+def bounded(seconds: float, memory: float = 0) -> Iterator[None]:
+    """Hold what is done to so many s of processor time, and to so many bytes of memory where a number is given."""
+    begin = time.process_time()
+    if not memory:
+        yield
+        assert time.process_time() - begin < seconds
+        return
+    tracemalloc.start()
+    try:
+        yield
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert time.process_time() - begin < seconds
+    assert peak < memory

@@ -11,13 +11,13 @@
 
 import math
 import random
-import time
 from datetime import datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 import pytest
+from processes import bounded
 
 from uncertain_lti import SignalMap, UncertainLTI, read_transients
 from uncertain_lti.base.errors import BagError, SignalError
@@ -477,9 +477,8 @@ def test_equal_names_do_not_take_for_ever(tmp_path):
     number = 3000
     rows = [",".join([str(i)] * (number + 1)) for i in range(3)]
     path = write(tmp_path / "a.csv", ",".join(["time"] + ["x"] * number), *rows)
-    begin = time.process_time()
-    assert len(Table(path).columns_by_field) == number
-    assert time.process_time() - begin < 5
+    with bounded(seconds=5):
+        assert len(Table(path).columns_by_field) == number
 
 
 def test_a_small_parquet_that_expands_is_refused(tmp_path):
