@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -19,12 +18,12 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writer import Message, Topic, cdr, joint_state, write
+from conftest import Command
 from test_pages import needs_nothing_else
 from test_schedule import GEAR, SPEED
 from test_schedule import scheduled as by_hand
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.cli.main import main
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
@@ -109,21 +108,13 @@ def case(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
-def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str]:
-    status = main([str(a) for a in arguments])
-    captured = capsys.readouterr()
-    assert status in (0, 1), captured.err
-    return status, captured.out
-
-
 # --- commands ----------------------------------------------------------------------------------------------------
 
 
-def test_info_shows_every_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_shows_every_regime(case: str, tmp_path: Path, cli: Command) -> None:
     model = model_of(case)
     model.save(tmp_path / "m.json")
-    status, text = run(capsys, "info", tmp_path / "m.json")
-    assert status == 0
+    text = cli("info", tmp_path / "m.json").out
     for r in range(len(model.blocks)):
         assert model.block_name(r) in text
     assert "0, not visited" in text and "time constants [s]" in text and "b: mean width" in text
@@ -131,8 +122,7 @@ def test_info_shows_every_regime(case: str, tmp_path: Path, capsys: pytest.Captu
     assert f"{model.block_name(len(model.blocks) - 1)} (as {model.block_name(1)})" in text
     for name in model.signals.signals:
         assert name.name in text
-    status, text = run(capsys, "info", tmp_path / "m.json", "--json")
-    data = json.loads(text)
+    data = cli.json("info", tmp_path / "m.json")
     regimes = data.pop("regimes")
     assert UncertainLTI.from_dict(data).to_dict() == model.to_dict()
     assert [r["regime"] for r in regimes] == [model.block_name(r) for r in range(len(model.blocks))]
@@ -144,13 +134,12 @@ def test_info_shows_every_regime(case: str, tmp_path: Path, capsys: pytest.Captu
     assert regimes[0]["mean_width"] is None and regimes[1]["mean_width"] == [2 * 1.1, 0.2]
 
 
-def test_check_counts_by_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_counts_by_regime(case: str, tmp_path: Path, cli: Command) -> None:
     model = model_of(case)
     model.save(tmp_path / "m.json")
     bag = recording(tmp_path / "strange.mcap", strange=True)
-    _, text = run(capsys, "check", tmp_path / "m.json", bag)
-    _, out = run(capsys, "check", tmp_path / "m.json", bag, "--json")
-    (data,) = json.loads(out)["recordings"]
+    text = cli("check", tmp_path / "m.json", bag, status=1).out
+    (data,) = cli.json("check", tmp_path / "m.json", bag, status=1)["recordings"]
     here = data["regimes"]
     assert len(here) == len(model.blocks)
     assert sum(r["verdicts"] for r in here) == data["verdicts"] and sum(r["violated"] for r in here) == data["violated"]
@@ -178,12 +167,12 @@ def test_check_counts_by_regime(case: str, tmp_path: Path, capsys: pytest.Captur
     assert f"no recording visited {model.block_name(0)}" in words
 
 
-def test_the_report_has_every_regime(case: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_report_has_every_regime(case: str, tmp_path: Path, cli: Command) -> None:
     model = model_of(case)
     model.save(tmp_path / "m.json")
     bags = [recording(tmp_path / "run.mcap"), recording(tmp_path / "strange.mcap", strange=True)]
     out = tmp_path / "page.html"
-    run(capsys, "report", tmp_path / "m.json", *bags, "--output", out)
+    cli("report", tmp_path / "m.json", *bags, "--output", out, status=1)
     page = needs_nothing_else(out.read_text(encoding="utf-8"))
     text = "".join(page.text)
     for r in range(len(model.blocks)):
@@ -191,8 +180,7 @@ def test_the_report_has_every_regime(case: str, tmp_path: Path, capsys: pytest.C
     assert "0, not visited" in text
     for signal in model.signals.scheduling:
         assert "scheduling" in text and signal.name in text
-    _, printed = run(capsys, "report", tmp_path / "m.json", *bags, "--json")
-    facts = json.loads(printed)
+    facts = cli.json("report", tmp_path / "m.json", *bags, status=1)
     assert len(facts["model"]["regimes"]) == len(model.blocks)
     reasons = [r for r in facts["rely"]["reasons"] if r["about"] == "regimes"]
     assert any("no recording visited" in r["text"] for r in reasons)

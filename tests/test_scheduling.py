@@ -253,14 +253,15 @@ def folder(engine_copy):
     return engine_copy
 
 
-def command(folder, *more):
-    arguments = ["fit", str(folder / "run.mcap"), "--signals", str(folder / "signals.yaml")]
-    return main([*arguments, "--output", str(folder / "m.model.json"), "--additive", "noise", *more])
+@pytest.fixture
+def command(folder, cli):
+    """`fit` of that recording."""
+    words = ["fit", folder / "run.mcap", "--signals", folder / "signals.yaml", "--output", folder / "m.model.json"]
+    return lambda *more: cli(*words, "--additive", "noise", *more).out
 
 
-def test_the_command_prints_the_table_and_the_reason(folder, capsys):
-    assert command(folder, "--schedule", "fan=auto") == 0
-    printed = capsys.readouterr().out
+def test_the_command_prints_the_table_and_the_reason(folder, command):
+    printed = command("--schedule", "fan=auto")
     assert "knots on fan, by leaving out one block of 10 at a time" in printed
     assert "1 (chosen)" in printed and "note: schedule: 1 knot on fan" in printed
     assert UncertainLTI.load(folder / "m.model.json").schedule is None
@@ -273,9 +274,8 @@ def test_the_modes_of_a_flag_may_be_true_and_false():
         _schedule("on=false,true")
 
 
-def test_the_command_takes_knots_and_validate_keeps_them(folder, capsys):
-    assert command(folder, "--schedule", "fan=-0.1,0,0.1", "--json") == 0
-    assert len(json.loads(capsys.readouterr().out)["fit"]["blocks"]) == 3
+def test_the_command_takes_knots_and_validate_keeps_them(folder, command):
+    assert len(json.loads(command("--schedule", "fan=-0.1,0,0.1", "--json"))["fit"]["blocks"]) == 3
     model = UncertainLTI.load(folder / "m.model.json")
     assert model.schedule.blocks == 3
     assert main(["validate", str(folder / "m.model.json"), "--output", str(folder / "v.model.json")]) == 0
@@ -283,10 +283,10 @@ def test_the_command_takes_knots_and_validate_keeps_them(folder, capsys):
     assert again.schedule == model.schedule
 
 
-def test_the_signals_file_asks_for_a_schedule(folder):
+def test_the_signals_file_asks_for_a_schedule(folder, command):
     with open(folder / "signals.yaml", "a") as file:
         file.write("schedule: [{signal: fan, knots: auto}]\n")
-    assert command(folder) == 0
+    command()
     model = UncertainLTI.load(folder / "m.model.json")
     assert model.fit_summary["schedule"][0]["signal"] == "fan"
     assert main(["validate", str(folder / "m.model.json")]) == 0
