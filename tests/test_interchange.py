@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from test_schedule import scheduled
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients, validate
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
@@ -282,22 +283,13 @@ def test_a_value_of_another_type_is_refused_with_a_sentence(call, why):
 # --- scheduled models -------------------------------------------------------------------------------------------
 
 
-def scheduled_model(axes, further=(), n=2, m=1, seed=4):
-    rng = np.random.default_rng(seed)
-    schedule = Schedule(axes)
-    R = schedule.blocks
-    names = [f"x{i}" for i in range(n)]
-    states = tuple(Signal(name, "", "x", i + 1.0, 2.3 + i, "rpm") for i, name in enumerate(names))
-    controls = tuple(Signal(f"u{j}", "", "u", -1.0, 0.5 + j, "") for j in range(m))
-    signals = SignalMap(states, controls, tuple(Signal(name, "", "s", 0.1, 0.7, "K") for name in further))
-    return UncertainLTI(
-        rng.normal(size=(R, n, n)), rng.normal(size=(R, n, m)), rng.random((R, n, n)), rng.random((R, n, m)),
-        rng.normal(size=(R, n)), rng.random((R, n)), rng.random((R, n)), schedule=schedule, signals=signals,
-        block_data=[BlockData(None if r == 1 else r, 0 if r == 2 else None) for r in range(R)],
-    )  # fmt: skip
+def scheduled_model(axes, further=(), n=2, m=1):
+    model = scheduled(np.random.default_rng(4), Schedule(axes), further, n, m)
+    data = [BlockData(None if r == 1 else r, 0 if r == 2 else None) for r in range(model.schedule.blocks)]
+    return model.replace(block_data=data)
 
 
-KNOTS, GEAR = Axis("x0", knots=(-0.3, 0.1, 0.77)), Axis("gear", modes=(1.0, 2.0))
+KNOTS, GEAR = Axis("speed", knots=(-0.3, 0.1, 0.77)), Axis("gear", modes=(1.0, 2.0))
 ONE_MODE = Axis("gear", modes=(3.0,))
 SCHEDULES = [((KNOTS,), (), 1, 1), ((KNOTS, GEAR), ("gear",), 2, 0), ((ONE_MODE,), ("gear",), 2, 1)]
 
@@ -308,15 +300,15 @@ def test_a_scheduled_model_is_one_system_per_block_and_one_at_a_point():
     assert len(systems) == 3
     for r, system in enumerate(systems):
         assert np.allclose(system.A, np.eye(2) + 0.02 * model.A[r])
-        assert list(system.input_labels) == ["u0", "disturbance"]
+        assert list(system.input_labels) == ["c", "disturbance"]
         again = UncertainLTI.from_control(system, dA=model.dA[r], dB=model.dB[r], signals=model.signals)
         assert np.allclose(again.A, model.A[r]) and np.allclose(again.c, model.c[r])
     low, high = (np.hstack([s.A, s.B]) for s in systems[:2])
-    middle = model.at(x0=1.0 + 2.3 * -0.1).to_control(0.02)  # half way from one knot to the next
+    middle = model.at(speed=3.0 + 2.0 * -0.1).to_control(0.02)  # half way from one knot to the next
     assert np.allclose(np.hstack([middle.A, middle.B]), (low + high) / 2)
     assert np.array_equal(model.to_control(0.02, knot=1).A, systems[1].A)
     calm = model.replace(c=np.where(np.arange(3)[:, None] == 1, model.c, 0.0))
-    assert [list(s.input_labels) for s in calm.to_control()] == [["u0", "disturbance"]] * 3
+    assert [list(s.input_labels) for s in calm.to_control()] == [["c", "disturbance"]] * 3
     for knot in (-1, 3):
         with pytest.raises(ModelError, match="blocks 0 to 2"):
             model.to_control(knot=knot)
@@ -354,12 +346,12 @@ def test_what_was_changed_of_a_schedule_in_matlab_counts(tmp_path):
     model.save_mat(tmp_path / "m.mat")
     data = {k: v for k, v in scipy_io.loadmat(tmp_path / "m.mat").items() if not k.startswith("__")}
     data["dA"][0, 1, 2] = 9.0
-    data["schedule_values"][0, 0][1] = 1.5
+    data["schedule_values"][0, 0][1] = 3.2
     scipy_io.savemat(tmp_path / "m.mat", data)
     again = UncertainLTI.load_mat(tmp_path / "m.mat")
     assert again.dA[2, 0, 1] == 9.0 and np.array_equal(again.A, model.A)
     knots = again.schedule.axes[0].knots
-    assert knots[0] == KNOTS.knots[0] and knots[2] == KNOTS.knots[2] and np.isclose(knots[1], 0.5 / 2.3)
+    assert knots[0] == KNOTS.knots[0] and knots[2] == KNOTS.knots[2] and np.isclose(knots[1], (3.2 - 3.0) / 2.0)
 
 
 @pytest.mark.parametrize(

@@ -18,28 +18,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from steps import steps_of
+from test_model import random_model
 
-from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
-from uncertain_lti.signals.signal_map import Signal
 
 
 def a_model(n: int, m: int, seed: int, **options: Any) -> UncertainLTI:
-    rng = np.random.default_rng(seed)
-    spread = 10.0 ** rng.integers(-6, 7, n + m)  # sums whose last bits depend on their order
-    signals = SignalMap(
-        tuple(Signal(f"x{i}", "", f"x{i}", *rng.uniform(0.1, 2, 2)) for i in range(n)),
-        tuple(Signal(f"u{j}", "", f"u{j}", *rng.uniform(0.1, 2, 2)) for j in range(m)),
-    )
-    return UncertainLTI(
-        rng.normal(size=(n, n)) * spread[:n], rng.normal(size=(n, m)) * spread[n:],
-        rng.uniform(0, 1, (n, n)) * spread[:n], rng.uniform(0, 1, (n, m)) * spread[n:],
-        rng.normal(size=n), rng.uniform(0, 1, n), rng.uniform(0, 1, n), signals=signals, **options,
-    )  # fmt: skip
+    return random_model(np.random.default_rng(seed), n, m).replace(**options)
 
 
 def judge(monitor: EnvelopeMonitor, transient: Transient, **options: Any) -> list[Any]:
@@ -117,20 +107,11 @@ def cases(draw: st.DrawFn) -> tuple[UncertainLTI, Transient]:
     z[rng.uniform(size=z.shape) < draw(st.sampled_from([0.0, 0.05]))] = draw(st.sampled_from([math.nan, math.inf]))
     window = draw(st.integers(1, 6))
     box = Domain(np.full(n, -1.0), np.full(n, 1.0), np.full(m, -1.0), np.full(m, 1.0))
-    signals = SignalMap(
-        tuple(Signal(f"x{i}", "/c", f"x{i}", float(rng.normal()), float(rng.uniform(0.5, 2))) for i in range(n)),
-        tuple(Signal(f"u{j}", "/c", f"u{j}", float(rng.normal()), float(rng.uniform(0.5, 2))) for j in range(m)),
-        clock="/c",
-        max_gap=0.05,
-        time={"/c": "header"},
-    )
-    model = UncertainLTI(
-        rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.uniform(0, 30, (n, n)), rng.uniform(0, 30, (n, m)),
-        rng.normal(size=n), rng.uniform(0, 20, n), rng.uniform(0, 1, n),
-        signals=signals, domain=draw(st.sampled_from([box, None])),
+    model = random_model(rng, n, m).replace(
+        domain=draw(st.sampled_from([box, None])),
         alarm_rule=AlarmRule(draw(st.integers(1, window)), window, draw(st.sampled_from([1.0, 0.5, 3.0]))),
-    )  # fmt: skip
-    return model, Transient(t, z[:, :n], z[:, n:], signals=signals, max_gap=0.05)
+    )
+    return model, Transient(t, z[:, :n], z[:, n:], signals=model.signals, max_gap=0.05)
 
 
 @settings(max_examples=80)

@@ -86,16 +86,18 @@ def test_what_is_no_schedule_is_refused_by_name(make: object, words: str) -> Non
         make()  # type: ignore[operator]
 
 
-def scheduled(rng: np.random.Generator, schedule: Schedule, further: tuple[str, ...] = ()) -> UncertainLTI:
-    """Two states, one control."""
+def scheduled(
+    rng: np.random.Generator, schedule: Schedule, further: tuple[str, ...] = (), n: int = 2, m: int = 1
+) -> UncertainLTI:
+    """One or two states, a control or none."""
     R = schedule.blocks
     signals = SignalMap(
-        (Signal("speed", "", "a", steady=3.0, scale=2.0), Signal("b", "", "b")),
-        (Signal("c", "", "c"),),
+        (Signal("speed", "", "a", steady=3.0, scale=2.0), Signal("b", "", "b"))[:n],
+        (Signal("c", "", "c"),)[:m],
         tuple(Signal(name, "", name) for name in further),
     )
-    half = [np.abs(rng.normal(size=s)) for s in ((R, 2, 2), (R, 2, 1), (R, 2), (R, 2))]
-    nominal = [rng.normal(size=s) for s in ((R, 2, 2), (R, 2, 1), (R, 2))]
+    half = [np.abs(rng.normal(size=s)) for s in ((R, n, n), (R, n, m), (R, n), (R, n))]
+    nominal = [rng.normal(size=s) for s in ((R, n, n), (R, n, m), (R, n))]
     return UncertainLTI(
         nominal[0], nominal[1], half[0], half[1], nominal[2], half[2], half[3], schedule=schedule, signals=signals,
         block_data=[BlockData(r, None if r else 1) for r in range(R)],
