@@ -7,12 +7,15 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Transients as the steps that a sampler gives, for what is judged one by one."""
+"""Transients and the steps that a sampler gives: the one as the other, and the one held against the other."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.transient import Transient
 
@@ -27,3 +30,14 @@ def steps_of(transient: Transient) -> list[Step]:
         dt = (transient.t_ns[k] - transient.t_ns[k - 1]) * 1e-9 if k else float("nan")
         found.append(Step(status, int(transient.t_ns[k]), 0, float(dt), before, transient.x[k].tolist()))
     return found
+
+
+def holds(transient: Transient, steps: Sequence[Step]) -> None:
+    """The transient has what these steps say of every sample that was kept, to the last bit."""
+    kept = [s for s in steps if not s.status.dropped]
+    assert transient.statuses() == [s.status for s in kept]
+    assert transient.t_ns.tolist() == [s.t_ns for s in kept]
+    np.testing.assert_array_equal(transient.x, np.reshape([s.x_next for s in kept], transient.x.shape))
+    for k, step in enumerate(kept[1:]):
+        if step.status is not Status.RESET:
+            np.testing.assert_array_equal(transient.u[k], step.u)

@@ -19,6 +19,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from steps import steps_of
 from test_model import random_model
+from test_transient import runs
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
@@ -93,25 +94,19 @@ def test_masks_are_held_against_the_states() -> None:
 
 # --- transients with every disorder --------------------------------------------------------------------------
 
-TICK = 10_000_000  # ns
-
 
 @st.composite
 def cases(draw: st.DrawFn) -> tuple[UncertainLTI, Transient]:
     """A run with gaps, resets, dropped samples and NaN."""
-    n, m = draw(st.integers(1, 3)), draw(st.integers(0, 2))
-    steps = draw(st.lists(st.sampled_from([1, 1, 1, 2, 0, 9, -1, -30]), max_size=40))
-    t = 1000 * TICK + TICK * np.cumsum(np.array([0, *steps], dtype=np.int64))
-    rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
-    z = rng.normal(size=(len(t), n + m))
-    z[rng.uniform(size=z.shape) < draw(st.sampled_from([0.0, 0.05]))] = draw(st.sampled_from([math.nan, math.inf]))
+    t, x, u, max_gap, min_step = draw(runs())
+    n, m = x.shape[1], u.shape[1]
     window = draw(st.integers(1, 6))
     box = Domain(np.full(n, -1.0), np.full(n, 1.0), np.full(m, -1.0), np.full(m, 1.0))
-    model = random_model(rng, n, m).replace(
+    model = a_model(n, m, draw(st.integers(0, 2**32 - 1))).replace(
         domain=draw(st.sampled_from([box, None])),
         alarm_rule=AlarmRule(draw(st.integers(1, window)), window, draw(st.sampled_from([1.0, 0.5, 3.0]))),
     )
-    return model, Transient(t, z[:, :n], z[:, n:], signals=model.signals, max_gap=0.05)
+    return model, Transient(t, x, u, signals=model.signals, max_gap=max_gap, min_step=min_step)
 
 
 @settings(max_examples=80)

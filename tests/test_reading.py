@@ -35,11 +35,11 @@ from bag_writer import (
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
+from steps import holds
 from test_sampler import Reference, Sent, cases
 
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted, read_transients, unused
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -79,13 +79,7 @@ def by_position(signals: SignalMap) -> SignalMap:
 
 def same(transient: Transient, reference: Reference) -> None:
     """The transient holds what the reference says of every clock message, to the last bit."""
-    kept = [s for decided in reference.steps() for s in decided if not s.status.dropped]
-    assert transient.statuses() == [s.status for s in kept]
-    assert transient.t_ns.tolist() == [s.t_ns for s in kept]
-    np.testing.assert_array_equal(transient.x, np.reshape([s.x_next for s in kept], transient.x.shape))
-    for k, step in enumerate(kept[1:]):
-        if step.status is not Status.RESET:
-            np.testing.assert_array_equal(transient.u[k], step.u)
+    holds(transient, [step for decided in reference.steps() for step in decided])
     assert +transient.counters == +reference.counters
 
 

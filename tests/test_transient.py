@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from steps import holds
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError, TransientError
@@ -67,12 +68,7 @@ def test_cut_and_judged_usable_as_the_sampler_does(run: tuple[Any, ...]) -> None
     kept = [s for s in decided if not s.status.dropped]
     transient = Transient(t, x, u, max_gap=max_gap, min_step=min_step)
 
-    assert transient.statuses() == [s.status for s in kept]
-    assert transient.t_ns.tolist() == [s.t_ns for s in kept]
-    np.testing.assert_array_equal(transient.x, [s.x_next for s in kept])
-    for k, step in enumerate(kept[1:]):
-        if step.status is not Status.RESET:
-            np.testing.assert_array_equal(transient.u[k], step.u)
+    holds(transient, decided)
     ok = [k for k, s in enumerate(kept) if s.status is Status.OK]
     steps = transient.transitions()
     assert steps.k.tolist() == [k - 1 for k in ok]
@@ -85,17 +81,6 @@ def test_cut_and_judged_usable_as_the_sampler_does(run: tuple[Any, ...]) -> None
     opens = [k for k, s in enumerate(kept) if s.status.opens_segment]
     assert transient.segment.tolist() == [sum(o <= k for o in opens) - 1 for k in range(len(kept))]
     assert transient.segments == len(opens)
-
-
-@settings(max_examples=40)
-@given(runs())
-def test_a_transient_of_its_own_samples_is_itself(run: tuple[Any, ...]) -> None:
-    t, x, u, max_gap, min_step = run
-    once = Transient(t, x, u, max_gap=max_gap, min_step=min_step)
-    twice = Transient(once.t_ns, once.x, once.u, max_gap=max_gap, min_step=min_step)
-    for name in ("t_ns", "x", "u", "segment"):
-        assert np.array_equal(getattr(once, name), getattr(twice, name), equal_nan=True)
-    assert not +twice.counters
 
 
 def test_a_part_keeps_the_step_of_its_run() -> None:
