@@ -59,13 +59,19 @@ class Rig:
         if self.session.alarm != before:
             self.event_log.turned(self.session, verdicts, self.now)
 
-    def send(self, samples: int, off: float = 0.0, control: bool = True, state: bool = True) -> None:
+    def send(
+        self, samples: int, off: float = 0.0, control: bool = True, state: bool = True, frozen: int | None = None
+    ) -> None:
         point = self.model.operating_point
+        held = point.recorded_x(self.x)
         for _ in range(samples):
             if control:
                 self.take(CONTROL, vector(self.t_ns, *(point.u_s + point.U * self.u)))
+            read = point.recorded_x(self.x)
+            if frozen is not None:
+                read[frozen] = held[frozen]
             if state:
-                self.take(STATE, joint_state(self.t_ns, point.recorded_x(self.x)))
+                self.take(STATE, joint_state(self.t_ns, read))
             centre, half = self.model.centre_and_half(self.x, self.u, STEP)
             self.x = centre + off * half
             self.wait(STEP)

@@ -19,7 +19,6 @@ import numpy as np
 import pytest
 from steps import steps_of
 from test_event_log import Rig
-from test_live import CONTROL, STATE, joint_state, vector
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients
 from uncertain_lti.base.arrays import LARGEST
@@ -428,32 +427,20 @@ def test_a_slow_sensor_repeats_regularly() -> None:
         assert verdicts.frozen[200:300, 0].any()
 
 
-class FrozenRig(Rig):
-    """A session whose model knows that nothing repeats; what is read is frozen on demand."""
-
-    def __init__(self, repeats: Repeats, **rule: Any) -> None:
-        super().__init__(**rule)
-        self.watch(self.model.replace(repeats=repeats, domain=None), self.session.rule)
-
-    def hold(self, samples: int, state: int) -> None:
-        point, value = self.model.operating_point, None
-        for _ in range(samples):
-            read = point.recorded_x(self.x)
-            value = read[state] if value is None else value
-            read[state] = value
-            self.take(CONTROL, vector(self.t_ns, *(point.u_s + point.U * self.u)))
-            self.take(STATE, joint_state(self.t_ns, read))
-            self.x = self.model.centre_and_half(self.x, self.u, DT)[0]
-            self.wait(DT)
+def frozen_rig(repeats: Repeats, **rule: Any) -> Rig:
+    """A session whose model knows so much of repeats."""
+    rig = Rig(**rule)
+    rig.watch(rig.model.replace(repeats=repeats, domain=None), rig.session.rule)
+    return rig
 
 
 def test_a_session_names_what_is_frozen() -> None:
-    rig = FrozenRig(Repeats([0.0, 0.0]))
+    rig = frozen_rig(Repeats([0.0, 0.0]))
     rig.send(30)
     assert not rig.session.alarm
     rig.lines.clear()
     rig.u[:] = -0.5
-    rig.hold(60, 1)
+    rig.send(60, frozen=1)
     assert rig.session.alarm and rig.session.last is not None
     (line,) = [line for line in rig.lines if line.startswith("alarm")]
     assert line.startswith("alarm, frozen: b repeats exactly for ") and "half-widths" in line
@@ -465,14 +452,14 @@ def test_a_session_names_what_is_frozen() -> None:
     assert "frozen" not in monitor.message.split(";")[0], "nothing arrives, so nothing is known to be frozen"
     rig.send(5)
     assert not rig.session.alarm and "the alarm is over" in " ".join(rig.lines)
-    rig.hold(30, 1)
+    rig.send(30, frozen=1)
     rig.send(5)
     monitor, *_ = rig.session.report(rig.now, 10.0)
     assert monitor.level == ERROR and monitor.message.startswith("alarm: frozen: b"), "not a rule that raised nothing"
 
 
 def test_a_session_warns_of_a_long_repeat() -> None:
-    rig = FrozenRig(Repeats([0.1, 0.0]), masked="b")
+    rig = frozen_rig(Repeats([0.1, 0.0]), masked="b")
     rig.x[:] = 0.0
     rig.u[:] = 0.0
     rig.send(40)
