@@ -59,16 +59,15 @@ def wrapped(topic, t_ns, yaw):
     return Message(topic, t_ns, cdr(POSE_2D, x=0.0, y=0.0, theta=math.remainder(yaw, math.tau)), t_ns)
 
 
-def driven(names=("/plant/state", "/plant/cmd"), count=400, seed=0, extra=lambda k, x, u: []):
-    """First-order lag with a stepping command, 50 Hz."""
+def driven(names=("/plant/state", "/plant/cmd"), count=400, seed=0, extra=lambda k, x, u: [], late=0):
+    """First-order lag with a stepping command that acts so many samples late, 50 Hz."""
     rng = np.random.default_rng(seed)
-    x, u, messages = 0.0, 0.0, []
+    x, u, messages = 0.0, [0.0] * 9, []
     for k in range(count):
-        if k % 37 == 0:
-            u = float(rng.normal())
+        u.append(float(rng.normal()) if k % 37 == 0 else u[-1])
         t = 10**18 + k * 20 * MS
-        messages += [f64(names[0], t, x + 1e-3 * rng.normal()), f64(names[1], t, u), *extra(k, x, u)]
-        x += 0.02 * (-2.0 * x + 3.0 * u)
+        messages += [f64(names[0], t, x + 1e-3 * rng.normal()), f64(names[1], t, u[-1]), *extra(k, x, u[-1])]
+        x += 0.02 * (-2.0 * x + 3.0 * u[-1 - late])
     return messages
 
 
@@ -519,14 +518,7 @@ def test_a_recording_of_noise_alone_says_so(tmp_path, cli):
 
 @pytest.mark.parametrize("late", [0, 4])
 def test_a_late_answer_becomes_the_delay_that_the_fit_would_name(tmp_path, late):
-    rng = np.random.default_rng(4)
-    x, history, messages = 0.0, [0.0] * 9, []
-    for k in range(1500):
-        history.append(float(rng.normal()) if k % 23 == 0 else history[-1])
-        t = 10**18 + k * 20 * MS
-        messages += [f64("/plant/state", t, x + 1e-3 * rng.normal()), f64("/plant/cmd", t, history[-1])]
-        x += 0.02 * (-2.0 * x + 3.0 * history[-1 - late])
-    path, proposal = proposed(tmp_path, messages)
+    path, proposal = proposed(tmp_path, driven(count=1500, seed=4, late=late))
     assert [c.delay for c in proposal.controls] == [late]
     assert not any("better when it is taken" in m for m in fitted([path], proposal).fit_summary["messages"])
 
