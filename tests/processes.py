@@ -14,14 +14,17 @@ from __future__ import annotations
 import ctypes
 import fcntl
 import os
+import pty
 import random
 import signal
+import subprocess
 import sys
 import time
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 _PR_SET_CHILD_SUBREAPER = 36
 LASTING: set[int] = set()  # children that serve several tests
@@ -127,6 +130,22 @@ def _kill_tree(pid: int) -> None:
         os.kill(pid, signal.SIGKILL)
     for child in below:
         _kill_tree(child)
+
+
+def on_a_terminal(command: list[str], until: bytes = b"", **options: Any) -> tuple[int, str]:
+    """Status of a process and what it wrote to a terminal; it is interrupted once that has these words."""
+    screen, terminal = pty.openpty()
+    process = subprocess.Popen(command, **{"stdout": terminal, "stderr": terminal} | options)
+    os.close(terminal)
+    shown = b""
+    with suppress(OSError):  # as the terminal ends with its last program
+        while text := os.read(screen, 4096):
+            shown += text
+            if until and until in shown:
+                process.send_signal(signal.SIGINT)
+                until = b""
+    os.close(screen)
+    return process.wait(), shown.decode()
 
 
 @contextmanager

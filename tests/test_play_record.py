@@ -13,14 +13,11 @@ from __future__ import annotations
 
 import json
 import os
-import pty
 import re
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,6 +40,7 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from processes import on_a_terminal
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from ros_processes import PATIENCE, World, own_domain, until
@@ -415,21 +413,11 @@ def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
 
 def test_a_signal_takes_the_bar_of_a_terminal_away(tmp_path: Path) -> None:
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 60 * 10**9, 10**8))).save(tmp_path / "in.mcap")
-    screen, terminal = pty.openpty()
     with own_domain() as domain:
         command = [sys.executable, "-m", "uncertain_lti.cli.main", "play", str(bag), "--wait", "0"]
         env = os.environ | {"ROS_DOMAIN_ID": str(domain), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        player = subprocess.Popen(command, stdout=terminal, stderr=terminal, env=env, start_new_session=True)
-        os.close(terminal)
-        shown = b""
-        with suppress(OSError):  # as the terminal ends with its last program
-            while text := os.read(screen, 4096):
-                if b"playing:" in text and b"playing:" not in shown:
-                    player.send_signal(signal.SIGINT)
-                shown += text
-        os.close(screen)
-        assert player.wait() == 130
-    assert shown.decode().rstrip().endswith("then interrupted"), shown
+        status, shown = on_a_terminal(command, until=b"playing:", env=env, start_new_session=True)
+    assert status == 130 and shown.rstrip().endswith("then interrupted"), shown
 
 
 def test_a_signal_ends_waiting_at_once(world: World, tmp_path: Path) -> None:

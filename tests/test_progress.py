@@ -12,7 +12,6 @@
 import io
 import json
 import os
-import pty
 import signal
 import subprocess
 import sys
@@ -21,6 +20,7 @@ import time
 import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
+from processes import on_a_terminal
 
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep, Progress
@@ -54,32 +54,14 @@ def fit_arguments(folder, output="m.model.json"):
     return ["fit", *files, "--output", str(folder / output), "--additive", "noise", "--force"]
 
 
-def on_a_terminal(command):
-    """What a process writes to a terminal that is its standard error."""
-    ours, theirs = pty.openpty()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=theirs)
-    os.close(theirs)
-    written = b""
-    while True:
-        try:
-            piece = os.read(ours, 65536)
-        except OSError:  # the other end is closed
-            break
-        if not piece:
-            break
-        written += piece
-    os.close(ours)
-    return process.wait(), written.decode()
-
-
 def test_a_terminal_sees_bars_that_are_gone_at_the_end(long_run):
     command = [*CLI, *fit_arguments(long_run)]
-    status, written = on_a_terminal(command)
+    status, written = on_a_terminal(command, stdout=subprocess.DEVNULL)
     assert status == 0
     assert "fitting: fit" in written and "%|" in written
     last = [line for line in written.replace("\r\n", "\n").splitlines() if not line.startswith("note: ")][-1]
     assert not last.split("\r")[-1].strip(), "the last thing drawn is an empty line"
-    status, written = on_a_terminal([*command, "--quiet"])
+    status, written = on_a_terminal([*command, "--quiet"], stdout=subprocess.DEVNULL)
     assert (status, written) == (0, "")
 
 
