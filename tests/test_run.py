@@ -118,12 +118,7 @@ SOURCED = {"ROS_DISTRO": "humble"}
         ("setup", {"python3": OLD, "python3.12": "exit 127"}, {}, "3.11, 3.12 or 3.13 is needed, python3 is 3.14;"),
         ("setup", {"python3": "venv"}, {}, rf"apt-get install python{VERSION}-venv$"),
         ("setup", {"python3": OLD, f"python{VERSION}": "venv"}, {}, f"Python {VERSION} has no venv module"),
-        (
-            "setup",
-            {"python3": HUMBLE, "python3.11": this_python()},
-            {"ROS_DISTRO": "humble"},
-            "humble runs on Python 3.10",
-        ),
+        ("setup", {"python3": HUMBLE, "python3.11": this_python()}, SOURCED, "humble runs on Python 3.10"),
         (
             "setup",
             {"python3": this_python("CC=no-such-compiler")},
@@ -209,13 +204,17 @@ for name in {programs}:
 """
 
 
+def making(folder: Path, first: str = "") -> str:
+    """Shell text that is this interpreter, but makes an environment by `_ENVIRONMENT`, after what is to come first."""
+    python, maker = Path(sys.executable).resolve(), folder / "make_environment.py"
+    maker.write_text(first + _ENVIRONMENT.format(bash=folder / "bin" / "bash", python=python, programs=PROGRAMS))
+    return f'[[ "$1 $2" == "-m venv" ]] && exec "{python}" "{maker}" "$@"\n{this_python()}'
+
+
 @pytest.fixture
 def elsewhere(run, tmp_path):
     """Call `./run` from another folder; its environment has programs that print name, folder and arguments."""
-    bash, python = tmp_path / "bin" / "bash", Path(sys.executable).resolve()
-    maker = tmp_path / "make_environment.py"
-    maker.write_text(_ENVIRONMENT.format(bash=bash, python=python, programs=PROGRAMS))
-    python3 = f'[[ "$1 $2" == "-m venv" ]] && exec "{python}" "{maker}" "$@"\n{this_python()}'
+    python3 = making(tmp_path)
     folder = tmp_path / "some where"
     folder.mkdir()
 
@@ -247,13 +246,7 @@ def test_programs_hear_this_machine_alone_unless_told_otherwise(elsewhere, tmp_p
 @pytest.fixture
 def slow(tmp_path):
     """Shell text that is this interpreter, and takes a second to make an environment, which is noted in a file."""
-    bash, python = tmp_path / "bin" / "bash", Path(sys.executable).resolve()
-    maker = tmp_path / "make_environment.py"
-    maker.write_text(
-        f"import time\nopen({str(tmp_path / 'made')!r}, 'a').write('x')\ntime.sleep(1)\n"
-        + _ENVIRONMENT.format(bash=bash, python=python, programs=PROGRAMS)
-    )
-    return f'[[ "$1 $2" == "-m venv" ]] && exec "{python}" "{maker}" "$@"\n{this_python()}'
+    return making(tmp_path, f"import time\nopen({str(tmp_path / 'made')!r}, 'a').write('x')\ntime.sleep(1)\n")
 
 
 def test_of_two_starts_at_once_one_installs_and_the_other_waits(run, slow, tmp_path):
