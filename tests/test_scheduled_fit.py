@@ -385,17 +385,13 @@ def test_schedules_that_make_no_sense_are_refused(schedule, words):
         fit(run, schedule=schedule, operating_point=point)
 
 
-def test_one_knot_of_a_further_signal_is_no_schedule():
-    plain = drawn(THREE, 300, 1)
-    further = Transient(plain.t_ns, plain.x, plain.u, s=np.linspace(0, 1, len(plain))[:, None])
-    model = fit(further, "qp", additive="noise", schedule={"s1": 1})
-    assert model.schedule is None and not model.signals.scheduling
-
-
-def test_one_knot_is_one_block():
+def test_one_knot_is_one_block_and_no_schedule():
     transient = drawn(THREE, 300, 1)
-    model, one = fit(transient, schedule={"u1": 1}), fit(transient)
-    assert model.schedule is None and (model.A == one.A).all() and (model.dA == one.dA).all()
+    further = Transient(transient.t_ns, transient.x, transient.u, s=np.linspace(0, 1, len(transient))[:, None])
+    one = fit(transient)
+    for model in (fit(transient, schedule={"u1": 1}), fit(further, schedule={"s1": 1})):
+        assert model.schedule is None and not model.signals.scheduling
+        assert (model.A == one.A).all() and (model.dA == one.dA).all()
 
 
 def test_the_signals_file_schedules_a_fit():
