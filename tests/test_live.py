@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writer import Layout, Message, Topic, float64, joint_state, vector, write
+from perturbed import CONTROL, EPOCH_NS, JOINT_STATE, STATE, STEP_NS, VECTOR
 from rosbags.highlevel import AnyReader
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, UncertainLTI
@@ -56,10 +57,6 @@ from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
 
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
-STATE, CONTROL = "/plant/state", "/plant/control"
-JOINT_STATE, VECTOR = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Vector3Stamped"
-STEP_NS = 10_000_000
-EPOCH_NS = 1_700_000_000_000_000_000
 
 
 # --- a model and recordings made by hand --------------------------------------------------------------------

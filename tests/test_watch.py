@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 import shutil
@@ -32,6 +31,7 @@ from ros_processes import Process, own_domain, until
 from ros_processes import world as world
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
+from test_pages import array as numbers
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.cli.main import main
@@ -60,10 +60,6 @@ def get(address: str, **headers: str) -> tuple[int, str]:
 def drawn(address: str) -> dict[str, Any]:
     recording: dict[str, Any] = json.loads(get(f"{address}data")[1])["recordings"][0]
     return recording
-
-
-def numbers(packed: dict[str, Any]) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(packed["data"]), "<f4") + packed["offset"]
 
 
 def test_the_page_draws_what_the_monitor_said(world, tmp_path):
