@@ -163,6 +163,6 @@ def engine_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def engine_copy(engine_folder: Path, tmp_path: Path) -> Path:
+def folder(engine_folder: Path, tmp_path: Path) -> Path:
     """A copy of `engine_folder` to write to."""
     return Path(shutil.copytree(engine_folder, tmp_path / "engine"))

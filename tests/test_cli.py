@@ -29,11 +29,6 @@ from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.reports.check import check_data
 
 
-@pytest.fixture
-def folder(engine_copy):
-    return engine_copy
-
-
 def refused(cli, *words):
     """Status 2 and one sentence on standard error, no traceback, nothing on standard output."""
     said = cli(*words, status=2)

@@ -36,11 +36,6 @@ from uncertain_lti.sampling.clock import LONGEST_NS, Status, to_ns
 ROOT = Path(__file__).resolve().parents[1]
 
 
-@pytest.fixture
-def folder(engine_folder):
-    return engine_folder
-
-
 def commands(folder):
     """Command lines that end by themselves and print."""
     model, bag = str(folder / "m.model.json"), str(folder / "run.mcap")

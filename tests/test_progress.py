@@ -35,11 +35,6 @@ class Terminal(io.StringIO):
         return True
 
 
-@pytest.fixture
-def folder(engine_copy):
-    return engine_copy
-
-
 @pytest.fixture(scope="module")
 def long_run(tmp_path_factory):
     """A recording whose fit, with the left-out ones, takes seconds."""

@@ -247,10 +247,10 @@ def test_validate_keeps_the_knots_of_the_model():
 
 
 @pytest.fixture
-def folder(engine_copy):
+def folder(folder):
     """A recording of an engine, whose plant is linear, and its signals file."""
-    (engine_copy / "m.model.json").unlink()
-    return engine_copy
+    (folder / "m.model.json").unlink()
+    return folder
 
 
 @pytest.fixture
