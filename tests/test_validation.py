@@ -250,17 +250,7 @@ def test_weights_go_with_their_samples():
     assert blocks.parts[1].mean_width == pytest.approx(judge(model, model, cut(whole, 100, 201), "").mean_width)
 
 
-def test_wrong_options_are_refused(runs):
-    cases = [
-        (dict(blocks=1), "blocks is 1"),
-        (dict(gap=1.0), "goes with blocks"),
-        (dict(blocks=4, gap=-1.0), "gap is -1"),
-        (dict(blocks=90), "too few for 90 blocks"),
-        (dict(confidence=1.0), "confidence is 1"),
-    ]
-    for options, words in cases:
-        with pytest.raises(FitError, match=words):
-            validate(runs, additive="noise", **options)
+def test_recordings_that_are_too_short_are_refused(runs):
     short = [cut(r, 0, 7) for r in runs[:2]]
     with pytest.raises(FitError, match=r"without tanks 3\.0 no model can be fitted: 6 usable"):
         validate(short, additive="noise")
@@ -344,9 +334,14 @@ def test_the_condition_stands_beside_every_interval(days):
         assert f"in less than {missed} of the {what} may be in none of them" in text and "show all that happens" in text
 
 
-def test_a_single_group_or_wrong_groups_are_refused(days):
+def test_wrong_options_and_wrong_groups_are_refused(days):
     runs, names = days
     for options, words in (
+        (dict(blocks=1), "blocks is 1"),
+        (dict(gap=1.0), "goes with blocks"),
+        (dict(blocks=4, gap=-1.0), "gap is -1"),
+        (dict(blocks=90), "too few for 90 blocks"),
+        (dict(confidence=1.0), "confidence is 1"),
         (dict(groups=["a"] * 12), r"of one group \(a\), so nothing is left"),
         (dict(groups=["a", "b"]), "2 groups for 12 recordings"),
         (dict(groups=names, blocks=3), "groups leave out whole recordings"),
