@@ -21,6 +21,7 @@ from bag_writer import Message, Topic, cdr, header, joint_state, message, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import bounded
+from test_signals import quaternion
 
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
@@ -38,20 +39,10 @@ def f64(topic, t_ns, value):
     return Message(topic, t_ns, cdr(FLOAT64, data=float(value)), t_ns)
 
 
-def quaternion(roll=0.0, yaw=0.0):
-    a, b = roll / 2, yaw / 2
-    return message(
-        "geometry_msgs/msg/Quaternion",
-        x=math.sin(a) * math.cos(b),
-        y=math.sin(a) * math.sin(b),
-        z=math.cos(a) * math.sin(b),
-        w=math.cos(a) * math.cos(b),
-    )
-
-
-def pose(topic, t_ns, roll=0.0, yaw=0.0, x=0.0):
-    point = message("geometry_msgs/msg/Point", x=x, y=1.0, z=0.0)
-    body = message("geometry_msgs/msg/Pose", position=point, orientation=quaternion(roll, yaw))
+def pose(topic, t_ns, yaw):
+    point = message("geometry_msgs/msg/Point", x=0.0, y=1.0, z=0.0)
+    turned = message("geometry_msgs/msg/Quaternion", **vars(quaternion(0.0, 0.0, yaw)))
+    body = message("geometry_msgs/msg/Pose", position=point, orientation=turned)
     return Message(topic, t_ns, cdr(POSE, header=header(t_ns), pose=body), t_ns)
 
 
