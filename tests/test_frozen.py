@@ -74,12 +74,8 @@ def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI, tmp_
     assert (model.repeats.largest_run < 0.5).all(), "the model does not move a machine at rest"
     model.save(tmp_path / "m.model.json")
     data = json.loads((tmp_path / "m.model.json").read_text())
-    assert data["format"] == "uncertain-lti/2" and list(data["frozen"]) == [
-        "longest_repeat_s",
-        "largest_run",
-        "largest_sum",
-        "active_beyond",
-    ]
+    assert data["format"] == "uncertain-lti/2"
+    assert list(data["frozen"]) == ["longest_repeat_s", "largest_run", "largest_sum", "active_beyond"]
     again = UncertainLTI.load(tmp_path / "m.model.json")
     assert again.to_dict() == model.to_dict()
     data["frozen"] = {"longest_repeat_s": [0.5, 0.25]}
@@ -302,10 +298,8 @@ def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:
     frozen = held(run(12), 0, 200, 350)
     verdicts = EnvelopeMonitor(model).check(frozen)
     assert verdicts.frozen.any() and np.isnan(verdicts.horizon_utilisation[340:351]).all()
-    assert (
-        np.isnan(verdicts.horizon_utilisation[351:355, 2]).all()
-        and not np.isnan(verdicts.horizon_utilisation[355]).any()
-    )
+    assert np.isnan(verdicts.horizon_utilisation[351:355, 2]).all()
+    assert not np.isnan(verdicts.horizon_utilisation[355]).any()
 
 
 def test_a_masked_state_and_a_model_without_repeats_are_not_watched(model: UncertainLTI) -> None:

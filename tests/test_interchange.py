@@ -64,9 +64,8 @@ def test_there_and_back(n, m, seed, drift, recorded):
     for dt in (None, 0.025):
         system = model.to_control(dt, recorded)
         assert list(system.state_labels) == list(model.state_names) and system.dt == (dt or 0)
-        again = UncertainLTI.from_control(
-            system, dA=model.dA, dB=model.dB, dc=model.dc, v=model.v, signals=model.signals, recorded=recorded
-        )
+        widths = {name: getattr(model, name) for name in ("dA", "dB", "dc", "v")}
+        again = UncertainLTI.from_control(system, **widths, signals=model.signals, recorded=recorded)
         same(model, again, exactly=dt is None and not recorded)
         assert again.signals == model.signals
 

@@ -37,9 +37,8 @@ def annotated(request, tmp_path_factory):
     runs = read_transients(ROOT / "bags" / f"{fitted}.mcap", ROOT / "config" / "signals" / f"{request.param}.yaml")
     fit(runs, additive="noise").save(folder / "m.model.json")
     out = folder / "out.mcap"
-    assert (
-        main(["check", str(folder / "m.model.json"), str(ROOT / "bags" / f"{checked}.mcap"), "--write", str(out)]) == 1
-    )
+    words = [folder / "m.model.json", ROOT / "bags" / f"{checked}.mcap", "--write", out]
+    assert main(["check", *map(str, words)]) == 1
     last = {}
     with AnyReader([out]) as reader:
         for connection, _, data in reader.messages():

@@ -50,12 +50,7 @@ def recording(folder: Path, compression: str, chunk_size: int) -> Path:
 
 
 def plain(stream: Stream) -> tuple[bytes, ...]:
-    return (
-        stream.topic.tobytes(),
-        stream.arrival.tobytes(),
-        stream.stamp.tobytes(),
-        *(v.tobytes() for v in stream.values),
-    )
+    return tuple(array.tobytes() for array in (stream.topic, stream.arrival, stream.stamp, *stream.values))
 
 
 def outcome(path: Path, by_message: bool) -> tuple[bytes, ...] | str:

@@ -207,13 +207,8 @@ def test_package_xml_covers_what_is_imported(package):
     assert fitting.findtext("version") == package.findtext("version")
     keys = {element.text for root in (package, fitting) for element in root.iter("exec_depend")}
     outside = imported("core", "uncertain_lti_ros", "launch")
-    optional = WITHOUT_ROSDEP_KEY | {
-        "isal",
-        "pandas",
-        "pyarrow",
-        "shtab",
-        "cython",
-    }  # data frames are handed in by who has pandas
+    # data frames are handed in by who has pandas
+    optional = WITHOUT_ROSDEP_KEY | {"isal", "pandas", "pyarrow", "shtab", "cython"}
     missing = {n: p for n, p in outside.items() if n not in optional and ROSDEP_KEY.get(n, n) not in keys}
     assert not missing
 

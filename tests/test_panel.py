@@ -140,9 +140,8 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(learnt, runs):
     np.testing.assert_allclose(panel.biases, half * (np.sqrt(sample.thresholds(2)) + 2 * middle), rtol=1e-12)
     middle_half = np.average([part.median_width for part in parts], axis=0, weights=weights) / 2
     offsets = middle_half * np.sqrt(energy.thresholds(2))
-    assert panel.figure == pytest.approx(np.exp(np.log(offsets).mean()), rel=1e-12) and panel.within == pytest.approx(
-        DT
-    )
+    assert panel.figure == pytest.approx(np.exp(np.log(offsets).mean()), rel=1e-12)
+    assert panel.within == pytest.approx(DT)
 
 
 @pytest.mark.parametrize(
@@ -187,13 +186,9 @@ def test_what_never_moved_or_lies_far_outside_leaves_thresholds_alone():
     both = [*peaks, np.full(2, 1e-9)], np.vstack([peaks, [1e-9, peaks[0, 1]]])
     for more in (np.array(both[0]), both[1]):
         for what, verdicts in (("recording", 4000), ("block", 4000), ("block", 400)):
-            found = [
-                Evidence(p, peaks.max(axis=0), np.full(2, 0.2), verdicts, np.ones((2, 2)), 1, 1, DT).thresholds(
-                    [rule], 2, what
-                )[0]
-                for p in (peaks, more)
-            ]
-            np.testing.assert_allclose(found[1], found[0], rtol=0.05)
+            rest = peaks.max(axis=0), np.full(2, 0.2), verdicts, np.ones((2, 2)), 1, 1, DT
+            (one,), (other,) = (Evidence(p, *rest).thresholds([rule], 2, what) for p in (peaks, more))
+            np.testing.assert_allclose(other, one, rtol=0.05)
 
 
 def test_evidence_of_more_recordings_adds_up():

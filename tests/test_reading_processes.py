@@ -64,12 +64,8 @@ def test_the_same_transients_and_remarks(tmp_path: Path) -> None:
     beside = read_transients(paths, XU, progress, processes=2)
     assert counted[0] == counted[1] == sum(2 * t.counters["samples"] + 1 for t in alone)
     for one, other in zip(alone, beside, strict=True):
-        assert (one.name, one.notes, one.counters, one.sources) == (
-            other.name,
-            other.notes,
-            other.counters,
-            other.sources,
-        )
+        for name in ("name", "notes", "counters", "sources"):
+            assert getattr(one, name) == getattr(other, name)
         for name in ("t_ns", "x", "u", "segment"):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
     assert any("cannot be decoded" in note for note in beside[-1].notes)
