@@ -41,6 +41,7 @@ from std_srvs.srv import Trigger
 
 PATIENCE = 300.0  # s; costs nothing where all is well
 MONITOR = "/envelope_monitor"
+OK, WARN, ERROR, STALE = 0, 1, 2, 3  # of diagnostic_msgs
 _NODES = "import sys; from uncertain_lti_ros.nodes import {0}; sys.exit({0}())"
 _COMMANDS = "import sys; from uncertain_lti.cli.main import main; sys.exit(main())"
 _SERVER = """

@@ -50,14 +50,11 @@ from geometry_msgs.msg import Vector3Stamped
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import Diagnostics, World, until
+from ros_processes import ERROR, OK, STALE, WARN, Diagnostics, World, until
 from ros_processes import world as world
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Bool, Float64, String
 from std_srvs.srv import Trigger
-
-OK, WARN, ERROR, STALE = 0, 1, 2, 3
-
 
 # --- a model and recordings made by hand --------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import yaml
 from conftest import ROOT
+from perturbed import CONTROL, STATE, STEP_NS
 
 from uncertain_lti.model.alarm_rule import AlarmRule
 
@@ -30,25 +31,12 @@ from lifecycle_msgs.msg import TransitionEvent
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import World, until
+from ros_processes import ERROR, World, until
 from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
-from test_live import (
-    CONTROL,
-    ERROR,
-    STATE,
-    STEP_NS,
-    Outputs,
-    Plant,
-    StartBench,
-    by_hand,
-    header_bag,
-    offline,
-    saved,
-    stamp_of,
-)
+from test_live import Outputs, Plant, StartBench, by_hand, header_bag, offline, saved, stamp_of
 from test_live import bench as bench
 
 from uncertain_lti_ros.parameters import PARAMETERS
