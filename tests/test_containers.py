@@ -258,17 +258,19 @@ def test_an_index_of_a_database_that_lacks_rows_is_not_believed_in_silence(conve
     assert any(re.search(r"hidden\.db3: is damaged \(.*timestamp_idx", w) for w in bag.warnings)
 
 
-def test_other_versions_and_no_space_for_nothing(tmp_path):
-    (tmp_path / "a.bag").write_bytes(b"#ROSBAG V1.2\n" + bytes(100))
-    with pytest.raises(BagError, match="of another version than 2.0"):
-        Bag(tmp_path / "a.bag")
-    for name, head in (("b.bag", b"#ROSBAG V2.0\n"), ("c.bag", b"#ROSBAG V2.0\n" + bytes(1 << 20))):
-        (tmp_path / name).write_bytes(head)
-        with pytest.raises(BagError, match="is cut or damaged or no ROS 1 bag"):
-            Bag(tmp_path / name)
-    (tmp_path / "c.db3").write_bytes(b"SQLite format 3\0" + bytes(5000))
-    with pytest.raises(BagError, match="is cut or damaged or no recording"):
-        Bag(tmp_path / "c.db3")
+@pytest.mark.parametrize(
+    ("name", "data", "words"),
+    [
+        ("a.bag", b"#ROSBAG V1.2\n" + bytes(100), "of another version than 2.0"),
+        ("a.bag", b"#ROSBAG V2.0\n", "is cut or damaged or no ROS 1 bag"),
+        ("a.bag", b"#ROSBAG V2.0\n" + bytes(1 << 20), "is cut or damaged or no ROS 1 bag"),
+        ("a.db3", b"SQLite format 3\0" + bytes(5000), "is cut or damaged or no recording"),
+    ],
+)
+def test_other_versions_and_no_space_for_nothing(name, data, words, tmp_path):
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(BagError, match=words):
+        Bag(tmp_path / name)
 
 
 def test_elements_without_bytes_do_not_take_for_ever(tmp_path):

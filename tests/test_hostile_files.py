@@ -47,6 +47,7 @@ from uncertain_lti.sampling.reading import read_stream
 
 TOPIC = Topic("/a")
 DEFINED = schema_record(1, TOPIC) + channel_record(1, TOPIC, 1)
+SIGNALS = SignalMap.from_dict({"states": [{"name": "x", "topic": "/a", "field": "data"}]})
 STEP = 10**9
 
 
@@ -169,8 +170,7 @@ def test_chunks_that_lie_in_each_other_are_walked(tmp_path):
 
 def values(path, indexed=False):
     """What a signal on /a reads of a file."""
-    signals = SignalMap.from_dict({"states": [{"name": "x", "topic": "/a", "field": "data"}]})
-    return read_stream(Bag(path, indexed=indexed), signals).values[0][:, 0].tolist()
+    return read_stream(Bag(path, indexed=indexed), SIGNALS).values[0][:, 0].tolist()
 
 
 def save(path, data):
@@ -287,9 +287,8 @@ def test_messages_cut_before_their_end_are_left_out(tmp_path, what):
     topic = Topic("/a", "p/msg/T", schema=text.decode())
     bodies = [b"\0\1\0\0" + body[:size] for size in (len(body), len(body), *range(longest + 1))]
     path = write([topic], [Message("/a", k * STEP, b) for k, b in enumerate(bodies)]).save(tmp_path / "cut.mcap")
-    signals = SignalMap.from_dict({"states": [{"name": "x", "topic": "/a", "field": "data"}]})
     for read in (read_stream, read_stream_by_message):
-        assert read(Bag(path), signals).values[0].tolist() == [[1.5], [1.5]]
+        assert read(Bag(path), SIGNALS).values[0].tolist() == [[1.5], [1.5]]
 
 
 def copied(path, model):
