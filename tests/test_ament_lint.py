@@ -9,11 +9,9 @@
 
 """The linters of ROS 2, with this repository's settings, if an installation of ROS 2 has them."""
 
-from pathlib import Path
-
 import pytest
+from conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ["core", "uncertain_lti_ros", "launch", "setup.py"]
 EVERYTHING = [*PACKAGES, "benchmarks", "docs", "examples", "tests"]
 IN_TESTS = ["tests/checkout/uncertain_lti", "tests/checkout/uncertain_lti_ros"]  # under the names that are imported

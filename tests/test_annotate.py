@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from bag_writer import COMPRESSIONS, Message, Topic, write
+from conftest import ROOT
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as Recorded
@@ -39,7 +40,7 @@ from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.reports.annotate import METADATA, annotate, targets
 from uncertain_lti.sampling.reading import read_as_fitted, read_as_fitted_with_decisions
 
-BAGS = Path(__file__).resolve().parents[1] / "bags"
+BAGS = ROOT / "bags"
 JUDGED = [output for output in outputs.JUDGED if output.of == "states"]
 TOPICS = {output.name: output.type for output in RECORDED if output.of == "states"}
 VERDICTS = [output.name for output in RECORDED if output.of == "states" and output.when != "changed"]

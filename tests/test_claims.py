@@ -12,13 +12,11 @@
 import itertools
 import re
 import shlex
-from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
 from uncertain_lti.cli.main import build_parser
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def rows() -> list[list[str]]:

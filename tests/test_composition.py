@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from conftest import ROOT
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -31,8 +32,6 @@ from test_live import CONTROL, EPOCH_NS, STATE, by_hand, joint_state, saved, sta
 from uncertain_lti_ros.envelope_monitor import NAME, EnvelopeMonitorNode
 from uncertain_lti_ros.parameters import DEFAULTS
 from uncertain_lti_ros.process import BAD_USAGE
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def pair(k: int) -> tuple[Vector3Stamped, JointState]:

@@ -41,6 +41,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from conftest import ROOT
 from processes import children, own_domain
 
 from uncertain_lti import SignalMap, UncertainLTI
@@ -48,7 +49,6 @@ from uncertain_lti.cli.main import COMMANDS, main
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.monitor.outputs import OUTPUTS
 
-ROOT = Path(__file__).resolve().parent.parent
 PATIENCE = 1200.0  # s for one block; costs nothing where all is well
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if "generated" not in p.name)]
 LANGUAGES = {"sh", "python", "yaml", "json", "text", "matlab", "{toctree}", "{include}", "{eval-rst}"}

@@ -22,11 +22,11 @@ import re
 from pathlib import Path
 
 import pytest
+from conftest import ROOT
 
 import uncertain_lti
 from uncertain_lti.base import errors
 
-ROOT = Path(__file__).resolve().parents[1]
 ERRORS = {n: kind for space in (errors, builtins) for n, kind in vars(space).items()
           if inspect.isclass(kind) and issubclass(kind, Exception)}  # fmt: skip
 

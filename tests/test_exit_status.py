@@ -16,12 +16,12 @@ import shlex
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
 import yaml
 from bag_writer import Message, Topic, write
+from conftest import ROOT
 from engine_bag import engine_bag
 from steps import steps_of
 
@@ -32,8 +32,6 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fit
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.sampling.clock import LONGEST_NS, Status, to_ns
-
-ROOT = Path(__file__).resolve().parents[1]
 
 
 def commands(folder):

@@ -14,10 +14,10 @@ import math
 import shutil
 from collections import namedtuple
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import BagError
@@ -29,7 +29,6 @@ from uncertain_lti.recordings.formats import Format, group_recordings, open_reco
 from uncertain_lti.recordings.recording import Columns, Recording, TopicFacts, TopicInfo
 from uncertain_lti.signals.field_path import FieldType
 
-ROOT = Path(__file__).resolve().parents[1]
 TOPIC, SECOND = "/table", 10**9
 
 

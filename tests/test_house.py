@@ -17,8 +17,8 @@ from importlib import import_module
 from pathlib import Path
 
 import yaml
+from conftest import ROOT
 
-ROOT = Path(__file__).resolve().parents[1]
 ROOMS = (
     "base", "kernel", "signals", "recordings", "sampling", "model", "monitor", "identification", "validation",
     "proposal", "reports", "plants", "cli",

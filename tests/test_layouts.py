@@ -11,10 +11,10 @@
 
 import json
 import re
-from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+from conftest import ROOT
 from rosbags.highlevel import AnyReader
 
 from uncertain_lti import read_transients
@@ -24,7 +24,6 @@ from uncertain_lti.monitor.outputs import OUTPUTS
 from uncertain_lti.reports.layouts import foxglove_layout, plotjuggler_layout
 from uncertain_lti.signals.signal_map import Signal
 
-ROOT = Path(__file__).resolve().parents[1]
 LAYOUTS = ROOT / "config" / "layouts"
 EXAMPLES = {"engine": ("leibov_fit", "leibov_check"), "turbofan": ("turbofan_levels_noise", "turbofan_fan_damage")}
 

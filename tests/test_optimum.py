@@ -10,11 +10,11 @@
 """The optimum: fits against independent solvers of the whole problem, and what is said of the distance from it."""
 
 import itertools
-from pathlib import Path
 
 import numpy as np
 import optimum
 import pytest
+from conftest import ROOT
 from test_identification import drawn, small_plant
 
 from uncertain_lti import OperatingPoint, Transient, read_transients
@@ -23,7 +23,6 @@ from uncertain_lti.identification import fit, working_set
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.structure import Structure
 
-ROOT = Path(__file__).resolve().parents[1]
 KEY = "optimality_gap"
 
 

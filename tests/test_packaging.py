@@ -20,19 +20,18 @@ from collections.abc import Iterable
 from distutils.core import run_setup  # setuptools brings it where Python no longer does
 from functools import cache
 from importlib import metadata
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 from xml.etree import ElementTree
 
 import pytest
+from conftest import ROOT
 from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
 import uncertain_lti
 
-ROOT = Path(__file__).resolve().parent.parent
 LIVE = [
     f"{room.name}.{path.stem}"
     for room in (ROOT / "core" / name for name in ("base", "signals", "model", "monitor"))

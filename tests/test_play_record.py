@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 import pytest
 from bag_writer import JAZZY, Message, Topic, cdr, float64, header, ramp, write
+from conftest import ROOT
 from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
 
@@ -53,7 +54,6 @@ from std_srvs.srv import Trigger
 from uncertain_lti_ros import player
 from uncertain_lti_ros.topics import definition, live_fields, message_class
 
-ROOT = Path(__file__).resolve().parents[1]
 Command = Callable[..., tuple[int, str]]
 START_NS = 1_700_000_000_000_000_000
 

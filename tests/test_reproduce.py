@@ -13,10 +13,10 @@ import io
 import json
 import runpy
 from contextlib import redirect_stdout
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 pytest.importorskip("scipy", reason="scipy, which the experiment needs, is not installed")
 pytest.importorskip("matplotlib", reason="matplotlib, which draws the figures, is not installed")
@@ -60,7 +60,6 @@ def test_the_published_model_is_known_to_the_commands_by_name(cli):
     assert "-15.59-17j" in cli("info", "leibov2006").out
 
 
-ROOT = Path(__file__).resolve().parents[1]
 RECORDINGS = runpy.run_path(str(ROOT / "bags/make.py"))["TURBOFAN"]
 SHIPPED = {make_run(**parameters): ROOT / f"bags/{name}.mcap" for name, parameters in RECORDINGS.items()}
 

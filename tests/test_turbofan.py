@@ -10,10 +10,10 @@
 """The nonlinear turbofan: balances, plausibility, modes, control, faults, and the recordings made with it."""
 
 import runpy
-from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 pytest.importorskip("scipy", reason="scipy, which integrates the turbofan, is not installed")
 
@@ -41,7 +41,6 @@ from uncertain_lti.plants.turbofan_runs import (
 )
 from uncertain_lti.recordings.bag import Bag
 
-ROOT = Path(__file__).resolve().parents[1]
 RECORDINGS = runpy.run_path(str(ROOT / "bags/make.py"))["TURBOFAN"]
 LEVERS = (68.0, 64.0, 60.0, 50.0, 40.0, 25.0, 12.0)
 WALSH_FLETCHER_AIR = (0.992313, 0.236688, -1.852148, 6.083152, -8.893933, 7.097112, -3.234725, 0.794571, -0.081873)

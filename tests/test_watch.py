@@ -18,11 +18,11 @@ import socket
 import subprocess
 import urllib.error
 import urllib.request
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from conftest import ROOT
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -37,7 +37,7 @@ from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.cli.main import main
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 
-BAGS = Path(__file__).resolve().parents[1] / "bags"
+BAGS = ROOT / "bags"
 FITTED = sorted(BAGS.glob("turbofan_*_noise.mcap"))
 DAMAGED = BAGS / "turbofan_fan_damage.mcap"
 
