@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
+from uncertain_lti.base.text import finite_data
 from uncertain_lti.model.alarm_rule import FADING, AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -84,10 +85,7 @@ class Seen:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file."""
-        data = {"kind": self.kind, "of": KINDS[self.kind].of, **vars(self)}
-        if not self.refused:
-            del data["refused"]
-        return {name: _plain(value) for name, value in data.items()}
+        return _plain({"kind": self.kind, "of": KINDS[self.kind].of, **vars(self)})
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +106,8 @@ class Detectable:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file."""
-        data = {"within": self.within, "share": SHARE, **vars(self), "faults": [f.to_dict() for f in self.faults]}
-        if not self.refused:
-            del data["refused"]
-        return data
+        faults = [fault.to_dict() for fault in self.faults]
+        return _plain({"within": self.within, "share": SHARE, **vars(self), "faults": faults})
 
     def find(self, kind: str, signal: str) -> Seen | None:
         """One of the faults."""
@@ -178,11 +174,10 @@ def check_within(within: float | None) -> None:
 
 def typical_within(parts: Sequence[Part]) -> float:
     """Time within which a fault shall be seen, where nobody says."""
-    steps = np.concatenate([p.dt for p in parts])
     spans = [float(p.dt.sum()) for p in parts if p.judged]
     if not spans:
         return WITHIN
-    return min(max(WITHIN, WITHIN_STEPS * float(np.median(steps))), OF_PART * float(np.median(spans)))
+    return min(max(WITHIN, WITHIN_STEPS * _median_step(parts)), OF_PART * float(np.median(spans)))
 
 
 def detectable(
@@ -421,8 +416,6 @@ def _rows(
     return times, x, u, s, inside
 
 
-def _plain(value: Any) -> Any:
-    """As JSON has it: null for what is not finite."""
-    if isinstance(value, tuple):
-        return [_plain(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _plain(data: Mapping[str, Any]) -> dict[str, Any]:
+    """As JSON has it: null for what is not finite, and `refused` only where something is."""
+    return {name: value for name, value in finite_data(data).items() if value or name != "refused"}

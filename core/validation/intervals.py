@@ -55,12 +55,16 @@ def rate_interval(
 
 def share_interval(hits: int, trials: int, confidence: float) -> tuple[float, float]:
     """Exact binomial (Clopper-Pearson) interval for the share of whole transients."""
+    return _binomial_limits(hits, trials - hits, (1.0 - confidence) / 2.0)
+
+
+def _binomial_limits(yes: float, no: float, tail: float) -> tuple[float, float]:
+    """Clopper and Pearson's limits of a share, with this probability beyond each; `yes` and `no` need not be whole."""
     from scipy.special import betainccinv, betaincinv  # scipy.stats takes a second to import
 
-    tail = (1.0 - confidence) / 2.0
-    lower = float(betaincinv(hits, trials - hits + 1, tail)) if hits else 0.0
-    upper = float(betainccinv(hits + 1, trials - hits, tail)) if hits < trials else 1.0
-    return lower, upper
+    low = float(betaincinv(yes, no + 1.0, tail)) if yes > 0 else 0.0
+    high = float(betainccinv(yes + 1.0, no, tail)) if no > 0 else 1.0
+    return low, high
 
 
 def quantile_share_interval(
@@ -74,7 +78,7 @@ def quantile_share_interval(
 
     `units` (N,): cluster of each case; `hits` (N,): whether it has the property.
     """
-    from scipy.special import betainccinv, betaincinv, ndtr, stdtrit
+    from scipy.special import ndtr, stdtrit
 
     unit, hit = np.asarray(units), np.asarray(hits, dtype=np.float64)
     total, found = len(hit), float(hit.mean()) if len(hit) else math.nan
@@ -87,10 +91,7 @@ def quantile_share_interval(
     effect = max(1.0, float(np.sum(residuals**2)) * G / (G - 1) / variance) if variance > 0 else 1.0
     worth = total / effect
     tail = float(ndtr(stdtrit(G - 1, (1.0 - confidence) / 2.0)))
-    yes, no = middle * worth, (1.0 - middle) * worth
-    low = float(betaincinv(yes, no + 1.0, tail)) if yes > 0 else 0.0
-    high = float(betainccinv(yes + 1.0, no, tail)) if no > 0 else 1.0
-    return found, (low, high)
+    return found, _binomial_limits(middle * worth, (1.0 - middle) * worth, tail)
 
 
 def scenario_interval(support: int, transients: int, confidence: float) -> tuple[float, float]:

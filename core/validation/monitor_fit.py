@@ -74,8 +74,6 @@ def fit_monitored(
     groups: Sequence[Any] | str | None = None,
     false_alarms: float | None = None,
     progress: Callable[[str], None] | None = None,
-    describe_data: bool = True,
-    seek_carriers: bool = False,
     centred: bool = False,
     **options: Any,
 ) -> Monitored:
@@ -85,11 +83,11 @@ def fit_monitored(
     """
     if centred:
         options["operating_point"] = _medians(transients)
-    said: dict[str, Any] = {"describe_data": describe_data, "seek_carriers": seek_carriers}
-    model = fit(transients, progress=progress, **said, **options)
+    model = fit(transients, progress=progress, **options)
     names, _ = resolve_groups(transients, groups)
     units = len(set(names)) if names else len(transients)
-    left = {k: v for k, v in options.items() if k not in ("schedule", "transient_weights")}
+    of_the_fit_alone = ("schedule", "transient_weights", "describe_data", "seek_carriers")
+    left = {name: value for name, value in options.items() if name not in of_the_fit_alone}
     size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
     if options.get("transient_weights") is not None:
         return Monitored(

@@ -125,9 +125,8 @@ class Evidence:
     def from_dict(cls, data: Mapping[str, Any]) -> Evidence:
         """Of `to_dict`."""
         found: dict[str, Any] = {each.name: of_text(data[each.name]) for each in fields(cls)}
-        return cls(
-            **{each.name: found[each.name].item() if each.type == "float" else found[each.name] for each in fields(cls)}
-        )
+        numbers = {each.name: found[each.name].item() for each in fields(cls) if each.type == "float"}
+        return cls(**found | numbers)
 
     def thresholds(self, rules: Sequence[StatisticRule], n: int, what: str) -> list[Array]:
         """Of each rule (n,) or (1,), but for the factor."""
