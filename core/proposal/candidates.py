@@ -37,7 +37,7 @@ WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wra
 """Functions that give an angle which jumps by a turn, likewise."""
 
 
-@dataclass
+@dataclass(eq=False)
 class Candidate:
     """One number of a topic that could be a signal.
 
@@ -84,7 +84,7 @@ class Candidate:
         return self.path.partition("[")[0]
 
 
-@dataclass
+@dataclass(eq=False)
 class Source:
     """One topic: its times per recording, what it seems to be, and its numbers.
 
@@ -417,7 +417,7 @@ def take_switches(sources: Sequence[Source]) -> list[Source]:
             continue
         for candidate in switches:
             candidate.reason = ""
-        table.candidates = [c for c in table.candidates if not any(c is one for one in switches)]
+        table.candidates = [c for c in table.candidates if c not in switches]
         found.append(replace(table, candidates=switches, role="switch", reason=""))
     return found
 
@@ -437,7 +437,7 @@ def at_rest(sources: Sequence[Source]) -> str:
 def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
     """Give the roles that a person asks for in place of those by name."""
     asked = [("state", p) for p in states] + [("control", p) for p in controls]
-    met: dict[str, set[int]] = {"state": set(), "control": set()}
+    met: dict[str, set[Candidate]] = {"state": set(), "control": set()}
     for role, pattern in asked:
         topic, _, field = pattern.partition(":")
         found = [
@@ -448,16 +448,16 @@ def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence
         ]
         if not any(not c.reason for c in found):
             fields = [f"{s.topic}:{c.path}" for s in sources for c in s.candidates if pattern == c.path]
-            why = f"; topics there: {_topics(sources)}"
+            why = f"; topics there: {shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)}"
             if found:
                 why = f"; {found[0].path} is {found[0].reason}"
             elif fields:
                 why = f"; a field is asked for with its topic, {' or '.join(fields[:3])}"
             raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
-        met[role] |= {id(c) for c in found}
+        met[role].update(found)
     for source in sources:
         for role, patterns in (("state", states), ("control", controls)):
-            mine, why = {id(c) for c in source.candidates} & met[role], f"not asked for by --{role}s"
+            mine, why = met[role].intersection(source.candidates), f"not asked for by --{role}s"
             if mine:
                 source.role, source.reason = role, ""
             elif patterns and source.role == role:
@@ -465,17 +465,13 @@ def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence
             else:
                 continue
             for candidate in source.free:
-                if id(candidate) not in mine:
+                if candidate not in mine:
                     candidate.reason = source.reason or why
 
 
 def _plain(path: str) -> str:
     """A field path without what a pattern would take for a choice of letters."""
     return path.replace("[", "(").replace("]", ")")
-
-
-def _topics(sources: Sequence[Source]) -> str:
-    return shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)
 
 
 def _held_columns(table: Source) -> Source | None:
@@ -485,9 +481,9 @@ def _held_columns(table: Source) -> Source | None:
     """
     if table.type != TYPE:
         return None
-    changed = {id(c): np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
-    held = [c for c in table.free if FEWEST_SET <= changed[id(c)].sum() <= MOST_SET * len(changed[id(c)])]
-    rest = replace(table, candidates=[c for c in table.candidates if not any(c is other for other in held)])
+    changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
+    held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows)]
+    rest = replace(table, candidates=[c for c in table.candidates if c not in held])
     found = replace(table, candidates=held, role="guess")
     if not held or not rest.free or explained(rest, [found]) <= SHOWS:
         return None

@@ -511,7 +511,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         set_own_scale(candidate)
         candidate.name, candidate.scale = candidate.path, candidate.scale or 1.0
         candidate.steady = 0.0  # what returns to its median would alarm on every change of load
-    return states, [c for c in free if any(c is one for one in controls)]
+    return states, [c for c in free if c in controls]
 
 
 def _finite(candidate: Candidate) -> Array:

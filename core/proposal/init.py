@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import product
@@ -54,15 +54,12 @@ from uncertain_lti.proposal.signals_file import (
 )
 from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.recordings.recording import Recording, TopicFacts
+from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
 from uncertain_lti.sampling.steady_state import codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
 from uncertain_lti.signals.values import TableLayout
-
-Iterate = Callable[[Iterable[object], int], Iterable[object]]
-
 
 LONGEST_ARRAY = 24
 """Entries of an array that are looked at one by one; a longer one is a picture, a scan or a map."""
@@ -84,7 +81,7 @@ _APART = "not in every recording"
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 
 
-def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[Source]:
+def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[Source]:
     """Every topic of the recordings with its numbers."""
     facts: dict[str, TopicFacts] = {}
     for bag in bags:
@@ -127,7 +124,7 @@ def read_sources(bags: Sequence[Recording], progress: Iterate | None) -> list[So
     return sources
 
 
-def moving_numbers(bag: Recording, progress: Iterate | None) -> tuple[list[tuple[str, str, Array, Array]], list[str]]:
+def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tuple[str, str, Array, Array]], list[str]]:
     """Every number of a recording that moves.
 
     Returns (messages,): topic, path, time of arrival in s after the first message of them all, and values.
@@ -213,7 +210,7 @@ def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
     return found
 
 
-def _read(bag: Recording, sources: Sequence[Source], progress: Iterate | None) -> None:
+def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) -> None:
     """Values of every candidate in one recording."""
     for source in sources:
         readable = [c for c in source.candidates if not c.reason]
@@ -344,7 +341,7 @@ class Proposal:
 @np.errstate(all="ignore")
 def propose(
     paths: Sequence[str | os.PathLike[str]],
-    progress: Iterate | None = None,
+    progress: Progress | None = None,
     *,
     states: Sequence[str] = (),
     controls: Sequence[str] = (),
@@ -388,15 +385,16 @@ def propose(
     if runs:
         bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
     sources = read_sources(bags, progress)
-    labels = set_aside_labels(sources, bags) if not states else []
+    warnings = [warning for bag in bags for warning in bag.warnings]
+    warnings += set_aside_labels(sources, bags) if not states else []
     if not (states or controls or like) and is_plant(sources):
-        return _of_plant(bags, sources, runs, labels)
+        return _of_plant(bags, sources, runs, warnings)
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     switches = [] if controls else take_switches(sources)
     commands, measured = assign_roles(sources)
     commands += switches
-    sources += [s for s in commands if not any(s is other for other in sources)]  # columns of a table
+    sources += [s for s in commands if s not in sources]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
@@ -422,29 +420,29 @@ def propose(
     set_operating_point(chosen, used, sources)
     for candidate in ready:
         set_own_scale(candidate)
-    warnings = (*(warning for bag in bags for warning in bag.warnings), *labels, *([doubt] if doubt else []))
+    warnings += [doubt] if doubt else []
     for topic in (s.topic for s in sources if s.role == "control"):
         lacking = [str(bag.path) for bag in bags if topic not in bag.topics or not bag.topics[topic].count]
         if 0 < len(lacking) < len(bags):
             without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
-            warnings = (*warnings, f"{without}, so it is no control; leave those recordings out")
+            warnings.append(f"{without}, so it is no control; leave those recordings out")
     members = _members(chosen, used, moving)
     try:
         memories = _memories(chosen, used, sources)
     except ModuleNotFoundError as error:  # all but this needs no solver
-        memories, warnings = [], (*warnings, f"what lies further back was not tried: {absent(error.name) or error}")
+        memories = []
+        warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
     text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
-    return Proposal(tuple(chosen), tuple(used), text, warnings, tuple(members))
+    return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
 
 
-def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str, labels: Sequence[str]) -> Proposal:
+def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str, warnings: Sequence[str]) -> Proposal:
     """The proposal for process data; names are those of the columns."""
     chosen, used = plant_signals(sources)
     if not chosen:
         raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
     text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
-    warnings = (*(warning for bag in bags for warning in bag.warnings), *labels)
-    return Proposal(tuple(chosen), tuple(used), text, warnings)
+    return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
 
 
 def _members(

@@ -214,7 +214,7 @@ def signals_file(
         ]
     members = members or {}
     proposed = [*states, *controls, *(c for alike in members.values() for c in alike)]
-    left_out = _left_out(sources, {id(c) for c in proposed})
+    left_out = _left_out(sources, set(proposed))
     if left_out:
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
@@ -254,12 +254,10 @@ def _place(name: str, member: str) -> str:
 
 def _quoted(text: str) -> str:
     """As YAML takes it: plain where it may stand so, and is not read as a number or a truth value."""
-    plain = not re.fullmatch(r"(?i)(y|n|yes|no|on|off|true|false|null|nan|\\.inf)", text)
-    return (
-        text
-        if plain and re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_./-]*", text)
-        else json.dumps(text, ensure_ascii=not text.isprintable())
-    )
+    special = re.fullmatch(r"(?i)(y|n|yes|no|on|off|true|false|null|nan|\\.inf)", text)
+    if re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_./-]*", text) and not special:
+        return text
+    return json.dumps(text, ensure_ascii=not text.isprintable())
 
 
 def entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
@@ -281,12 +279,12 @@ def _number(value: float, exact: bool = False) -> str:
     return text.replace("e", ".0e") if "e" in text and "." not in text else text
 
 
-def _left_out(sources: Sequence[Source], chosen: set[int]) -> list[str]:
+def _left_out(sources: Sequence[Source], chosen: set[Candidate]) -> list[str]:
     lines = []
     for source in sources:
         groups: dict[str, list[str]] = {}
         for candidate in source.candidates:
-            if id(candidate) not in chosen and not candidate.ready:
+            if candidate not in chosen and not candidate.ready:
                 groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
         of = {reason: f" {shortlist(paths, 6)}" for reason, paths in groups.items()}
         if source.reason and set(groups) <= {source.reason}:

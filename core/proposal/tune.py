@@ -347,18 +347,14 @@ def tune(
         if progress is not None:
             progress(CountedStep(text, len(trials), max(len(trials) + 1, 12)))
 
+    shared: dict[str, Any] = {"groups": groups, "false_alarms": false_alarms, "progress": hurried}
+
     def attempt(setting: Setting) -> bool:
         nonlocal best, least, model, reason, missed
         hurried(setting.words)
         try:
             runs = setting.prepared(transients)
-            found = fit_monitored(
-                runs,
-                groups=groups,
-                false_alarms=false_alarms,
-                progress=hurried,
-                **{"schedule": {}, **setting.options},
-            )
+            found = fit_monitored(runs, **{"schedule": {}, **setting.options, **shared})
             if found.panel is None:
                 raise FitError(found.why)
             kind, headline = worth(found.model, found.panel)
@@ -432,29 +428,26 @@ def recall(values: Array, memory: Memory, dt: Array, opens: NDArray[np.bool_]) -
 def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory]]) -> Transient:
     """The same run with further controls that follow from earlier samples of its states and controls."""
     names = [*transient.state_names, *transient.control_names, *transient.scheduling_names]
-    z = np.hstack([transient.x, transient.u])
+    z, signals = np.hstack([transient.x, transient.u]), transient.signals
+    there = names[: z.shape[1]]
     columns, added = [], []
     for name, (of, memory) in memories.items():
-        if of not in names[: z.shape[1]]:
-            there = names[: z.shape[1]]
+        if of not in there:
             raise TransientError(
                 f"{transient.name}: there is no '{of}'{meant(of, there)}; there are {', '.join(there)}"
             )
         if name in names:
             raise TransientError(f"{transient.name}: '{name}' is there already; choose another name")
         names.append(name)
-        place = names.index(of)
+        place = there.index(of)
         columns.append(_column(transient, z[:, place], memory))
-        if transient.signals is not None:
-            added.append(memory_of(transient.signals[place], memory, name))
+        if signals is not None:
+            added.append(memory_of(signals[place], memory, name))
     u = np.column_stack([transient.u, *columns])
-    if transient.signals is not None:
-        signals = replace(transient.signals, controls=(*transient.signals.controls, *added))
-        signals = replace(
-            signals, structure=with_rules(signals.structure, {name: of for name, (of, _) in memories.items()})
-        )
-        return transient.replace(u=u, signals=signals)
-    return transient.replace(u=u, control_names=(*transient.control_names, *memories))
+    if signals is None:
+        return transient.replace(u=u, control_names=(*transient.control_names, *memories))
+    rules = with_rules(signals.structure, {name: of for name, (of, _) in memories.items()})
+    return transient.replace(u=u, signals=replace(signals, controls=(*signals.controls, *added), structure=rules))
 
 
 def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
