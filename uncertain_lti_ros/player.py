@@ -164,21 +164,16 @@ def _offer(
 
 def _hold_layout(type_name: str, recorded: TypeFields, installed: TypeFields) -> None:
     """Raise SignalError where recorded bytes would be read wrongly by the type that is installed."""
-    waiting, seen = [type_name], set()
-    while waiting:
-        name = waiting.pop()
-        if name in seen:
-            continue
-        seen.add(name)
-        layouts = []
-        for fields in (recorded(name), installed(name)):
-            layouts.append(
-                [(n.rstrip("_"), f.kind, f.array, "" if f.kind == "string" else f.type_name) for n, f in fields.items()]
-            )
-            waiting += [f.type_name for f in fields.values() if f.kind == "message"]
-        same = [[(n, k, a, "uint8" if t == "char" else t) for n, k, a, t in layout] for layout in layouts]
-        if same[0] != same[1]:
-            raise SignalError(f"{name} was recorded in another version than is installed; install the recorded one")
+    alike = {"char": "uint8"}
+    then, now = (
+        [(n.rstrip("_"), f.kind, f.array, f.kind == "string" or alike.get(f.type_name, f.type_name)) for n, f in of]
+        for of in (recorded(type_name).items(), installed(type_name).items())
+    )
+    if then != now:
+        raise SignalError(f"{type_name} was recorded in another version than is installed; install the recorded one")
+    used = [f.type_name for f in installed(type_name).values() if f.kind == "message"]
+    for name in reversed(used):
+        _hold_layout(name, recorded, installed)
 
 
 def _durability(bag: Bag, topic: str) -> DurabilityPolicy:

@@ -114,26 +114,20 @@ def definition(type_name: str) -> str:
 
     Constants and default values are not in it: a class does not hold them, and no reader of messages needs them.
     """
-    bodies: dict[str, str] = {}
-    waiting = [full_name(type_name)]
-    while waiting:
-        name = waiting.pop(0)
-        if name in bodies:
-            continue
+    names, parts = [full_name(type_name)], list[str]()
+    for name in names:  # and those that are found in it
+        if parts:
+            package, _, short = name.split("/")
+            parts.append(f"{'=' * 80}\nMSG: {package}/{short}\n")
         lines = []
         for field, text in message_class(name).get_fields_and_field_types().items():
             element, _, array = _split(text)
-            if "/" in element:
-                waiting.append(full_name(element))
+            if "/" in element and full_name(element) not in names:
+                names.append(full_name(element))
             written = {"boolean": "bool", "octet": "byte"}.get(element, _NUMBERS.get(element, element))
             written = re.sub(r"<(\d+)>", r"<=\1", written)  # a bounded string
             lines.append(f"{written}{array} {field}\n")
-        bodies[name] = "".join(lines) or "uint8 structure_needs_at_least_one_member\n"
-    first, *others = bodies.items()
-    parts = [first[1]]
-    for name, body in others:
-        package, _, short = name.split("/")
-        parts.append(f"{'=' * 80}\nMSG: {package}/{short}\n{body}")
+        parts += lines or ["uint8 structure_needs_at_least_one_member\n"]
     return "".join(parts)
 
 

@@ -253,13 +253,6 @@ PUBLISHED = helped("model", "model file, or leibov2006 for the published one")
 """A model file, or the published model."""
 
 
-def declare(parser: argparse.ArgumentParser, options: tuple[Option, ...]) -> None:
-    """Declare the options of a command."""
-    for option in options:
-        name, changes = (option, {}) if isinstance(option, str) else option
-        parser.add_argument(name, **OPTIONS[name] | changes)
-
-
 @dataclass(frozen=True)
 class Result:
     """What a command comes to: `data` for --json, if it has any; else `text`, which --quiet prints as well."""
@@ -295,7 +288,9 @@ class Command:
     def declare(self, parser: argparse.ArgumentParser, chosen: str, every: bool) -> None:
         """Declare the arguments on a parser; those of a module of ROS if it is chosen, or where it can be imported."""
         if self.run is not None:
-            declare(parser, self.options)
+            for option in self.options:
+                name, changes = (option, {}) if isinstance(option, str) else option
+                parser.add_argument(name, **OPTIONS[name] | changes)
             parser.set_defaults(run=self.run)
         elif every or self.name == chosen:
             with nullcontext() if self.name == chosen else suppress(ModuleNotFoundError, UncertainLTIError):

@@ -187,23 +187,19 @@ class Alarm:
         `sizes` (H, n): utilisation there, for one step and for each horizon; `flags` (n,): 1 for a state that violates
         its one-step bounds there.
         """
-        found = []
-        names = self._model.state_names
+        found, names = list[Raised](), self._model.state_names
         for i in rules:
-            rule, label, span = self.rules[i], self.labels[i], self._spans[i]
+            rule, begin = self.rules[i], self._begins[i]
             if isinstance(rule, AlarmRule):
                 left = flags == 1.0 if rule.horizon == 1 else np.abs(sizes[row_of(rule, self._model)]) > rule.margin
-                blamed = [names[j] for j in np.flatnonzero(left & self._counted)]
-                found += [Raised(label, rule.kind, rule.horizon, name, 1.0, span) for name in blamed or [""]]
-                continue
-            begin = self._begins[i]
-            if rule.kind in JOINT:
-                state = self._nearest_state(values)
-                found.append(Raised(label, rule.kind, rule.horizon, state, float(values[begin]), span))
-                continue
-            for j in np.flatnonzero(self._counted).tolist():
-                if abs(values[begin + j]) > 1.0:
-                    found.append(Raised(label, rule.kind, rule.horizon, names[j], float(values[begin + j]), span))
+                blamed = {names[j]: 1.0 for j in np.flatnonzero(left & self._counted)} or {"": 1.0}
+            elif rule.kind in JOINT:
+                blamed = {self._nearest_state(values): float(values[begin])}
+            else:
+                own = {j: float(values[begin + j]) for j in np.flatnonzero(self._counted).tolist()}
+                blamed = {names[j]: value for j, value in own.items() if abs(value) > 1.0}
+            label, span = self.labels[i], self._spans[i]
+            found += [Raised(label, rule.kind, rule.horizon, state, value, span) for state, value in blamed.items()]
         return tuple(found)
 
     def _nearest_state(self, values: Sequence[float]) -> str:

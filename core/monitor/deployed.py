@@ -105,17 +105,11 @@ class DeployedMonitor:
         these values.
         """
         t, count = transient.t, len(transient)
-        inside = np.ones(count, dtype=bool)
-        if self.start is not None:
-            inside &= t >= self.start
-        if self.stop is not None:
-            inside &= t <= self.stop
-        a, b = 0, count
-        if not inside.all():
-            if not inside.any():
-                raise ModelError(f"{transient.name}: no sample lies between the times asked for; it has {t[-1]:g} s")
-            chosen = np.flatnonzero(inside)
-            a, b = int(chosen[0]), int(chosen[-1]) + 1
+        first, last = (-math.inf if self.start is None else self.start), (math.inf if self.stop is None else self.stop)
+        inside = np.flatnonzero((first <= t) & (t <= last))
+        if count and not len(inside):
+            raise ModelError(f"{transient.name}: no sample lies between the times asked for; it has {t[-1]:g} s")
+        a, b = (int(inside[0]), int(inside[-1]) + 1) if count else (0, 0)
         arming = Arming(self.condition, to_ns(self.grace))
         came, heard = np.asarray(before, dtype=np.intp) - a, np.asarray(values, dtype=np.float64)
         for value in heard[came < 0][-1:].tolist():
@@ -195,14 +189,14 @@ def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]],
         text += f"{100 * abs(math.expm1(slope)):.2g} % a {unit} over {plural(len(x), what)}"
         left = (math.log(limit) - float(np.log(peaks).mean())) / slope - float(x[-1])
         if slope > 0.0 and left < _FAR:
-            when = f"in {plural(math.ceil(left), what)}"
-            if dated:
-                when = f"on {datetime.fromtimestamp(stamps[-1] / 1e9, UTC) + timedelta(weeks=left):%Y-%m-%d}"
-            text += f"; at that rate it reaches its threshold of {limit:.3g} {when}" if left > 0.0 else "; it is past "
-            text += "" if left > 0.0 else f"its threshold of {limit:.3g}"
-            text += (
-                ", and the promised rate of false alarms no longer holds: if the machine is healthy, update the model"
-            )
+            where = f"it is past its threshold of {limit:.3g}"
+            if left > 0.0:
+                when = f"in {plural(math.ceil(left), what)}"
+                if dated:
+                    when = f"on {datetime.fromtimestamp(stamps[-1] / 1e9, UTC) + timedelta(weeks=left):%Y-%m-%d}"
+                where = f"at that rate it reaches its threshold of {limit:.3g} {when}"
+            text += f"; {where}, and the promised rate of false alarms no longer holds: if the machine is healthy, "
+            text += "update the model"
         found.append(text)
     return found
 

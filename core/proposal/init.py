@@ -145,10 +145,8 @@ def run_column(bags: Sequence[Recording]) -> str:
     tables = [bag for bag in bags if isinstance(bag, Table)]
     if not tables or len(tables) < len(bags):
         return ""
-    for name in tables[0].columns_by_field:
-        if all(_tells_runs(table, name) for table in tables):
-            return name
-    return ""
+    told = (name for name in tables[0].columns_by_field if all(_tells_runs(table, name) for table in tables))
+    return next(told, "")
 
 
 def _tells_runs(table: Table, name: str) -> bool:

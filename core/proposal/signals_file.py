@@ -71,9 +71,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
     inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
     words = [w for w in _split(inner) if w not in _DULL]
-    if not words or all(len(w) == 1 or w.isdigit() for w in words):
-        if candidate.topic != TOPIC:  # that of every table says nothing
-            words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
+    if candidate.topic != TOPIC and all(len(w) == 1 or w.isdigit() for w in words):  # that of a table says nothing
+        words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
     return words or ["signal"]
 
 

@@ -305,13 +305,11 @@ def _size(low: Array, high: Array) -> Array:
 
 def _fmax(values: Array) -> Array:
     """Greatest of each row; NaN where there is none."""
-    greatest: Array = np.fmax.reduce(values, axis=1, initial=np.nan)
-    return greatest
+    return np.asarray(np.fmax.reduce(values, axis=1, initial=np.nan))
 
 
 def _most(values: Array) -> Array:
-    greatest: Array = np.nan_to_num(np.fmax.reduce(values, axis=0, initial=0.0), posinf=1e9)
-    return greatest
+    return np.asarray(np.nan_to_num(np.fmax.reduce(values, axis=0, initial=0.0), posinf=1e9))
 
 
 def envelope_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, chosen: Sequence[int]) -> Chart:

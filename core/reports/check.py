@@ -238,15 +238,11 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
 
 def _explained(model: UncertainLTI, verdicts: Verdicts) -> Iterator[dict[str, Any]]:
     """What the alarms look like, those close to one another together."""
-    if not verdicts.alarm.any():
-        return
-    v = verdicts
-    patterns = over_recording(model, v)
-    for start, stop, explainer in patterns:
+    for start, stop, explainer in over_recording(model, verdicts):
         like = explainer.likeness()
         if like is not None and like.verdicts >= LEAST:
             yield {
-                **_span(v.transient, start, stop + 1),
+                **_span(verdicts.transient, start, stop + 1),
                 "label": like.label or None,
                 "matches": dict(like.matches),
                 "parts": [part._asdict() for part in like.parts],

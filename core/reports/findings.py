@@ -98,7 +98,7 @@ def findings(
     )
     reasons = sorted((reason for kind in kinds for reason in kind), key=lambda reason: WEIGHTS.index(reason[0]))
     fit = model.fit_summary
-    facts = {
+    facts: dict[str, Any] = {
         "version": __version__,
         "rely": {
             "answer": reasons[0][0] if reasons else YES,
@@ -129,8 +129,7 @@ def findings(
         "validation": validation,
         "recordings": recordings,
     }
-    finite: dict[str, Any] = finite_data(facts)
-    return finite
+    return {key: finite_data(value) for key, value in facts.items()}
 
 
 def findings_text(facts: Mapping[str, Any]) -> str:

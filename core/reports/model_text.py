@@ -147,12 +147,10 @@ def schedule_blocks(choice: Mapping[str, Any]) -> list[Block]:
         sizes = [share(c["outside"], 2), share(c["excess"]), f"x {c['width']:.3g}", f"x {c['jumps']:.3g}"]
         at = ", ".join(f"{k:.4g}" for k in c["at"]) or "-"
         rows.append([_chosen(c["knots"], c["knots"] == choice["chosen"]), *sizes, at])
-    title = f"knots on {choice['signal']}, {_left_out(choice)}:"
-    return [
-        title,
-        *([Table(("knots", "outside", "excess", "mean width", "jumps seen", "at"), rows)] if rows else []),
-        *refused,
-    ]
+    blocks: list[Block] = [f"knots on {choice['signal']}, {_left_out(choice)}:"]
+    if rows:
+        blocks.append(Table(("knots", "outside", "excess", "mean width", "jumps seen", "at"), rows))
+    return [*blocks, *refused]
 
 
 def horizon_blocks(choice: Mapping[str, Any]) -> list[Block]:

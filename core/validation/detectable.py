@@ -210,18 +210,14 @@ def detectable(
     steps = within / max(_median_step(parts), 1e-12) + _memory(model, _median_step(parts))
     cases = max(min(cases, int(LIMIT / (max(len(pairs), 1) * (ROUNDS + 1) * steps))), 2 * FEWEST)
     every = _cases(model, parts, within, cases, seed)
-    left_out = 0
-    if every is not None:
-        alone = np.isinf(every.delays([(every.windows.x, every.windows.u)])[0])
-        left_out = int(np.count_nonzero(~alone))
-        every = every.take(alone)
-    count = 0 if every is None else len(every.t_ns)
-    if every is None or count < FEWEST:
-        why = (
-            f"{count} cases of {within:g} s without an alarm are too few to say which faults are seen"
-            if count or left_out
-            else f"nothing that was left out lasts {within:g} s without a gap; record longer runs, or ask for less time"
-        )
+    if every is None:
+        why = f"nothing that was left out lasts {within:g} s without a gap; record longer runs, or ask for less time"
+        return Detectable(within, confidence, 0, 0, refused=why)
+    alone = np.isinf(every.delays([(every.windows.x, every.windows.u)])[0])
+    every, left_out = every.take(alone), int(np.count_nonzero(~alone))
+    count = len(every.t_ns)
+    if count < FEWEST:
+        why = f"{count} cases of {within:g} s without an alarm are too few to say which faults are seen"
         return Detectable(within, confidence, count, left_out, refused=why)
     growth = 1.0
     if model.sampling.dt_median is not None:  # by how much the nominal model multiplies a deviation within the time

@@ -239,8 +239,7 @@ def _options(model: UncertainLTI) -> Mapping[str, Any]:
             raise FitError(f"the model does not say by which {key} it was fitted; fit it again")
     if facts.get("weights", "ones") != "ones":
         raise FitError("the model was fitted with weights, which its file does not hold; use validate() from Python")
-    options: dict[str, Any] = {"criterion": facts["criterion"], "additive": facts["additive"]}
-    options |= {key: facts[key] for key in ("discard", "count") if key in facts}
+    options: dict[str, Any] = {key: facts[key] for key in ("criterion", "additive", "discard", "count") if key in facts}
     if "structure" in facts:
         options["structure"] = Structure.from_dict(facts["structure"], model.n, model.m)
     return options
