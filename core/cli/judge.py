@@ -196,7 +196,9 @@ def run_report(options: argparse.Namespace) -> Result:
 def run_plot(options: argparse.Namespace) -> Result:
     """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.reports.pages import HOLDS, page_target
+    from uncertain_lti.reports.charts import base_name
+    from uncertain_lti.reports.figures import alarm_figure, matrices_figure, save
+    from uncertain_lti.reports.pages import HOLDS, interactive_page, page_target, plotted_check, write_page
 
     named = _names_model(options.bags[0])
     model = load_model(options.bags[0]) if named else None
@@ -215,16 +217,25 @@ def run_plot(options: argparse.Namespace) -> Result:
     if not page and len(bags) > 1:
         raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
     page_target(output, options.bags[0] if named else "", bags)
-    status = DONE
-    if model is None:
-        _write_page("Recorded", bags, _recorded(options, bags), output)
-    elif bags:
-        status = _plot_judged(options, Judged(options, model, bags), output)
-    else:
-        from uncertain_lti.reports.figures import matrices_figure, save
-
+    judged = Judged(options, model, bags) if model is not None and bags else None
+    if page:
+        if judged is None:
+            about, plotted = "Recorded", _recorded(options, bags)
+        else:
+            about = os.path.basename(options.bags[0])
+            plotted = [plotted_check(judged.model, verdicts, len(bags)) for _, verdicts, _ in judged]
+        if not plotted:
+            nothing = "no recording could be checked, so nothing is drawn"
+            raise BagError(f"{nothing}; name one that has the topics of the model")
+        title = f"{about}: {shortlist([base_name(bag.path) for bag in bags], 1)}"
+        write_page(output, interactive_page(title, plotted))
+    elif judged is not None:
+        for _, verdicts, _ in judged:
+            save(alarm_figure(judged.model, verdicts), output, 200)
+    elif model is not None:
         save(matrices_figure(model), output, 200)
     options.say(f"plot written to {output}")
+    status = DONE if judged is None else judged.status
     recordings = [str(bag.path) for bag in bags]
     data = {"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status}
     return Result(status, data)
@@ -238,24 +249,6 @@ def _names_model(path: str) -> bool:
         return False
     with open(path, "rb") as stream:
         return stream.read(100).lstrip()[:1] == b"{"
-
-
-def _plot_judged(options: argparse.Namespace, judged: Judged, output: Path) -> int:
-    plotted: list[Plotted] = []
-    for _, verdicts, _ in judged:
-        if output.suffix == ".html":
-            from uncertain_lti.reports.pages import plotted_check
-
-            plotted.append(plotted_check(judged.model, verdicts, len(judged.bags)))
-        else:
-            from uncertain_lti.reports.figures import alarm_figure, save
-
-            save(alarm_figure(judged.model, verdicts), output, 200)
-    if len(judged.refused) == len(judged.bags):
-        raise BagError("no recording could be checked, so nothing is drawn; name one that has the topics of the model")
-    if plotted:
-        _write_page(os.path.basename(options.bags[0]), judged.bags, plotted, output)
-    return judged.status
 
 
 def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Plotted]:
@@ -280,13 +273,6 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
         note = "Every number that moves, over the time of arrival." + f" Left out: {shortlist(left, 8)}." * bool(left)
         plotted.append(plotted_fields(str(bag.path), fields, note, len(bags)))
     return plotted
-
-
-def _write_page(title: str, bags: Sequence[Recording], plotted: list[Plotted], output: Path) -> None:
-    from uncertain_lti.reports.charts import base_name
-    from uncertain_lti.reports.pages import interactive_page, write_page
-
-    write_page(output, interactive_page(f"{title}: {shortlist([base_name(bag.path) for bag in bags], 1)}", plotted))
 
 
 CHECK = Command(
