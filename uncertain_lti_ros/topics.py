@@ -174,17 +174,8 @@ class PolledEvents:
         self._handlers.clear()
 
 
-class _WaitSet:
-    """A wait set in which everything is ready; a status without changes costs nothing."""
-
-    def add_event(self, _: Any) -> int:
-        return 0
-
-    def is_ready(self, _kind: str, _index: int) -> bool:
-        return True
-
-
-_EVERY = _WaitSet()
+_EVERY = SimpleNamespace(add_event=lambda _: 0, is_ready=lambda kind, index: True)
+"""A wait set in which everything is ready; a status without changes costs nothing."""
 
 
 @dataclass(frozen=True)

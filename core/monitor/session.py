@@ -89,20 +89,18 @@ class Session(Stream):
             text = f"outside the fitted domain in {outside} of {period.verdicts} verdicts"
             complaints.append(f"{text}: {where}" if where else text)
         for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
-            if period.statuses[status]:
-                which = ""
-                if status is Status.MISSING:
-                    which = f" ({shortlist([signal.name for signal in lacking], SHOWN)})"
+            if count := period.statuses[status]:
                 why = why_not(status, self.model)
                 if status is Status.MODE and period.last_unlisted is not None:
                     why = self.model.why_unlisted(period.last_unlisted.before)
-                complaints.append(f"{period.statuses[status]} samples without a verdict: {why}{which}")
+                if status is Status.MISSING:
+                    why += f" ({shortlist([signal.name for signal in lacking], SHOWN)})"
+                complaints.append(f"{count} samples without a verdict: {why}")
         complaints += self.absent(lacking)
-        dropped = sum(count for status, count in period.statuses.items() if status.dropped)
-        if dropped:
-            which = ", ".join(f"{status.value} {count}" for status, count in period.statuses.items() if status.dropped)
+        if dropped := Counter({status.value: n for status, n in period.statuses.items() if status.dropped}):
+            which = ", ".join(f"{kind} {n}" for kind, n in dropped.items())
             coarse = self.coarse_clock(period.statuses[Status.EQUAL])
-            complaints.append(f"{dropped} messages dropped ({which}){coarse}")
+            complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
         if late := self.late - period.late:
             complaints.append(f"{late} messages came too late")
         if self.unreadable.total() > period.unreadable:
@@ -217,10 +215,8 @@ class Session(Stream):
         return ", ".join(parts)
 
     def _report_state(self, i: int, name: str, period: Period, without: float, timeout: float) -> Report:
-        values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i])}
-        masked = name in self.monitor.masked
-        values["masked"] = str(int(masked))
-        violated = period.violations[i]
+        masked, violated = name in self.monitor.masked, period.violations[i]
+        values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i]), "masked": str(int(masked))}
         if self.last is not None:
             values |= {
                 output.name: repr(self.last.numbers(output.position)[i]) for output in JUDGED if output.of == "states"
@@ -476,11 +472,9 @@ def _digits(value: float, by: float) -> int:
 
 def _left(session: Session, verdict: Verdict) -> str:
     """The states that left their bounds, and by how much."""
-    numbers = zip(
-        session.model.state_names, *(verdict.numbers(n) for n in ("flags", "state", "lower", "upper")), strict=True
-    )
+    numbers = (verdict.numbers(kind) for kind in ("flags", "state", "lower", "upper"))
     left = []
-    for name, flag, value, lower, upper in numbers:
+    for name, flag, value, lower, upper in zip(session.model.state_names, *numbers, strict=True):
         if flag == 1.0 and name not in session.monitor.masked:
             side, by = ("above", value - upper) if value > upper else ("below", lower - value)
             digits = _digits(value, by)

@@ -101,9 +101,8 @@ class Scene:
     definition: Callable[[str], str]
     reasons: Reasons | None = None
 
-    def write(self, path: Path) -> int:
+    def write(self, path: Path) -> None:
         """Write an MCAP file."""
-        count = 0
         messages = VerdictMessages(self.names)
         encode = {name: messages.encoder([name]) for name in messages.outputs}
         has = len(self.names["states"]), len(self.names["horizons"]), tuple(self.names["statistics"])
@@ -127,7 +126,6 @@ class Scene:
                 if entry.topic not in inputs:
                     continue  # of the previous model
                 writer.message(inputs[entry.topic], log_time, entry.data)
-                count += 1
                 for verdict in entry.verdicts:
                     horizons = verdict.n * (1 + verdict.horizons) if verdict.horizons else 0
                     if (verdict.n, horizons, verdict.statistic_names) != has:
@@ -138,17 +136,15 @@ class Scene:
                         alarm = TRUE if entry.alarm else FALSE
                         data = alarm if output.type == FLAG_TYPE else encode[output.name](verdict)[0]
                         writer.message(channel, log_time, data)
-                        count += 1
                     if reason is None or self.reasons is None:
                         continue
                     text = self.reasons.take(verdict, entry.alarm)
                     if text != said:
                         writer.message(reason, log_time, text_message(text))
-                        count, said = count + 1, text
+                        said = text
             writer.finish()
             stream.flush()
             os.fsync(stream.fileno())
-        return count
 
 
 class Album:
