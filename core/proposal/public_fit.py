@@ -196,20 +196,18 @@ def fit(
         )
     if automatic and structure is None:
         _no_knots_named(signals, automatic[0])
-    resolved: Schedule | None = None
-    facts: list[dict[str, Any]] = []
+    added: dict[str, Any] = {}
     for number, name in enumerate(automatic):
         others = {other: knots for other, knots in chosen.items() if other not in automatic[number:]}
         best, table = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
-        facts.append(table)
+        assert best.model is not None, "without a fit to everything with one knot it raises"
+        added.setdefault("schedule", []).append(table)
         messages.append(f"schedule: {plural(best.count, 'knot')} on {name}: {table['reason']}")
-        chosen = {**chosen, name: (knots_of(best.model, name) if best.model is not None else []) or 1}
-        resolved = best.model.schedule if best.model is not None else None
-    asked = (resolved or {}) if automatic else asked  # to the bit as it was judged
+        chosen = {**chosen, name: knots_of(best.model, name) or 1}
+        asked = best.model.schedule or {}  # to the bit as it was judged
     on = signals_of(asked, names)
     messages += unused(first.scheduling_names, [*on, *automatic])
     lengths: dict[int, Widths] = {}
-    choice_of_horizons: dict[str, Any] = {}
     if rule is not None:
         steps = lengths_of(rule, transients)
         if not rule.leaves_out:
@@ -222,9 +220,10 @@ def fit(
         else:
             point = operating_point and operating_point.scheduled_on([n in on for n in first.scheduling_names])
             own = {**options, "operating_point": point, "schedule": asked, "groups": groups, "progress": progress}
-            lengths, choice_of_horizons = choose_horizons([t.scheduled_on(on) for t in transients], rule, steps, **own)
+            lengths, choice = choose_horizons([t.scheduled_on(on) for t in transients], rule, steps, **own)
+            added["horizon_choice"] = choice
             listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
-            messages.append(f"{listed}: {choice_of_horizons['reason']}")
+            messages.append(f"{listed}: {choice['reason']}")
     options |= {"schedule": asked, "horizons": list(lengths), "widths": lengths, "transient_weights": transient_weights}
     options["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
     options |= {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
@@ -243,9 +242,6 @@ def fit(
         model = fitting.fit(transients, **options)
         if not isinstance(alarm, str):
             model = model.replace(alarm=alarm)
-    added: dict[str, Any] = {"schedule": facts} if facts else {}
-    if choice_of_horizons:
-        added["horizon_choice"] = choice_of_horizons
     return _saying(model, messages, added)
 
 

@@ -16,6 +16,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from itertools import count
+from types import MappingProxyType
 
 import numpy as np
 
@@ -150,8 +151,8 @@ _ADDITIVE = f"# The further term that measured data needs: {CHOICES_TEXT}; compa
 
 def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
-    doubt: str, memories: Sequence[str] = (), members: Mapping[str, Sequence[Candidate]] | None = None, runs: str = "",
-    plant: bool = False,
+    doubt: str, memories: Sequence[str] = (), members: Mapping[str, Sequence[Candidate]] = MappingProxyType({}),
+    runs: str = "", plant: bool = False,
 ) -> str:  # fmt: skip
     """Write the text of the file."""
     every = {s.topic: s for s in sources}
@@ -211,7 +212,6 @@ def signals_file(
             "# No topic looks like a command. Without controls the envelope must cover what they do.",
             "controls: []",
         ]
-    members = members or {}
     proposed = [*states, *controls, *(c for alike in members.values() for c in alike)]
     left_out = _left_out(sources, set(proposed))
     if left_out:
