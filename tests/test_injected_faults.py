@@ -220,12 +220,12 @@ def test_the_share_seen_is_that_of_faults_injected_one_by_one(validation, found)
         if KINDS[kind].both:
             signs[np.random.default_rng([0, 1]).permutation(found.cases)[: found.cases // 2]] = -1.0
         seen = []
-        for x, owner in zip(every.windows.x, every.owner, strict=True):
+        for x, owner in zip(every.x, every.owner, strict=True):
             monitor = every.monitors[owner]
             run = validation.parts[owner].transient
-            k = int(np.flatnonzero((run.x == x[every.windows.onset]).all(axis=1))[0])  # the onset in its recording
+            k = int(np.flatnonzero((run.x == x[every.onset]).all(axis=1))[0])  # the onset in its recording
             at = float(run.t[k])
-            part = slice(max(k - every.windows.onset, 0), int(np.searchsorted(run.t, at + found.within + 1e-9)))
+            part = slice(max(k - every.onset, 0), int(np.searchsorted(run.t, at + found.within + 1e-9)))
             if monitor.check(run.replace(part)).alarm[k - part.start :].any():
                 continue  # an alarm anyway
             size = float(fault.size * signs[len(seen)])

@@ -115,13 +115,12 @@ class Detectable:
 
 
 @dataclass(frozen=True, eq=False)
-class _Cases:
+class _Cases(Windows):
     """Onsets of faults in what was left out, side by side, and the monitors that judge them.
 
     `unit` (W,): what each was left out with; `owner` (W,): its monitor; `template`: what all have as a `Transient`.
     """
 
-    windows: Windows
     t_ns: NDArray[np.int64]
     valid: NDArray[np.bool_]
     noise: Array
@@ -133,19 +132,19 @@ class _Cases:
 
     def take(self, which: NDArray[np.bool_]) -> _Cases:
         """Some of them."""
-        each = {name: getattr(self, name)[which] for name in ("t_ns", "valid", "noise", "unit", "owner")}
-        return replace(self, windows=self.windows.take(which), **each)
+        of_each = ("t", "x", "u", "s", "t_ns", "valid", "noise", "unit", "owner")
+        return replace(self, **{name: getattr(self, name)[which] for name in of_each})
 
     def delays(self, states: Sequence[tuple[Array, Array]]) -> Array:
         """Time (P, W) from the onset to the first alarm, s, with each of these x, u (W, L, n or m); inf without one."""
         found = np.full((len(states), len(self.t_ns)), np.inf)
-        w, onset = self.windows, self.windows.onset
-        since = w.t[:, onset:] - w.t[:, onset][:, None]
+        onset = self.onset
+        since = self.t[:, onset:] - self.t[:, onset][:, None]
         for number, monitor in enumerate(self.monitors):
             rows = np.flatnonzero(self.owner == number)
             if not len(rows):
                 continue
-            together = max(1, MOST_TOGETHER // w.x[rows].size)
+            together = max(1, MOST_TOGETHER // self.x[rows].size)
             for first in range(0, len(states), together):
                 some = states[first : first + together]
                 x, u = (np.concatenate([pair[part][rows] for pair in some]) for part in (0, 1))
@@ -161,7 +160,7 @@ class _Cases:
         t_ns = np.tile(self.t_ns[rows], (copies, 1))
         apart = int(t_ns.max() - t_ns.min()) + 4 * to_ns(self.template["max_gap"])
         t_ns += apart * np.arange(len(t_ns), 0, -1)[:, None]  # each begins before the one before it: a new alarm
-        s = np.tile(self.windows.s[rows], (copies, 1, 1))
+        s = np.tile(self.s[rows], (copies, 1, 1))
         x, u, s = (values.reshape(t_ns.size, -1) for values in (x, u, s))
         return monitor.check(Transient(t_ns.ravel(), x, u, s=s, **self.template)).alarm
 
@@ -213,7 +212,7 @@ def detectable(
     if every is None:
         why = f"nothing that was left out lasts {within:g} s without a gap; record longer runs, or ask for less time"
         return Detectable(within, confidence, 0, 0, refused=why)
-    alone = np.isinf(every.delays([(every.windows.x, every.windows.u)])[0])
+    alone = np.isinf(every.delays([(every.x, every.u)])[0])
     every, left_out = every.take(alone), int(np.count_nonzero(~alone))
     count = len(every.t_ns)
     if count < FEWEST:
@@ -238,9 +237,7 @@ def detectable(
             progress(CountedStep("faults of each kind", number + 1, ROUNDS + 2))
         going = [s for s in searches if number == 0 or s.reached.any()]
         recalled = model.signals.recalled
-        faults = [
-            faulty(every.windows, s.kind, s.i, s.signs * s.sizes(number), every.noise, recalled, model) for s in going
-        ]
+        faults = [faulty(every, s.kind, s.i, s.signs * s.sizes(number), every.noise, recalled, model) for s in going]
         for search, delay in zip(going, every.delays(faults), strict=True):
             search.learn(delay, number)
     found |= {(s.kind, s.name): s.seen(model, every.unit, confidence) for s in searches}
@@ -314,9 +311,9 @@ def _largest(model: UncertainLTI, every: _Cases, kind: str, i: int, within: floa
     if what.unit == "s":
         return within
     if what.of == "actuator":
-        values, fitted = every.windows.u[:, :, i], (domain.u_max[i] - domain.u_min[i]) * point.U[i]
+        values, fitted = every.u[:, :, i], (domain.u_max[i] - domain.u_min[i]) * point.U[i]
     else:
-        values, fitted = every.windows.x[:, :, i], (domain.x_max[i] - domain.x_min[i]) * point.X[i]
+        values, fitted = every.x[:, :, i], (domain.x_max[i] - domain.x_min[i]) * point.X[i]
     span = float(np.nanmax(values) - np.nanmin(values))
     span = max(float(fitted), span) if math.isfinite(fitted) else span
     return LARGEST * span / (within if what.unit == "rate" else 1.0)
@@ -366,16 +363,12 @@ def _cases(model: UncertainLTI, parts: Sequence[Part], within: float, cases: int
     template |= {"name": "cases", "step": first.step or "recorded"}
     template["max_gap"] = (int(np.diff(times, axis=1).max()) + 1) * 1e-9
     return _Cases(
-        Windows(times * 1e-9, x, u, s, before),
-        times,
-        valid,
+        times * 1e-9, x, u, s, before, times, valid,
         np.concatenate([rng.standard_normal((len(onsets), times.shape[1])) for _, _, onsets, _, rng in chosen]),
         np.repeat([unit for _, unit, *_ in chosen], counts),
         np.repeat([list(models).index(id(part.model)) for part, *_ in chosen], counts),
-        tuple(EnvelopeMonitor(m.replace(alarm=model.alarm)) for m in models.values()),
-        template,
-        step,
-    )
+        tuple(EnvelopeMonitor(m.replace(alarm=model.alarm)) for m in models.values()), template, step,
+    )  # fmt: skip
 
 
 def _onsets(transient: Transient, within: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

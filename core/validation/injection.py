@@ -22,10 +22,9 @@ stays as recorded, and no controller reacts to the fault.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -79,13 +78,6 @@ class Windows:
     u: Array
     s: Array
     onset: int
-
-    def take(self, which: NDArray[np.bool_]) -> Windows:
-        """Some of them.
-
-        `which` (W,): those that are wanted.
-        """
-        return replace(self, t=self.t[which], x=self.x[which], u=self.u[which], s=self.s[which])
 
 
 def faulty(
