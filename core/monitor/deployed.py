@@ -126,23 +126,17 @@ class DeployedMonitor:
 
     def words(self) -> str:
         """What differs from a monitor without conditions."""
-        return ", ".join(
-            [
-                *([f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []),
-                *condition_words(self.condition, self.grace, self.latch),
-                *([] if self.start is None else [f"from {self.start:g} s"]),
-                *([] if self.stop is None else [f"to {self.stop:g} s"]),
-            ]
-        )
+        said = [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
+        said += condition_words(self.condition, self.grace, self.latch)
+        said += [] if self.start is None else [f"from {self.start:g} s"]
+        said += [] if self.stop is None else [f"to {self.stop:g} s"]
+        return ", ".join(said)
 
 
 def condition_words(condition: Condition | None, grace: float, latch: bool) -> list[str]:
     """When an alarm counts and how long it lasts, in words."""
-    return [
-        *([f"as long as {condition}"] if condition else []),
-        *([f"grace {grace:g} s"] if grace else []),
-        *(["latched"] if latch else []),
-    ]
+    said = {f"as long as {condition}": condition, f"grace {grace:g} s": grace, "latched": latch}
+    return [words for words, holds in said.items() if holds]
 
 
 class Days:

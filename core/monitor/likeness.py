@@ -171,13 +171,16 @@ def scaled(moments: Array) -> Array:
 
 def likeness(model: UncertainLTI, pattern: Pattern, first: Sequence[str] = ()) -> Likeness:
     """What a pattern looks like."""
-    own = pattern.signature("-")
-    every = sorted(((closeness(own, s), s.label) for s in model.signatures), reverse=True)
-    label = ""
-    if every and every[0][0] >= MATCH and (len(every) == 1 or every[0][0] - every[1][0] >= AHEAD):
-        label = every[0][1] if pattern.verdicts >= LEAST else ""
-    matches = tuple((name, match) for match, name in every)
+    label, matches = _matched(pattern.signature("-"), model.signatures)
+    label = label if pattern.verdicts >= LEAST else ""
     return Likeness(label, matches, pattern.parts(model), tuple(first), pattern.verdicts)
+
+
+def _matched(own: Signature, signatures: Iterable[Signature]) -> tuple[str, tuple[tuple[str, float], ...]]:
+    """The label of the signature that is clearly ahead, "" for none, and every one with its match, the best first."""
+    every = sorted(((closeness(own, s), s.label) for s in signatures), reverse=True)
+    clear = bool(every) and every[0][0] >= MATCH and (len(every) == 1 or every[0][0] - every[1][0] >= AHEAD)
+    return every[0][1] if clear else "", tuple((label, match) for match, label in every)
 
 
 class Explainer:
@@ -272,20 +275,14 @@ def learn_signatures(model: UncertainLTI, labelled: Sequence[tuple[str, Verdicts
         if label in known and not replace:
             raise ModelError(f"the model has a signature '{label}'; give another label, or replace it with --force")
         alone.append(_of_recording(model, label, verdicts))
-    labels = list(dict.fromkeys(label for label, _ in labelled))
-    new = {label: _mean([s for s in alone if s.label == label]) for label in labels}
+    new = _means(alone)
     kept = tuple(s for s in model.signatures if s.label not in new)
     signatures = (*kept, *new.values())
     named = []
     for i, (label, verdicts) in enumerate(labelled):
-        others: dict[str, list[Signature]] = {}
-        for j, signature in enumerate(alone):
-            if j != i:
-                others.setdefault(signature.label, []).append(signature)
-        rest = [*kept, *(_mean(found) for found in others.values())]
-        match = sorted(((closeness(alone[i], s), s.label) for s in rest), reverse=True)
-        clear = bool(match) and match[0][0] >= MATCH and (len(match) == 1 or match[0][0] - match[1][0] >= AHEAD)
-        named.append((verdicts.transient.name, label, match[0][1] if clear and label in others else ""))
+        others = _means(alone[:i] + alone[i + 1 :])
+        found, _ = _matched(alone[i], [*kept, *others.values()])
+        named.append((verdicts.transient.name, label, found if label in others else ""))
     pairs = ((a, b, closeness(a, b)) for i, a in enumerate(signatures) for b in signatures[:i])
     return Learnt(signatures, tuple(named), tuple((b.label, a.label, c) for a, b, c in pairs if c >= MATCH))
 
@@ -310,7 +307,11 @@ def _of_recording(model: UncertainLTI, label: str, verdicts: Verdicts) -> Signat
     return pattern.signature(label)
 
 
-def _mean(signatures: Sequence[Signature]) -> Signature:
-    first = signatures[0]
-    moments = scaled(np.mean([s.moments for s in signatures], axis=0))
-    return Signature(first.label, first.steps, moments, len(signatures), sum(s.verdicts for s in signatures))
+def _means(signatures: Sequence[Signature]) -> dict[str, Signature]:
+    """The mean of the signatures of each label, however long their recordings are."""
+    means = {}
+    for label in dict.fromkeys(s.label for s in signatures):
+        alike = [s for s in signatures if s.label == label]
+        moments = scaled(np.mean([s.moments for s in alike], axis=0))
+        means[label] = Signature(label, alike[0].steps, moments, len(alike), sum(s.verdicts for s in alike))
+    return means

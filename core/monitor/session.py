@@ -270,17 +270,15 @@ class Session(Stream):
             for label, nearest in self.monitor.alarms.nearest(self.last.statistics.tolist()).items():
                 counts[label], counts[f"{label} threshold"] = repr(nearest.value), repr(nearest.threshold)
                 counts[f"{label} state"] = nearest.state
-        for name in ("samples", "gaps", "resets", "missing"):
-            counts[name] = str(counters[name])
+        counts |= {name: str(counters[name]) for name in ("samples", "gaps", "resets", "missing")}
         for name, count in sorted(counters.items()):
             counts.setdefault(name, str(count))
         lags = self.lags
         for topic in self.types:
             counts[f"received {topic}"] = str(self.received.get(topic, 0))
-            if self.unreadable[topic]:
-                counts[f"unreadable {topic}"] = str(self.unreadable[topic])
-            if self.future[topic]:
-                counts[f"future {topic}"] = str(self.future[topic])
+            for name, counted in (("unreadable", self.unreadable), ("future", self.future)):
+                if counted[topic]:
+                    counts[f"{name} {topic}"] = str(counted[topic])
             if topic in lags:
                 counts[f"lag {topic}"] = repr(round(lags[topic], 6))
             if (heard := self.heard(topic)) is not None:

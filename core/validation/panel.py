@@ -402,10 +402,8 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         )
     if still or blind:
         seen = [name for name in names if name not in (*still, *blind)]
-        why = [
-            *([f"{', '.join(still)} never moved"] if still else []),
-            *([f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []),
-        ]
+        why = [f"{', '.join(still)} never moved"] if still else []
+        why += [f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []
         return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
     if panel.unlike:
         count = len(panel.unlike)
