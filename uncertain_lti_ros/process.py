@@ -86,8 +86,7 @@ class Declared:
     @property
     def wanted(self) -> str:
         """The type in words, with the range if there is one."""
-        low, high = (f"{limit:.12g}" for limit in (self.low or 0.0, self.high or 0.0))
-        limits = "" if self.low is None else f" from {low} to {high}"
+        limits = "" if self.low is None else f" from {self.low:.12g} to {self.high:.12g}"
         return f"{_TYPES[type(self.default)]}{limits}"
 
     @property
@@ -270,9 +269,7 @@ def hold_overrides(node: Node, args: Sequence[str]) -> None:
     known = sorted(node._parameters)
     words = [args[i + 1] for i, word in enumerate(args[:-1]) if word in ("-p", "--param")]
     at_command_line = {word.partition(":=")[0].rpartition(":")[2] for word in words}
-    for name in overrides:
-        if name in known:
-            continue
+    for name in (name for name in overrides if name not in known):
         near = get_close_matches(name, known, 1, 0.75)
         if near or name in at_command_line:
             remedy = f"did you mean {near[0]}?" if near else "--help lists those there are"

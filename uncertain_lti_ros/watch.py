@@ -19,9 +19,10 @@ import argparse
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
@@ -81,37 +82,37 @@ class Watched:
             (JointState, "utilisation", self._utilisation, many), (JointState, "statistics", self._statistics, many),
             (String, "reason", self._why, latched),
         ):  # fmt: skip
-            node.create_subscription(kind, f"{self.name}/{topic}", take, qos)
+            node.create_subscription(kind, f"{self.name}/{topic}", partial(self._locked, take), qos)
+
+    def _locked(self, take: Callable[[Any], None], message: Any) -> None:
+        with self._lock:
+            take(message)
 
     def _flags(self, message: JointState) -> None:
-        with self._lock:
-            if self._said.names != list(message.name):
-                self._said = _Said(list(message.name))
-            said, row = self._said, self._said.count % _MOST
-            said.t_ns[row], said.flags[row] = stamp_ns(message), message.position
-            said.alarm[row] = said.count and said.alarm[row - 1]
-            said.utilisation[row] = said.statistics[row] = np.nan
-            said.count += 1
-            for ring, early in said.early.pop(said.t_ns[row].item(), ()):
-                ring[row] = early.position
-            self._heard = time.monotonic()
+        if self._said.names != list(message.name):
+            self._said = _Said(list(message.name))
+        said, row = self._said, self._said.count % _MOST
+        said.t_ns[row], said.flags[row] = stamp_ns(message), message.position
+        said.alarm[row] = said.count and said.alarm[row - 1]
+        said.utilisation[row] = said.statistics[row] = np.nan
+        said.count += 1
+        for ring, early in said.early.pop(said.t_ns[row].item(), ()):
+            ring[row] = early.position
+        self._heard = time.monotonic()
 
     def _violation(self, message: Bool) -> None:
-        with self._lock:
-            if self._said.count:
-                self._said.alarm[(self._said.count - 1) % _MOST] = message.data
+        if self._said.count:
+            self._said.alarm[(self._said.count - 1) % _MOST] = message.data
 
     def _utilisation(self, message: JointState) -> None:
-        with self._lock:
-            if self._said.names == list(message.name):
-                self._put(self._said.utilisation, message)
+        if self._said.names == list(message.name):
+            self._put(self._said.utilisation, message)
 
     def _statistics(self, message: JointState) -> None:
-        with self._lock:
-            if self._said.statistic_names != list(message.name):
-                self._said.statistic_names = list(message.name)
-                self._said.statistics = np.full((_MOST, len(message.name)), np.nan)
-            self._put(self._said.statistics, message)
+        if self._said.statistic_names != list(message.name):
+            self._said.statistic_names = list(message.name)
+            self._said.statistics = np.full((_MOST, len(message.name)), np.nan)
+        self._put(self._said.statistics, message)
 
     def _put(self, ring: NDArray[Any], message: JointState) -> None:
         """Numbers of a sample that was flagged lately, or will be: topics have no order among them."""
@@ -126,8 +127,7 @@ class Watched:
             said.early.pop(next(iter(said.early)))
 
     def _why(self, message: String) -> None:
-        with self._lock:
-            self._reason = message.data
+        self._reason = message.data
 
     def plotted(self) -> Plotted:
         """The last `window` seconds."""
