@@ -90,11 +90,8 @@ def _discard(text: str) -> float:
 
 def _time(text: str) -> float:
     """Seconds of 90, 90s, 10m or 1h."""
-    match = re.fullmatch(r"\s*([0-9.]+)\s*(s|m|min|h)?\s*", text)
-    try:
-        seconds = float(match[1]) * {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}[match[2] or "s"] if match else 0.0
-    except ValueError:
-        seconds = 0.0
+    match = re.fullmatch(r"\s*([0-9]+\.?[0-9]*|\.[0-9]+)\s*(s|m|min|h)?\s*", text)
+    seconds = float(match[1]) * {"s": 1.0, "m": 60.0, "min": 60.0, "h": 3600.0}[match[2] or "s"] if match else 0.0
     if not 0 < seconds < math.inf:
         raise argparse.ArgumentTypeError(f"{text!r} is no time; write 90s, 10m or 1h")
     return seconds

@@ -19,7 +19,6 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from dataclasses import replace
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, FitError, ModelError
@@ -187,9 +186,7 @@ def run_tune(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.model_text import alarm_text, headline_text, tune_text
     from uncertain_lti.validation.groups import resolve_groups
 
-    output: Path | None = None
-    if options.output is not None:
-        output = model_target(options.output, options.force, options.bags)
+    output = None if options.output is None else model_target(options.output, options.force, options.bags)
     healthy = [bag for bag in options.bags if _label(bag) is None]
     if not healthy:
         raise FitError("no recording of the healthy machine is named; give at least one without a label")

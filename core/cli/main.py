@@ -253,14 +253,12 @@ class _Parser(argparse.ArgumentParser):
                 if not any(option.startswith(word) for option in self._option_string_actions):
                     message += f"; there is no {word}{meant(word, self._option_string_actions, 1)}"
         elif message.startswith("unrecognized arguments: "):
-            commands: list[dict[str, argparse.ArgumentParser]] = [
-                a.choices for a in self._actions if isinstance(a.choices, dict)
-            ]
-            chosen = next((p for group in commands for name, p in group.items() if name in self._given), self)
-            known = chosen._option_string_actions
+            commands: dict[str, argparse.ArgumentParser]
+            commands = dict(*(action.choices for action in self._actions if isinstance(action.choices, dict)))
+            chosen = next((parser for name, parser in commands.items() if name in self._given), self)
             word = message.split(": ")[1].split()[0].partition("=")[0]
-            takes = sorted({name for g in commands for name, p in g.items() if word in p._option_string_actions})
-            message += f" (an option of {', '.join(takes)})" if takes else meant(word, known, 1)
+            takes = sorted(name for name, parser in commands.items() if word in parser._option_string_actions)
+            message += f" (an option of {', '.join(takes)})" if takes else meant(word, chosen._option_string_actions, 1)
             if not word.startswith("-"):
                 message += f"; that is one more than it takes: {chosen.prog} --help"
         super().error(message)

@@ -79,25 +79,22 @@ def run_init(options: argparse.Namespace) -> Result:
     reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
     proposal = propose(options.bags, reading, **chosen, like=options.like)
     options.progress.note(*proposal.warnings)
-    if output is None and not options.json:
-        return Result(text=proposal.text.removesuffix("\n"))
-    if output is not None:
-        with written(output, SignalError) as stream:
-            stream.write(proposal.text.encode())
     proposed = {
         kind: [{"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind]
         for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
     }
     more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
     data = {"output": output, **proposed, **more}
-    if options.json:
-        return Result(data=data)
+    if output is None:
+        return Result(data=data, text=proposal.text.removesuffix("\n"))
+    with written(output, SignalError) as stream:
+        stream.write(proposal.text.encode())
     options.say(
         f"{_proposed(data)}\n"
         f"signals file written to {output}: read it and edit it, it says why; then\n"
         f"  uncertain-lti fit {shlex.join(options.bags)} --signals {shlex.quote(output)} --output machine.model.json"
     )
-    return Result()
+    return Result(data=data)
 
 
 def _proposed(data: Mapping[str, Any]) -> str:

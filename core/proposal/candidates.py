@@ -392,9 +392,8 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
                 values = [v for v in column.ravel().tolist() if v not in ("", None) and v == v]
                 columns.setdefault(name, Counter()).update(values)
     warnings = []
-    for name, counts in columns.items():
-        if len(counts) > _LABELS:  # an angle of attack, for example
-            continue
+    few = {name: counts for name, counts in columns.items() if len(counts) <= _LABELS}  # no angle of attack
+    for name, counts in few.items():
         for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
             if candidate.path.partition("[")[0] == name:
                 candidate.reason = "a label by its name, and no signal of the machine"

@@ -194,10 +194,8 @@ def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
 def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
     """Paths as they would stand in a file; arrays entry by entry, long ones once with the reason."""
     found: list[Candidate] = []
-    for path in fields:
+    for path in (path for path in fields if "variance" not in path):
         size = math.prod(int(b) - int(a) + 1 for a, b in _SPREAD.findall(path))
-        if re.search(r"(covariance|variance)", path):
-            continue
         if size > LONGEST_ARRAY:
             found.append(Candidate(topic, path, reason=f"an array of {size} numbers"))
             continue
@@ -303,11 +301,9 @@ def _wrapped(source: Source) -> None:
     """Angles that jump by a turn are unwrapped, those of a quaternion always."""
     for candidate in source.free:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
-        jumps = 0
-        for values in candidate.values:
-            finite = values[np.isfinite(values)]
-            if len(finite) and np.ptp(finite) <= 2.2 * np.pi:
-                jumps += int((np.abs(np.diff(finite)) > 1.6 * np.pi).sum())
+        finite = [values[np.isfinite(values)] for values in candidate.values]
+        within = [values for values in finite if len(values) and np.ptp(values) <= 2.2 * np.pi]
+        jumps = any((np.abs(np.diff(values)) > 1.6 * np.pi).any() for values in within)
         if angle or (jumps and re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)):
             candidate.path = f"unwrap({candidate.path})"
             candidate.values = [_unwrapped(v) for v in candidate.values]

@@ -206,11 +206,8 @@ def _rows(values: NDArray[Any], at: Integers) -> NDArray[Any]:
 
 def _base(topics: set[str]) -> str:
     """Beginning of the topics, under which none of the recording is."""
-    base, number = NODE, 1
-    while any(f"{base}/{output.name}" in topics for output in RECORDED):
-        base = f"{NODE}_check" if number == 1 else f"{NODE}_check_{number}"
-        number += 1
-    return base
+    names = [NODE, f"{NODE}_check", *(f"{NODE}_check_{number}" for number in range(2, len(topics) + 2))]
+    return next(name for name in names if not any(f"{name}/{output.name}" in topics for output in RECORDED))
 
 
 def _schema(writer: McapWriter, contents: Sequence[Contents], type_name: str) -> int:

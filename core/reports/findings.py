@@ -267,9 +267,8 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
     worst = max(wide, key=lambda name: wide[name])
     useless = [f"{shortened(name)} ({wide[name]:.0%})" for name in model.state_names if wide.get(name, 0.0) > TOO_WIDE]
     if useless:
-        weight = (
-            NO if 2 * len(useless) >= model.n and not _alarm(model) else CARE
-        )  # a window sees less than a width says
+        # with an alarm that was learnt, a window sees less than a width says
+        weight = NO if 2 * len(useless) >= model.n and not _alarm(model) else CARE
         wider = f"bounds over {TOO_WIDE:.0%} as wide as the state's own range {where} say next to nothing"
         yield weight, "tightness", f"{wider}: {shortlist(useless, 6)}"
     elif wide[worst] > 0.0:
