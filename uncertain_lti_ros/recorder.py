@@ -118,7 +118,7 @@ def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSu
     clock = node.get_clock()
     channel = file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
     return MatchedSubscription(
-        node, topic, type_name, lambda data, _: file.write(channel, clock.now().nanoseconds, data)
+        node, topic, type_name, lambda data, _: file.write(topic, channel, clock.now().nanoseconds, data)
     )
 
 
@@ -153,7 +153,6 @@ class _File:
         self.path, self._notes = path, notes
         self._part = path.with_name(f"{path.name}.part")
         self.count = 0
-        self._topics: dict[int, str] = {}
         self.counts: dict[str, int] = {}
         self.began: float | None = None
         self._first = self._last = 0
@@ -194,17 +193,16 @@ class _File:
     def channel(self, topic: str, type_name: str, offered: list[QoSProfile]) -> int:
         schema = self._writer.register_schema(type_name, "ros2msg", definition(type_name).encode())
         metadata = {"offered_qos_profiles": _qos_text(offered)}
-        number = int(self._writer.register_channel(topic, "cdr", schema, metadata))
-        self._topics[number], self.counts[topic] = topic, 0
-        return number
+        self.counts[topic] = 0
+        return int(self._writer.register_channel(topic, "cdr", schema, metadata))
 
-    def write(self, channel: int, log_time: int, data: bytes) -> None:
+    def write(self, topic: str, channel: int, log_time: int, data: bytes) -> None:
         if self.began is None:
             self.began, self._first = time.monotonic(), log_time
         self._last = max(log_time, self._last)  # a clock that is set back must not reorder what was received
         self._to_disk(self._writer.add_message, channel, self._last, bytes(data), self._last, self.count)
         self.count += 1
-        self.counts[self._topics[channel]] += 1
+        self.counts[topic] += 1
 
     def flush(self) -> None:
         self._to_disk(self._writer.flush)

@@ -171,7 +171,7 @@ def run_check(options: argparse.Namespace) -> Result:
 def run_report(options: argparse.Namespace) -> Result:
     """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.reports.findings import findings, findings_text
-    from uncertain_lti.reports.pages import page_target, write_page
+    from uncertain_lti.reports.pages import html_report, page_target, write_page
 
     judged = _judged(options)
     output = options.output or (None if options.json else "report.html")
@@ -183,8 +183,6 @@ def run_report(options: argparse.Namespace) -> Result:
     facts = findings(judged.model, options.model, checked, judged.deployed.monitor.rule, judged.deployed.words())
     options.say(findings_text(facts))
     if output is not None:
-        from uncertain_lti.reports.pages import html_report
-
         write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
         options.say(f"report written to {output}")
     return Result(judged.status_of(facts["recordings"]), {**facts, "not_checked": judged.refused})

@@ -57,13 +57,13 @@ class Reasons:
     While the same rules hold the alarm, the states that any of its verdicts blamed stay named: which of them is outside
     its bounds may change with every sample.
 
-    `model`: names the signals; `rules`: of the alarm; `text`: on the last sample; `by`: what holds the alarm, or held
-    it last: rules, horizons and states; empty before any.
+    `model`: names the signals; `rules`: of the alarm; `words`: of each rule, by what it is called; `text`: on the last
+    sample; `by`: what holds the alarm, or held it last: rules, horizons and states; empty before any.
     """
 
     def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
         self._model = model
-        self._words = {label: rule.words for label, rule in zip(labels(rules), rules, strict=True)}
+        self.words = {label: rule.words for label, rule in zip(labels(rules), rules, strict=True)}
         self.reset()
 
     def reset(self) -> None:
@@ -127,7 +127,7 @@ class Reasons:
             if reason.state and reason.state not in self._blamed[reason.label]:
                 self._blamed[reason.label].append(reason.state)
         by = [
-            self._words[label] + (f": {', '.join(states)}" if states else "") for label, states in self._blamed.items()
+            self.words[label] + (f": {', '.join(states)}" if states else "") for label, states in self._blamed.items()
         ]
         return "; ".join([*by, *self._jumps])
 

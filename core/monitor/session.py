@@ -196,15 +196,9 @@ class Session(Stream):
             return ""
         return ": /clock moves more seldom than they come; play with --clock, or by ros2 bag with --clock-topics-all"
 
-    @property
-    def rule_words(self) -> dict[str, str]:
-        """Each rule of the alarm in words, by what it is called."""
-        alarms = self.monitor.alarms
-        return {label: rule.words for label, rule in zip(alarms.labels, alarms.rules, strict=True)}
-
     def rule_text(self) -> str:
         """The rules of the alarm in words."""
-        return ", or ".join(self.rule_words.values())
+        return ", or ".join(self.reasons.words.values())
 
     def whole_rule_text(self) -> str:
         """The alarm rule in words, with everything that it depends on."""
@@ -350,7 +344,7 @@ class EventLog:
             left = f": {_left(session, cause)}" if cause is not None and cause.violated else ""
             raised = () if cause is None else cause.raised
             by = [reason.words for reason in raised if reason.label != CONTAINMENT]
-            by = by or list(dict.fromkeys(session.rule_words[reason.label] for reason in raised))
+            by = by or list(dict.fromkeys(session.reasons.words[reason.label] for reason in raised))
             line = f"alarm, {', '.join(by[:SHOWN]) if by else session.rule_text()}{left}"
             jumped = [] if cause is None else session.jumps_of(cause)
             line += f"; {', '.join(jumped[:SHOWN])}" if jumped else ""
@@ -507,9 +501,7 @@ class Failures:
 
     def problems(self) -> list[str]:
         """What went wrong since the last report."""
-        if self.count > self._reported:
-            return [f"{self.count} unexpected errors, the last {self._last}"]
-        return []
+        return [f"{self.count} unexpected errors, the last {self._last}"] * (self.count > self._reported)
 
     def reported(self) -> None:
         """The errors so far are in a report."""
