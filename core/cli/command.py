@@ -363,15 +363,6 @@ def read_fitted(options: argparse.Namespace, bags: Iterable[str], signals: Signa
         yield transient
 
 
-def read_labelled(
-    options: argparse.Namespace, pairs: Iterable[tuple[str, str]], signals: SignalMap
-) -> Iterator[tuple[str, Transient]]:
-    """Read recordings of known faults as a model has its signals."""
-    for label, name in pairs:
-        for transient in read_fitted(options, [name], signals):
-            yield label, transient
-
-
 def model_target(path: str, force: bool, bags: Iterable[str] = ()) -> Path:
     """Where a model file of some recordings goes; with force an older one is replaced, and nothing else ever."""
     from uncertain_lti.base.errors import BagError

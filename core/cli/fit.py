@@ -32,7 +32,6 @@ from uncertain_lti.cli.command import (
     load_model,
     model_target,
     read_fitted,
-    read_labelled,
 )
 
 if TYPE_CHECKING:
@@ -197,9 +196,9 @@ def run_tune(options: argparse.Namespace) -> Result:
     signals = transients[0].signals
     assert signals is not None
     faulty: dict[str, list[Transient]] = {}
-    pairs = [(label, bag.partition("=")[2]) for bag in options.bags if (label := _label(bag)) is not None]
-    for label, run in read_labelled(options, pairs, signals):
-        faulty.setdefault(label, []).append(run)
+    for bag in options.bags:
+        if (label := _label(bag)) is not None:
+            faulty.setdefault(label, []).extend(read_fitted(options, [bag.partition("=")[2]], signals))
     with options.progress.stage("tuning") as step:
         given = {"budget": options.budget, "groups": options.group, "faulty": faulty, "progress": step}
         tuned = tune(transients, options.false_alarms, **given)
@@ -307,9 +306,8 @@ def run_signature(options: argparse.Namespace) -> Result:
             raise ModelError(f"{text!r} is not LABEL=BAG; write for example stuck_valve=run7.mcap")
     model = load_model(options.model)
     monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin)
-    labelled = read_labelled(options, [(label, bag) for label, _, bag in pairs], model.signals)
-    checked = [(label, monitor.check(transient)) for label, transient in labelled]
-    learnt = learn_signatures(model, checked, options.force)
+    runs = ((label, run) for label, _, bag in pairs for run in read_fitted(options, [bag], model.signals))
+    learnt = learn_signatures(model, [(label, monitor.check(run)) for label, run in runs], options.force)
     model.replace(signatures=learnt.signatures).save(output)
     faults = [
         {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}

@@ -105,13 +105,11 @@ def delays(transients: Sequence[Transient], best: Setting) -> Iterator[list[Sett
     if not moving or "arrival" in first.ends:
         return
     sets = [moving]
-    try:
+    with suppress(FitError):  # too few of them follow one another
         few = thinned(transients, 5 * TRANSITIONS)
         problem = assemble(few, point_of(first), None, best.options.get("additive", "noise"))
         late = {names[j]: samples for j, (samples, _) in late_controls(problem).items() if names[j] in moving}
         sets = [late, *(s for s in sets if s != late)] if late else sets
-    except FitError:
-        pass  # too few of them follow one another
     for chosen in sets:
         said = ", ".join(f"{name} {plural(count, 'sample')} earlier" for name, count in chosen.items())
         words = "all controls 1 sample earlier" if len(chosen) > 1 and chosen is moving else said
