@@ -313,20 +313,19 @@ class EventLog:
     def __init__(self, log: Callable[[int, str], None]) -> None:
         self._log = log
         self._matters = defaultdict[str, _Matter](lambda: _Matter(None))
-        self._alarm, self._alarm_since = False, 0.0
-        self._named = False  # whether the start of this alarm was logged
+        self._alarm_since = 0.0
+        self._start(False, Counter(), Counter(), 0.0)
+
+    def _start(self, alarm: bool, counters: Counter[str], unreadable: Counter[str], now: float) -> None:
+        self._alarm = self._named = alarm  # the latter: whether the start of this alarm was logged
         self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
-        self._counters: Counter[str] = Counter()
-        self._unreadable: Counter[str] = Counter()
-        self._ceased, self._judged = 0.0, False
-        self._cause = ("", 0.0)  # why there are no verdicts, and since when
+        self._counters, self._unreadable = counters, unreadable
+        self._ceased, self._judged = now, False
+        self._cause = ("", now)  # why there are no verdicts, and since when
 
     def begin(self, session: Session, now: float) -> None:
         """A session starts, with no sample."""
-        self._alarm, self._named, self._latest, self._unnamed = session.alarm, session.alarm, "", 0
-        self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
-        self._ceased, self._judged = now, False
-        self._cause = ("", now)
+        self._start(session.alarm, Counter(session.sampler.counters), Counter(session.unreadable), now)
         self._matters.clear()
         self._matters["arming"] = _Matter(True)
 

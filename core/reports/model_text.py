@@ -146,7 +146,8 @@ def schedule_blocks(choice: Mapping[str, Any]) -> list[Block]:
             continue
         sizes = [share(c["outside"], 2), share(c["excess"]), f"x {c['width']:.3g}", f"x {c['jumps']:.3g}"]
         at = ", ".join(f"{k:.4g}" for k in c["at"]) or "-"
-        rows.append([_chosen(c["knots"], c["knots"] == choice["chosen"]), *sizes, at])
+        chosen = " (chosen)" * (c["knots"] == choice["chosen"])
+        rows.append([f"{c['knots']}{chosen}", *sizes, at])
     blocks: list[Block] = [f"knots on {choice['signal']}, {_left_out(choice)}:"]
     if rows:
         blocks.append(Table(("knots", "outside", "excess", "mean width", "jumps seen", "at"), rows))
@@ -158,7 +159,7 @@ def horizon_blocks(choice: Mapping[str, Any]) -> list[Block]:
     rows = []
     for c in choice["candidates"]:
         widths = [share(c["outside"], 2), f"x {c['width']:.3g}", f"x {c['per_step']:.3g}"]
-        rows.append([_chosen(c["steps"], c["taken"]), c["widths"], *widths, c["why"]])
+        rows.append([f"{c['steps']}{' (chosen)' * c['taken']}", c["widths"], *widths, c["why"]])
     if not rows:
         return [f"horizons: {choice['reason']}"]
     header = ("steps", "half-widths", "outside", "width", "per step", "")
@@ -167,10 +168,6 @@ def horizon_blocks(choice: Mapping[str, Any]) -> list[Block]:
 
 def _left_out(choice: Mapping[str, Any]) -> str:
     return f"by leaving out one {choice['left_out']} of {choice['units']} at a time"
-
-
-def _chosen(count: int, chosen: bool) -> str:
-    return f"{count}{' (chosen)' * chosen}"
 
 
 def _widths(model: UncertainLTI) -> list[Block]:
