@@ -345,17 +345,13 @@ class MatchedSubscription:
         message, info = given if len(given) == 2 else given[0]
         self.received += 1
         number, before = info["publication_sequence_number"], self._number
-        if before is not None and number is not None and number != before + 1:
-            self._count_skipped(number - before - 1)
+        if before is not None and number is not None:
+            if number <= before:  # they come from several publishers
+                self._alone = False
+            elif self._alone:
+                self._skipped += number - before - 1
         self._number = number
         self._callback(message, info["source_timestamp"])
-
-    def _count_skipped(self, skipped: int) -> None:
-        """Take a jump in the numbers of messages; it says nothing if they fall, or come from several publishers."""
-        if skipped < 0:
-            self._alone = False
-        elif self._alone:
-            self._skipped += skipped
 
     def _changed(self, _: Any) -> None:
         self.look_soon, self._alone = True, False
