@@ -191,7 +191,7 @@ class Explainer:
 
     def __init__(self, model: UncertainLTI) -> None:
         self._model = model
-        self._steps = (1, *(horizon.steps for horizon in model.horizons))
+        self._steps = (1, *model.steps)
         self._per_width = 0.5 / model.operating_point.X
         self.pattern: Pattern | None = None
         self._first: tuple[str, ...] = ()
@@ -295,7 +295,7 @@ def _of_recording(model: UncertainLTI, label: str, verdicts: Verdicts) -> Signat
             f"{verdicts.transient.name}: {on}, so it has no signature; give a recording of '{label}' that the rule "
             f"sees, or a rule that sees it (--violations, --window, --margin)"
         )
-    pattern = Pattern((1, *(horizon.steps for horizon in model.horizons)), model.n)
+    pattern = Pattern((1, *model.steps), model.n)
     table, zeros = verdicts.horizon_utilisation[rows], np.zeros(model.n)
     for row in table:
         pattern.add(row, zeros)

@@ -68,9 +68,8 @@ class Score:
         """Of one step."""
         parts = [part for part in left.parts if part.judged]
         widths = np.average([p.mean_width for p in parts], axis=0, weights=[p.judged for p in parts])
-        judged, outside = (
-            by_unit(left.parts, [getattr(p, name) for p in left.parts]) for name in ("judged", "violated")
-        )
+        judged = by_unit(left.parts, [p.judged for p in left.parts])
+        outside = by_unit(left.parts, [p.violated for p in left.parts])
         return cls(judged, outside, _geometric(widths), figure)
 
     @property
