@@ -150,6 +150,8 @@ def fit(
             discarded.append({"file": of.name, "k": k, **when, "effect": effect})
         problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
     fleet = Fleet.of(problem) if method == "working-set" else Fleet([problem])
+    plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
+    keeps = plain and describe_data and not horizons
     with contradiction_named(where, signals):
         model = fit_fleet(
             fleet,
@@ -164,6 +166,7 @@ def fit(
             transients=transients,
             discarded=len(discarded),
             seek_carriers=seek_carriers,
+            remember=partial(_memory, problem, transients, fleet) if keeps else None,
         )
     facts = {
         **model.fit_summary,
@@ -185,9 +188,7 @@ def fit(
             key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
         }
     if not horizons:
-        model = model.replace(fit_summary=facts)
-        plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
-        return model.replace(memory=_memory(model, problem, transients, fleet)) if plain and describe_data else model
+        return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]
     model = model.replace(run=better_run(model, problem, lengths, structure))
     over, facts["horizons"], dropped, solvers = fit_horizons(model, problem, lengths, widths, criterion, progress)
@@ -200,7 +201,7 @@ def fit(
 
 
 def _memory(
-    model: UncertainLTI, problem: Problem, transients: Sequence[Transient], fleet: Fleet
+    problem: Problem, transients: Sequence[Transient], fleet: Fleet, model: UncertainLTI
 ) -> dict[str, Any] | None:
     """What the file of a plain model keeps of its recordings."""
     edges = np.searchsorted(problem.source, np.arange(len(transients) + 1)).tolist()
@@ -224,8 +225,9 @@ def fit_fleet(
     transients: Sequence[Transient] = (),
     discarded: int = 0,
     seek_carriers: bool = False,
+    remember: Callable[[UncertainLTI], dict[str, Any] | None] | None = None,
 ) -> UncertainLTI:
-    """`fit` on transitions that are already normalised, wherever they lie."""
+    """`fit` on transitions that are already normalised, wherever they lie; `remember`: what the model's file keeps."""
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
         engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
@@ -292,13 +294,19 @@ def fit_fleet(
         )
         return rank, messages + distance_in_words(found.gap)
 
-    afterwards = (said, partial(fleet.residuals, model, judged), *(partial(repeats_in, model, t) for t in transients))
-    words, residuals, *seen = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)
+    memory = (lambda: None) if remember is None else partial(remember, model.replace(fit_summary=facts))
+    afterwards = (
+        memory,
+        said,
+        partial(fleet.residuals, model, judged),
+        *(partial(repeats_in, model, t) for t in transients),
+    )
+    kept, words, residuals, *seen = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)
     if words is not None:
         facts["rank"], facts["messages"] = words
     if transients:
         model = with_repeats(model, seen)
-    return model.replace(fit_summary=facts, residuals=residuals)
+    return model.replace(fit_summary=facts, residuals=residuals, memory=kept)
 
 
 def structure_of(signals: SignalMap, schedule: Schedule | None) -> Structure | None:
