@@ -62,9 +62,7 @@ def assemble(
     n = len(point.x_s)
     steps = [t.transitions() for t in transients]
     k = _joined([s.k for s in steps])
-    source = np.zeros(len(k), dtype=np.intp)
-    for number, stop in enumerate(np.cumsum([len(s.k) for s in steps])[:-1], start=1):
-        source[stop:] = number
+    source = np.repeat(np.arange(len(steps)), [len(s.k) for s in steps])
     if not len(k) and not empty:
         names = ", ".join(t.name for t in transients)
         raise FitError(
