@@ -89,6 +89,34 @@ class Runs:
     def push(self, before: Sequence[float], after: Sequence[float], dt: float) -> array[float]: ...
     def foresee(self, before: Sequence[float], dt: float) -> array[float] | None: ...
 
+class Repeating:
+    most: Array
+    def __init__(self, thresholds: Array, least: int, counted: Sequence[bool], margin: float) -> None: ...
+    def forget(self) -> None: ...
+    def take(
+        self,
+        t_ns: int,
+        dt: float,
+        before: Sequence[float],
+        after: Sequence[float],
+        lower: Sequence[float],
+        upper: Sequence[float],
+        own: Sequence[float],
+        outside: bool,
+    ) -> list[tuple[int, float, int, float]]: ...
+    def take_all(
+        self,
+        follows: NDArray[np.bool_],
+        t_ns: NDArray[np.int64],
+        dt: Array,
+        before: Array,
+        after: Array,
+        lower: Array,
+        upper: Array,
+        own: Array,
+        outside: NDArray[np.bool_],
+    ) -> tuple[NDArray[np.uint8], Array]: ...
+
 class Statistic:
     alarm: bool
     def __init__(

@@ -18,7 +18,7 @@ from uncertain_lti.base.arrays import LARGEST
 
 cimport cython
 from cpython cimport array as arrays
-from libc.math cimport INFINITY, NAN, fabs
+from libc.math cimport INFINITY, NAN, fabs, fmax, llrint
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 
@@ -31,4 +31,5 @@ include "rows.pxi"
 include "passes.pxi"
 include "judge.pxi"
 include "runs.pxi"
+include "repeats.pxi"
 include "statistics.pxi"

@@ -34,9 +34,8 @@ chance.
 
 from __future__ import annotations
 
-import math
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from operator import eq
 from typing import Any, NamedTuple
 
@@ -45,7 +44,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import FLAGS, UTILISATION, changes, edges
+from uncertain_lti.kernel.arithmetic import FLAGS, UTILISATION, Repeating, changes, edges
 from uncertain_lti.model.terms import checked, object_of
 
 _KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond", "noisy_steps")
@@ -151,115 +150,38 @@ class Repeats:
 class Moved(NamedTuple):
     """One repeat so far.
 
-    `state`: number of the state; `seconds`: since the last fresh sample, s; `run`: how far the nominal model ran, in
-    half-widths; `sum`: sum of its one-step movements, in half-widths, likewise without a sign; `start`: the states at
-    the last fresh sample, recorded units; `steps`: transitions of the repeat, but for those outside the fitted ranges,
-    of which nothing counts; `activity`: range of the rates at which the nominal model would move it, in half-widths;
-    `why`: why it is frozen, in words; empty for a state that is not.
+    `state`: number of the state; `seconds`: since the last fresh sample, s; `why`: why it is frozen, in words; empty
+    for a state that is not.
     """
 
     state: int
     seconds: float
-    run: float
-    sum: float
-    start: Sequence[float]
-    steps: int
-    activity: float
     why: str = ""
 
 
-class Transition(NamedTuple):
-    """One transition in which some state repeats.
-
-    `t_ns`: its end, ns; `dt`: s; `before` (n,), `after` (n,): states, recorded units; `lower` (n,), `upper` (n,): their
-    bounds; `own` (n,): elements a_ii of the nominal model, 1/s; `outside`: it begins outside the fitted ranges.
-    """
-
-    t_ns: int
-    dt: float
-    before: Sequence[float]
-    after: Sequence[float]
-    lower: Sequence[float]
-    upper: Sequence[float]
-    own: Sequence[float]
-    outside: bool = False
+Followed = tuple[NDArray[np.bool_], NDArray[np.int64], Array, Array, Array, Array, Array, Array, NDArray[np.bool_]]
+"""What `Repeating.take_all` takes."""
 
 
-class Repeating:
-    """Follows the repeats of every state, one transition after another.
-
-    `n`: number of states; `margin`: of the bounds that it will be given.
-    """
-
-    __slots__ = ("_margin", "_of")
-
-    def __init__(self, n: int, margin: float = 1.0) -> None:
-        self._margin = margin
-        # of each state: None, or [begin in ns, the states then, run, sum, largest half-width, steps,
-        # lowest and highest rate, largest half-width per second]
-        self._of: list[list[Any] | None] = [None] * n
-
-    def forget(self) -> None:
-        """No transition leads to the next sample: every repeat ends."""
-        self._of = [None] * len(self._of)
-
-    def push(self, step: Transition) -> list[Moved]:
-        """Take one transition in which some state repeats; after one in which none does, `forget`."""
-        found, dt = list[Moved](), step.dt
-        for i, value in enumerate(step.after):
-            if value != step.before[i]:
-                self._of[i] = None
-                continue
-            repeat = self._of[i]
-            if repeat is None:
-                nothing = 0.0, 0.0, 0.0, 0, math.inf, -math.inf, 0.0
-                repeat = self._of[i] = [step.t_ns - round(dt * 1e9), step.before[: len(step.after)], *nothing]
-            if not step.outside:
-                movement = 0.5 * (step.lower[i] + step.upper[i]) - value
-                half = 0.5 * (step.upper[i] - step.lower[i]) / self._margin
-                repeat[2] += dt * step.own[i] * repeat[2] + movement
-                repeat[3] += movement
-                repeat[4] = max(repeat[4], half)
-                repeat[5] += 1
-                repeat[6], repeat[7] = min(repeat[6], movement / dt), max(repeat[7], movement / dt)
-                repeat[8] = max(repeat[8], half / dt)
-            since, start, run, total, half, steps, low, high, per_second = repeat
-            activity = _over(high - low, per_second) if steps else 0.0
-            run, total = _over(abs(run), half), _over(abs(total), half)
-            found.append(Moved(i, (step.t_ns - since) * 1e-9, run, total, start, steps, activity))
-        return found
-
-
-def _over(size: float, half: float) -> float:
-    """A size in half-widths; any is beyond all where the half-width is 0."""
-    return size / half if half > 0.0 else math.inf if size > 0.0 else 0.0
-
-
-def walk(
+def followed(
     model: Any,
     t_ns: NDArray[np.int64],
     steps: Any,
     repeats: NDArray[np.bool_],
-    bounds: Callable[[Any], Iterable[Array]],
-) -> Iterator[tuple[int, bool, Transition]]:
-    """Transitions in which some state repeats, and those right after: where each begins, and whether it follows on.
+    bounds: Callable[[Any], Sequence[Array]],
+) -> tuple[NDArray[np.intp], Followed]:
+    """Transitions in which some state repeats, and those right after: where each begins, and what they are.
 
     `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `repeats` (K,): whether some state repeats; `bounds`:
     lower and upper bounds (K, n) of some transitions, recorded units.
     """
-    if not repeats.any():
-        return
-    follows = np.append(False, np.diff(steps.k) == 1)
-    rows = np.flatnonzero(repeats | (follows & np.roll(repeats, 1)))
-    steps = steps.take(rows)
+    follows = np.append(False, np.diff(steps.k) == 1)[: len(steps.k)]
+    steps = steps.take(np.flatnonzero(repeats | (follows & np.roll(repeats, 1))))
     z, at = model.normalised_columns(steps), steps.k
+    on = np.append(False, np.diff(at) == 1)[: len(at)]
+    lower, upper = bounds(steps)
     outside = model.domain.beyond(z) | model.unknown(z)
-    given = steps.dt, steps.x, steps.x_next, *bounds(steps), model.own_rates(z).T, outside
-    on = np.append(False, np.diff(at) == 1)
-    for k, after, t, *each in zip(
-        at.tolist(), on.tolist(), t_ns[at + 1].tolist(), *(a.tolist() for a in given), strict=True
-    ):
-        yield k, after, Transition(t, *each)
+    return at, (on, t_ns[at + 1], steps.dt, steps.x, steps.x_next, lower, upper, model.own_rates(z).T, outside)
 
 
 class Found(NamedTuple):
@@ -279,23 +201,19 @@ class Found(NamedTuple):
 
 def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
-    most, point, steps = np.zeros((4, model.n)), model.operating_point, transient.transitions()
+    point, steps = model.operating_point, transient.transitions()
     windows, noisy = _activity(model, transient, steps)
     some, largest = changes(transient.x, steps.k)
-    follow = Repeating(model.n)
+    follow = Repeating(np.full((model.n, 7), np.inf), LEAST, [False] * model.n, 1.0)
 
-    def bounds(some: Any) -> Iterable[Array]:
+    def bounds(some: Any) -> list[Array]:
         with np.errstate(over="ignore", invalid="ignore"):
             centre, half = model.columns_centre_and_half(model.normalised_columns(some), some.dt)
             return [point.recorded_x(bound.T) for bound in edges(centre, half, 1.0)]
 
-    for _, follows, step in walk(model, transient.t_ns, steps, some, bounds):
-        if not follows:
-            follow.forget()
-        for moved in follow.push(step):
-            reached = moved.seconds, moved.run, moved.sum, moved.activity
-            most[:, moved.state] = np.fmax(most[:, moved.state], reached)  # a run beyond all numbers is NaN after
-    return Found(most, windows, noisy, largest)
+    if some.any():
+        follow.take_all(*followed(model, transient.t_ns, steps, some, bounds)[1])
+    return Found(follow.most, windows, noisy, largest)
 
 
 def together(n: int, found: Sequence[Found]) -> Repeats:
@@ -373,7 +291,7 @@ SLOW_S, SLOW_NOISY = 0.5, 5000
 """Seconds that are enough in place of these steps if so many have shown the noise: of a slow sensor."""
 
 Bounds = tuple[Sequence[float], Sequence[float], Sequence[float], bool]
-"""What `Transition` has of bounds, nominal model and domain."""
+"""Lower and upper bounds (n,), elements a_ii (n,), and whether a transition begins outside the fitted ranges."""
 
 
 class Looked(NamedTuple):
@@ -389,6 +307,8 @@ class Looked(NamedTuple):
 
 
 _NOTHING = Looked()
+LONGER = 2
+"""Code of `Repeating` for what repeats longer than in the fit; those of frozen states follow it."""
 
 
 class FrozenWatch:
@@ -398,23 +318,25 @@ class FrozenWatch:
     is masked is never frozen; `needs` (n, n): which rows need which states.
     """
 
-    __slots__ = ("_beyond", "_counted", "_follow", "_frozen", "_margin", "_needed_by", "_on", "_usual", "repeats")
+    __slots__ = ("_follow", "_frozen", "_needed_by", "_needs", "_on", "repeats")
 
     def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool], needs: NDArray[np.bool_]) -> None:
-        self.repeats, self._counted, self._margin = repeats, list(counted), margin
+        self.repeats, self._needs = repeats, needs
         self._needed_by = [np.flatnonzero(column).tolist() for column in needs.T]
         longest, reached = repeats.longest_repeat_s, np.array([repeats.largest_run, repeats.largest_sum])
         known = np.isfinite(reached)  # of a model that was changed after its fit they are not
         beyond = np.vstack([np.maximum(1.0, FARTHER * np.where(known, reached, 0.0)), repeats.active_beyond])
-        self._beyond = np.where(beyond < LARGEST, beyond, np.inf).T.tolist()
-        self._usual = np.where(known[0], np.minimum(FARTHER * longest, USUAL_S), longest).tolist()
-        self._follow = Repeating(len(self._counted), margin)
+        usual = np.where(known[0], np.minimum(FARTHER * longest, USUAL_S), longest)
+        noisy = np.where(longest == 0.0, repeats.noisy_steps, 0.0)
+        by_noise = np.where(noisy >= NOISY, USUAL_S, np.inf), np.where(noisy >= SLOW_NOISY, SLOW_S, np.inf)
+        thresholds = np.vstack([usual, longest, np.where(beyond < LARGEST, beyond, np.inf), *by_noise]).T
+        self._follow = Repeating(thresholds, LEAST, counted, margin)
         self.forget()
 
     def forget(self) -> None:
         """No transition leads to the next sample: nothing is known to repeat."""
         self._follow.forget()
-        self._frozen: dict[int, str] = {}  # and why
+        self._frozen: set[int] = set()
         self._on = False  # something repeats
 
     def look(
@@ -432,54 +354,40 @@ class FrozenWatch:
             withheld = self._rows(self._frozen)
             self.forget()
             return Looked(withheld=withheld)
-        return self.take(Transition(t_ns, dt, before, after, *bounds()))
-
-    def take(self, step: Transition) -> Looked:
-        """Take one in which some state repeats."""
         self._on = True
-        frozen, repeating = [], []
-        for moved in self._follow.push(step):
-            i = moved.state
-            if not self._counted[i]:
-                continue
-            if why := self._frozen.get(i) or ("" if step.outside else self._why(moved, step)):
-                frozen.append(moved._replace(why=why))
-            elif moved.seconds > self.repeats.longest_repeat_s[i] + step.dt / 2:  # not by jitter of its steps
-                repeating.append(moved)
-        now = {moved.state: moved.why for moved in frozen}
+        each = [
+            (Moved(i, s, self._why(i, code, size)), code)
+            for i, s, code, size in self._follow.take(t_ns, dt, before, after, *bounds())
+        ]
+        frozen = tuple(moved for moved, code in each if code > LONGER)
+        now = {moved.state for moved in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
-        return Looked(tuple(frozen), withheld, tuple(repeating))
+        return Looked(frozen, withheld, tuple(moved for moved, code in each if code == LONGER))
+
+    def look_all(self, given: Followed) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Callable[[int, int], str]]:
+        """As `look`, many transitions: codes and rows withheld (K, n), and why a state is frozen after one of them."""
+        codes, sizes = self._follow.take_all(*given)
+        frozen = codes > LONGER
+        before = np.roll(frozen, 1, axis=0) & given[0][:, None]
+        withheld = ((frozen | before).astype(np.float64) @ self._needs.T) > 0.0
+        return codes, withheld, lambda k, i: self._why(i, int(codes[k, i]), float(sizes[k, i]))
 
     def _rows(self, states: Iterable[int]) -> tuple[int, ...]:
         return tuple(sorted({i for j in states for i in self._needed_by[j]}))
 
-    def _why(self, moved: Moved, step: Transition) -> str:
+    def _why(self, i: int, code: int, size: float) -> str:
         """Why a state is frozen, in words; empty if it is not."""
-        i, repeats = moved.state, self.repeats
-        run, total, active = self._beyond[i]
-        if moved.seconds <= self._usual[i]:
-            return ""
-        if moved.run > run:
-            return _moved("the model moves it", moved.run, repeats.largest_run[i])
-        if moved.sum > total and moved.seconds > repeats.longest_repeat_s[i] and self._moves(moved, step):
-            return _moved("the model's steps add up", moved.sum, repeats.largest_sum[i])
-        if moved.steps >= LEAST and moved.activity > active:
-            size = f"changes by {moved.activity:.3g} half-widths, and beyond {active:.3g} it always moved"
-            return f"while the machine is active: its rate by the model {size}"
-        noisy = repeats.noisy_steps[i] if repeats.longest_repeat_s[i] == 0.0 else 0
-        slow = noisy >= SLOW_NOISY and moved.steps > 0 and moved.seconds >= SLOW_S
-        if slow or (noisy >= NOISY and moved.steps >= LEAST and moved.seconds >= USUAL_S):
-            parked = len(step.after) > 1 and all(map(eq, step.before, step.after))
-            if step.after[i] != 0.0 and not parked:
-                return f"while at constant controls noise changed it {noisy:.0f} times in the fit"
+        repeats = self.repeats
+        if code == LONGER + 1:
+            return _moved("the model moves it", size, repeats.largest_run[i])
+        if code == LONGER + 2:
+            return _moved("the model's steps add up", size, repeats.largest_sum[i])
+        if code == LONGER + 3:
+            active = f"{size:.3g} half-widths, and beyond {repeats.active_beyond[i]:.3g} it always moved"
+            return f"while the machine is active: its rate by the model changes by {active}"
+        if code == LONGER + 4:
+            return f"while at constant controls noise changed it {repeats.noisy_steps[i]:.0f} times in the fit"
         return ""
-
-    def _moves(self, moved: Moved, step: Transition) -> bool:
-        """Some state has left the place that it had when the repeat began, so that the machine is not at rest."""
-        return any(
-            abs(value - start) > 0.5 * (high - low) / self._margin
-            for value, start, low, high in zip(step.after, moved.start, step.lower, step.upper, strict=True)
-        )
 
 
 def _moved(what: str, size: float, most: float) -> str:

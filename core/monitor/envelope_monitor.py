@@ -42,7 +42,7 @@ from uncertain_lti.kernel.arithmetic import (
 )
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
-from uncertain_lti.model.repeats import Bounds, FrozenWatch, Partly, needs, walk
+from uncertain_lti.model.repeats import LONGER, Bounds, FrozenWatch, Partly, followed, needs
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
@@ -501,16 +501,13 @@ class EnvelopeMonitor:
             found = self._numbers(transient, some, (LOWER, UPPER))
             return [found[kind][some.k + 1] for kind in (LOWER, UPPER)]
 
-        for k, follows, step in walk(self.model, transient.t_ns, steps, steps.rows(marks, 1) & REPEATS > 0, bounds):
-            if not follows:
-                watch.forget()
-            looked = watch.take(step)
-            withheld[k + 1, list(looked.withheld)] = True
-            for moved in looked.frozen:
-                frozen[k + 1, moved.state] = True
-                why[k + 1, moved.state] = moved.why
-            for moved in looked.repeating:
-                repeating[k + 1, moved.state] = True
+        some = steps.rows(marks, 1) & REPEATS > 0
+        if some.any():
+            at, given = followed(self.model, transient.t_ns, steps, some, bounds)
+            codes, withheld[at + 1], because = watch.look_all(given)
+            frozen[at + 1], repeating[at + 1] = codes > LONGER, codes == LONGER
+            for row, state in np.argwhere(codes > LONGER).tolist():
+                why[int(at[row]) + 1, state] = because(row, state)
         return frozen, withheld, repeating, why
 
     def _numbers(
