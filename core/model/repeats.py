@@ -164,22 +164,20 @@ Followed = tuple[NDArray[np.bool_], NDArray[np.int64], Array, Array, Array, Arra
 
 
 def followed(
-    model: Any,
-    t_ns: NDArray[np.int64],
-    steps: Any,
-    repeats: NDArray[np.bool_],
-    bounds: Callable[[Any], Sequence[Array]],
+    model: Any, t_ns: NDArray[np.int64], steps: Any, repeats: NDArray[np.bool_], margin: float
 ) -> tuple[NDArray[np.intp], Followed]:
     """Transitions in which some state repeats, and those right after: where each begins, and what they are.
 
-    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `repeats` (K,): whether some state repeats; `bounds`:
-    lower and upper bounds (K, n) of some transitions, recorded units.
+    `t_ns` (N+1,): of the samples, ns; `steps`: K transitions; `repeats` (K,): whether some state repeats; `margin`: of
+    the bounds.
     """
     follows = np.append(False, np.diff(steps.k) == 1)[: len(steps.k)]
     steps = steps.take(np.flatnonzero(repeats | (follows & np.roll(repeats, 1))))
     z, at = model.normalised_columns(steps), steps.k
     on = np.append(False, np.diff(at) == 1)[: len(at)]
-    lower, upper = bounds(steps)
+    with np.errstate(over="ignore", invalid="ignore"):
+        centre, half = model.columns_centre_and_half(z, steps.dt)
+        lower, upper = (model.operating_point.recorded_x(bound.T) for bound in edges(centre, half, margin))
     outside = model.domain.beyond(z) | model.unknown(z)
     return at, (on, t_ns[at + 1], steps.dt, steps.x, steps.x_next, lower, upper, model.own_rates(z).T, outside)
 
@@ -201,18 +199,13 @@ class Found(NamedTuple):
 
 def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
-    point, steps = model.operating_point, transient.transitions()
+    steps = transient.transitions()
     windows, noisy = _activity(model, transient, steps)
     some, largest = changes(transient.x, steps.k)
     follow = Repeating(np.full((model.n, 7), np.inf), LEAST, [False] * model.n, 1.0)
 
-    def bounds(some: Any) -> list[Array]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            centre, half = model.columns_centre_and_half(model.normalised_columns(some), some.dt)
-            return [point.recorded_x(bound.T) for bound in edges(centre, half, 1.0)]
-
     if some.any():
-        follow.take_all(*followed(model, transient.t_ns, steps, some, bounds)[1])
+        follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
     return Found(follow.most, windows, noisy, largest)
 
 

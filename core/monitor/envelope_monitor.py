@@ -66,7 +66,7 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int
 
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
 _BEYOND_NS = 2**63 - 1  # later than any instant
-_PIECE = 100_000  # rows that one thread takes at a time
+_PIECE = 200_000  # numbers that one thread takes at a time
 
 
 @cython.cclass
@@ -497,13 +497,9 @@ class EnvelopeMonitor:
         if watch is None:
             return frozen, withheld, repeating, why
 
-        def bounds(some: Transitions) -> list[Array]:
-            found = self._numbers(transient, some, (LOWER, UPPER))
-            return [found[kind][some.k + 1] for kind in (LOWER, UPPER)]
-
         some = steps.rows(marks, 1) & REPEATS > 0
         if some.any():
-            at, given = followed(self.model, transient.t_ns, steps, some, bounds)
+            at, given = followed(self.model, transient.t_ns, steps, some, self.rule.margin)
             codes, withheld[at + 1], because = watch.look_all(given)
             frozen[at + 1], repeating[at + 1] = codes > LONGER, codes == LONGER
             for row, state in np.argwhere(codes > LONGER).tolist():
@@ -517,7 +513,8 @@ class EnvelopeMonitor:
         count = len(transient)
         numbers = [np.empty((count, self.model.n)) if kind in kinds else None for kind in range(UTILISATION + 1)]
         marks = np.empty(count, dtype=np.uint8) if marks is None else marks
-        ends = np.linspace(0, len(steps.k), len(steps.k) // _PIECE + 2).astype(int).tolist()
+        pieces = len(steps.k) * (self.model.n + self.model.m) // _PIECE + 1
+        ends = np.linspace(0, len(steps.k), pieces + 1).astype(int).tolist()
         judges = [self.model.judge_of(self.rule.margin, self._counted) for _ in ends[1:]]  # each has room of its own
         given = [(judge, steps.k[a:b], steps.dt[a:b]) for judge, (a, b) in zip(judges, pairwise(ends), strict=True)]
         x, u, s = transient.x, transient.u, transient.s
