@@ -361,8 +361,10 @@ class FrozenWatch:
         """As `look`, many transitions: codes and rows withheld (K, n), and why a state is frozen after one of them."""
         codes, sizes = self._follow.take_all(*given)
         frozen = codes > LONGER
-        before = np.roll(frozen, 1, axis=0) & given[0][:, None]
-        withheld = ((frozen | before).astype(np.float64) @ self._needs.T) > 0.0
+        stale = frozen | (np.roll(frozen, 1, axis=0) & given[0][:, None])
+        withheld = np.zeros(frozen.shape, dtype=bool)
+        for j in np.flatnonzero(stale.any(axis=0)):
+            withheld[stale[:, j]] |= self._needs[:, j]
         return codes, withheld, lambda k, i: self._why(i, int(codes[k, i]), float(sizes[k, i]))
 
     def _rows(self, states: Iterable[int]) -> tuple[int, ...]:

@@ -367,8 +367,13 @@ def _cases(model: UncertainLTI, parts: Sequence[Part], within: float, cases: int
         np.concatenate([rng.standard_normal((len(onsets), times.shape[1])) for _, _, onsets, _, rng in chosen]),
         np.repeat([unit for _, unit, *_ in chosen], counts),
         np.repeat([list(models).index(id(part.model)) for part, *_ in chosen], counts),
-        tuple(EnvelopeMonitor(m.replace(alarm=model.alarm)) for m in models.values()), template, step,
+        tuple(EnvelopeMonitor(_alarming(m, model)) for m in models.values()), template, step,
     )  # fmt: skip
+
+
+def _alarming(own: UncertainLTI, model: UncertainLTI) -> UncertainLTI:
+    """A model with the alarm of another; which combinations it has seen takes long to tell, and no alarm asks."""
+    return own.replace(alarm=model.alarm, domain=replace(own.domain, measure=None))
 
 
 def _onsets(transient: Transient, within: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
