@@ -19,7 +19,7 @@ import pytest
 
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.kernel import arithmetic
-from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
+from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION, Repeating
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.signals.signal_map import Signal
@@ -200,3 +200,87 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
     for k in ([-1], [3], [4]):
         with pytest.raises(ValueError, match="fit the recording"):
             judge.judge_rows(*samples, k, [0.1], two, marks)
+
+
+# --- repeats ------------------------------------------------------------------------------------------------------
+
+
+def by_the_words(thresholds: Any, least: int, counted: Any, margin: float, steps: list[tuple[Any, ...]]) -> Any:
+    """Codes, sizes and the most of each measure, as the head of `model/repeats.py` says, one state after another."""
+    n = len(counted)
+    codes, sizes, most = np.zeros((len(steps), n), dtype=np.uint8), np.zeros((len(steps), n)), np.zeros((4, n))
+    for i in range(n):
+        usual, longest, run_most, sum_most, active, noise_s, slow_s = thresholds[i]
+        start: Any = None
+        for k, (follows, t_ns, dt, before, after, lower, upper, own, outside) in enumerate(steps):
+            if not follows or after[i] != before[i]:
+                start = None
+            if after[i] != before[i]:
+                continue
+            if start is None:
+                start, begin, run, total, code, size = before, t_ns - dt, 0.0, 0.0, 1, 0.0
+                rates, halves, per_s = list[float](), list[float](), list[float]()
+            if not outside:
+                movement, half = (lower[i] + upper[i]) / 2 - after[i], (upper[i] - lower[i]) / 2 / margin
+                run, total = run + dt * 1e-9 * own[i] * run + movement, total + movement
+                rates.append(movement / (dt * 1e-9))
+                halves.append(half)
+                per_s.append(half / (dt * 1e-9))
+            seconds, widest = (t_ns - begin) * 1e-9, max(halves, default=0.0)
+            far, away = (abs(v) / widest if widest > 0 else math.inf if v else 0.0 for v in (run, total))
+            spread = max(rates) - min(rates) if rates else 0.0
+            activity = spread / max(per_s) if rates and max(per_s) > 0 else math.inf if spread > 0 else 0.0
+            most[:, i] = np.fmax(most[:, i], (seconds, far, away, activity))
+            if counted[i] and code < 3:
+                left = (abs(after - start) > (upper - lower) / 2 / margin).any()
+                still = n > 1 and (before == after).all()
+                enough, shown = len(rates) >= least, len(rates) > 0 and seconds >= slow_s
+                code = 2 if seconds > longest + dt * 1e-9 / 2 else 1
+                if not outside and seconds > usual:
+                    if far > run_most:
+                        code, size = 3, far
+                    elif away > sum_most and seconds > longest and left:
+                        code, size = 4, away
+                    elif enough and activity > active:
+                        code, size = 5, activity
+                    elif (shown or (enough and seconds >= noise_s)) and after[i] != 0.0 and not still:
+                        code = 6
+            codes[k, i], sizes[k, i] = code, size
+    return codes, sizes, most
+
+
+def test_repeats_are_told_as_the_words_say() -> None:
+    seen: set[int] = set()
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        n, count, margin = int(rng.integers(1, 4)), 80, float(rng.choice([1.0, 1.5]))
+        held = rng.uniform(size=(count, n)) < rng.choice([0.7, 0.9, 1.0], size=n)
+        x = rng.normal(size=(count + 1, n)) * (rng.uniform(size=(count + 1, n)) < 0.8)  # some are 0
+        for k in range(count):
+            x[k + 1] = np.where(held[k], x[k], x[k + 1])
+        dt = rng.integers(8_000_000, 12_000_000, count)
+        t_ns = 1_700_000_000_000_000_000 + np.cumsum(dt)
+        centre = x[1:] + rng.normal(size=(count, n)) * rng.choice([0.01, 0.2], size=n)
+        half = rng.uniform(0.1, 0.5, (count, n)) * (rng.uniform(size=n) < 0.95)
+        follows, outside = rng.uniform(size=count) < 0.97, rng.uniform(size=count) < 0.1
+        own = rng.normal(size=(count, n)) * 5.0
+        often = np.array([0.05, 0.1, 3.0, 6.0, 1.0, 0.1, 0.2]) * rng.choice([0.3, 1.0, np.inf], size=(n, 7))
+        counted = rng.uniform(size=n) < 0.9
+        follow = Repeating(often, 3, counted.tolist(), margin)
+        given = (follows, t_ns, dt * 1e-9, x[:-1], x[1:], centre - half, centre + half, own, outside)
+        codes, sizes = follow.take_all(*given)
+        steps = list(zip(follows, t_ns, dt, x[:-1], x[1:], centre - half, centre + half, own, outside, strict=True))
+        wanted, measured, most = by_the_words(often, 3, counted, margin, steps)
+        assert np.array_equal(codes, wanted)
+        np.testing.assert_allclose(sizes, measured, rtol=1e-9)
+        np.testing.assert_allclose(follow.most, most, rtol=1e-9)
+        seen |= set(codes.ravel().tolist())
+        alone = Repeating(often, 3, counted.tolist(), margin)
+        for k, (on, *step) in enumerate(steps):
+            if not on:
+                alone.forget()
+            step[1] *= 1e-9
+            told = alone.take(*step)
+            more = np.flatnonzero(codes[k] > 1).tolist()
+            assert [(i, c, s) for i, _, c, s in told] == [(i, codes[k, i], sizes[k, i]) for i in more]
+    assert seen == set(range(7))

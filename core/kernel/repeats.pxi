@@ -133,12 +133,12 @@ cdef class Repeating:
         for i in range(n):
             repeat = &self.of[i]
             if after[i] != before[i]:
-                repeat.code = _FRESH
+                repeat.code, repeat.size = _FRESH, 0.0
                 continue
             if repeat.code == _FRESH:
                 repeat.code, repeat.begin, repeat.steps = _USUAL, t_ns - llrint(dt * 1e9), 0
                 repeat.run = repeat.total = repeat.half = repeat.per_second = 0.0
-                repeat.low, repeat.high = INFINITY, -INFINITY
+                repeat.low, repeat.high, repeat.size = INFINITY, -INFINITY, 0.0
                 memcpy(self.start + i * n, before, n * sizeof(double))
             if not outside:
                 movement = 0.5 * (lower[i] + upper[i]) - after[i]
