@@ -25,6 +25,11 @@ UNKNOWN: int
 UNLISTED: int
 LEFT: int
 REPEATS: int
+LONGER: int
+BY_RUN: int
+BY_SUM: int
+BY_ACTIVITY: int
+BY_NOISE: int
 LOWER: int
 UPPER: int
 RESIDUAL: int

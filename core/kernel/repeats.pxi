@@ -9,6 +9,9 @@
 
 """Exact repeats as they come: how long, how far the model moves the state meanwhile, and whether it is frozen."""
 
+LONGER, BY_RUN, BY_SUM, BY_ACTIVITY, BY_NOISE = range(2, 7)
+"""What a code of `Repeating` says: longer than in any repeat of the fit, or frozen, by its run, its sum, the activity
+or for want of noise."""
 cdef enum:
     _MEASURES = 4  # seconds, run, sum, activity
     _THRESHOLDS = 7  # usual s, longest s, run, sum, activity, s of noise, s of a slow sensor

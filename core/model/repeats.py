@@ -44,7 +44,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import FLAGS, UTILISATION, Repeating, changes, edges
+from uncertain_lti.kernel.arithmetic import (
+    BY_ACTIVITY,
+    BY_NOISE,
+    BY_RUN,
+    BY_SUM,
+    FLAGS,
+    LONGER,
+    UTILISATION,
+    Repeating,
+    changes,
+    edges,
+)
 from uncertain_lti.model.terms import checked, object_of
 
 _KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond", "noisy_steps")
@@ -300,8 +311,6 @@ class Looked(NamedTuple):
 
 
 _NOTHING = Looked()
-LONGER = 2
-"""Code of `Repeating` for what repeats longer than in the fit; those of frozen states follow it."""
 
 
 class FrozenWatch:
@@ -352,7 +361,7 @@ class FrozenWatch:
             (Moved(i, s, self._why(i, code, size)), code)
             for i, s, code, size in self._follow.take(t_ns, dt, before, after, *bounds())
         ]
-        frozen = tuple(moved for moved, code in each if code > LONGER)
+        frozen = tuple(moved for moved, code in each if code != LONGER)
         now = {moved.state for moved in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
         return Looked(frozen, withheld, tuple(moved for moved, code in each if code == LONGER))
@@ -373,14 +382,14 @@ class FrozenWatch:
     def _why(self, i: int, code: int, size: float) -> str:
         """Why a state is frozen, in words; empty if it is not."""
         repeats = self.repeats
-        if code == LONGER + 1:
+        if code == BY_RUN:
             return _moved("the model moves it", size, repeats.largest_run[i])
-        if code == LONGER + 2:
+        if code == BY_SUM:
             return _moved("the model's steps add up", size, repeats.largest_sum[i])
-        if code == LONGER + 3:
+        if code == BY_ACTIVITY:
             active = f"{size:.3g} half-widths, and beyond {repeats.active_beyond[i]:.3g} it always moved"
             return f"while the machine is active: its rate by the model changes by {active}"
-        if code == LONGER + 4:
+        if code == BY_NOISE:
             return f"while at constant controls noise changed it {repeats.noisy_steps[i]:.0f} times in the fit"
         return ""
 

@@ -28,6 +28,7 @@ from uncertain_lti.kernel.arithmetic import (
     FLAGS,
     JUDGED,
     LEFT,
+    LONGER,
     LOWER,
     OUTSIDE,
     REPEATS,
@@ -42,7 +43,7 @@ from uncertain_lti.kernel.arithmetic import (
 )
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
-from uncertain_lti.model.repeats import LONGER, Bounds, FrozenWatch, Partly, followed, needs
+from uncertain_lti.model.repeats import Bounds, FrozenWatch, Partly, followed, needs
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
