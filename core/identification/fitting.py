@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, on_cores, one_thread_each
+from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.assembly import assemble, median_step
@@ -201,13 +201,13 @@ def fit(
 
 
 def _memory(
-    problem: Problem, transients: Sequence[Transient], fleet: Fleet, model: UncertainLTI
+    problem: Problem, transients: Sequence[Transient], fleet: Fleet, model: UncertainLTI, nearest: Sequence[Index]
 ) -> dict[str, Any] | None:
     """What the file of a plain model keeps of its recordings."""
     edges = np.searchsorted(problem.source, np.arange(len(transients) + 1)).tolist()
     each = zip(transients, edges[:-1], edges[1:], strict=True)
     recordings = [Recording.of(t.name, problem.subset(slice(a, b))) for t, a, b in each]
-    return remembered(model, problem, recordings, fleet)
+    return remembered(model, problem, recordings, fleet.sums, nearest)
 
 
 @one_thread_each()
@@ -225,9 +225,12 @@ def fit_fleet(
     transients: Sequence[Transient] = (),
     discarded: int = 0,
     seek_carriers: bool = False,
-    remember: Callable[[UncertainLTI], dict[str, Any] | None] | None = None,
+    remember: Callable[[UncertainLTI, list[Index]], dict[str, Any] | None] | None = None,
 ) -> UncertainLTI:
-    """`fit` on transitions that are already normalised, wherever they lie; `remember`: what the model's file keeps."""
+    """`fit` on transitions that are already normalised, wherever they lie.
+
+    `remember`: what the model's file keeps, of the model and `WorkingSet.nearest`.
+    """
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
         engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
@@ -260,7 +263,7 @@ def fit_fleet(
         )
 
     found = optimum(engine, criterion, build, [s.name for s in signals.states], method)
-    fleet.nearest = engine.nearest
+    nearest = engine.nearest() if remember is not None else []
     del engine  # with the samples that its rows hold
     model, judged, solution = found.envelope, found.judged, found.solution
     facts: dict[str, Any] = {
@@ -294,7 +297,7 @@ def fit_fleet(
         )
         return rank, messages + distance_in_words(found.gap)
 
-    memory = (lambda: None) if remember is None else partial(remember, model.replace(fit_summary=facts))
+    memory = (lambda: None) if remember is None else partial(remember, model.replace(fit_summary=facts), nearest)
     afterwards = (
         memory,
         said,

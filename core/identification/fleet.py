@@ -18,7 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array, Index, core_count
+from uncertain_lti.base.arrays import Array, core_count
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
@@ -44,12 +44,10 @@ class Fleet:
     """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
 
     `partitions`: with the same columns, states and controls; `threads`: how many partitions a pass visits at a time,
-    which the kernel does without the interpreter's lock; `sums`: those of the last `moments`; `nearest`: of each row of
-    the last fit the transitions nearest to their bounds, or the widest, in order.
+    which the kernel does without the interpreter's lock; `sums`: those of the last `moments`.
     """
 
     sums: Moments
-    nearest: list[Index]
 
     def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
         self.partitions = list(partitions)

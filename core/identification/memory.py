@@ -28,7 +28,6 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import WORTH_THREADS, Array, Index, on_cores
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments, moments
 from uncertain_lti.identification.problem import Block, Columns, Problem
 from uncertain_lti.kernel.arithmetic import boxes_of
@@ -225,14 +224,15 @@ def remembered(
     model: UncertainLTI,
     problem: Problem,
     recordings: Sequence[Recording],
-    fleet: Fleet,
+    sums: Moments,
+    nearest: Sequence[Index],
     rest: Moments | None = None,
     boxes: Boxes | None = None,
 ) -> dict[str, Any] | None:
     """What the file of a model keeps of transitions, beside what was kept of others already.
 
     None if there is no room for those that decide. `problem`: `source` being the number of the recording, rising;
-    `fleet`: that the model was fitted to, `rest` included; `boxes`: with the room that the model leaves.
+    `sums`: over its transitions; `nearest`: of `WorkingSet`; `boxes`: with the room that the model leaves.
     """
     n, p, widths = model.n, problem.p, model.fit_summary["criterion"] == "lp"
     unknowns, each, box = problem.columns.unknowns(p), 8 * (p + n + 3), 2 * (p + 1) + (3 if widths else 2) * n
@@ -244,8 +244,7 @@ def remembered(
         if most <= n * unknowns:
             return None
         widest = 0.5 * np.asarray(model.fit_summary["max_width"]) if widths else None
-        sums = fleet.sums if rest is None else fleet.sums + rest
-        kept = _nearest(model, problem, sums, fleet.nearest, widest, most)
+        kept = _nearest(model, problem, sums if rest is None else sums + rest, nearest, widest, most)
         left = np.ones(problem.N, dtype=bool)
         left[kept] = False
         if not problem.columns.half:  # at rest there is no room, and no model changes that
@@ -262,7 +261,7 @@ def remembered(
                 tasks.append((model, block, problem.source[part], widest, numbers))
         parts = [] if boxes is None else [boxes.fewer(0, share)]
         parts += on_cores(Boxes.of, tasks, problem.N > WORTH_THREADS)
-        others = fleet.sums - moments(chosen)[0]
+        others = sums - moments(chosen)[0]
         problem, rest, boxes = chosen, others if rest is None else rest + others, Boxes.join(parts)
     return Memory(problem, rest, boxes, tuple(recordings)).to_dict(model)
 

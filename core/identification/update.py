@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.assembly import assemble, is_constant, median_step
@@ -121,8 +121,13 @@ def updated(
             "recordings differ; fit again with all recordings"
         )
     structure = Structure.from_dict(facts["structure"], model.n, model.m) if "structure" in facts else None
+    fleet = _Updated(model, memory, here, new)
+
+    def remember(of: UncertainLTI, nearest: Sequence[Index]) -> dict[str, Any] | None:
+        boxes = fleet.boxes_after(of, np.asarray(of.fit_summary["max_width"]))
+        return remembered(of, _joined([here, new]), every, fleet.sums, nearest, memory.rest, boxes)
+
     try:
-        fleet = _Updated(model, memory, here, new)
         found = fit_fleet(
             fleet,
             model.signals,
@@ -131,6 +136,7 @@ def updated(
             progress=progress,
             dt_median=sampling.dt_median if facts["transitions"] >= new.N else median_step(new.dt),
             transients=runs,
+            remember=remember,
         )
     except InfeasibleError as error:
         number = int(np.concatenate([here.source, new.source])[error.index])
@@ -150,12 +156,10 @@ def updated(
         repeats=found.repeats and (found.repeats.and_of(model.repeats) if model.repeats else found.repeats),
         alarm=model.alarm,
     )
-    boxes = fleet.boxes_after(found, np.asarray(found.fit_summary["max_width"]))
-    data = remembered(found, _joined([here, new]), every, fleet, memory.rest, boxes)
-    if data is None:
+    if not found.memory:
         words = "the room for what an update needs is used up; fit all recordings the next time"
         found.fit_summary["messages"].append(words)
-    return found.replace(memory=data), runs
+    return found, runs
 
 
 def _as_fitted(model: UncertainLTI, transients: Iterable[Transient]) -> list[Transient]:

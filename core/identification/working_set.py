@@ -110,7 +110,7 @@ class WorkingSet:
         self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
         self._reach = np.zeros((2, fleet.n))  # in these scales of the rows
         self._reach_scales = np.full(fleet.n, np.nan)
-        self.nearest: list[Index] = [np.empty(0, dtype=np.intp)] * fleet.n  # of each row that is proven, in order
+        self._nearest_of: dict[int, Index] = {}  # of rows that were released
         self.keeps = False  # working sets of rows that are done, which choosing what to discard looks into
         self._together = False  # (10) with full weights: the rows meet in the objective
         self._like: Row | None = None  # the row that held samples last
@@ -139,6 +139,11 @@ class WorkingSet:
         if criterion == "qp":
             floor = np.array([float(floor @ floor) * self.sums.count])
         return float(np.max((objective - reference) / np.maximum(np.maximum(objective, floor), 1e-300), initial=0.0))
+
+    def nearest(self) -> list[Index]:
+        """Of each row that is proven the transitions nearest to their bounds, or the widest, in order."""
+        released = self._nearest_of
+        return [released[row.i] if row.i in released else row.nearest(_NEAREST) for row in self.rows]
 
     def quadratic(self) -> Solution:
         """Solve (10)."""
@@ -452,10 +457,10 @@ class WorkingSet:
         self._each(rows, settle)
         if not self.whole:
             self._prove(settle, rows)
-        for row in rows:
-            self.nearest[row.i] = row.nearest(_NEAREST)
             if self._in_groups:
-                self.programmes[row.i].release(self.keeps)
+                for row in rows:
+                    self._nearest_of[row.i] = row.nearest(_NEAREST)
+                    self.programmes[row.i].release(self.keeps)
 
     def _prove(self, settle: Settle, rows: list[Row]) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
