@@ -222,7 +222,7 @@ def by_the_words(thresholds: Any, least: int, counted: Any, margin: float, steps
                 rates, halves, per_s = list[float](), list[float](), list[float]()
             if not outside:
                 movement, half = (lower[i] + upper[i]) / 2 - after[i], (upper[i] - lower[i]) / 2 / margin
-                run, total = run + dt * 1e-9 * own[i] * run + movement, total + movement
+                run, total = run + dt * 1e-9 * min(own[i], 0.0) * run + movement, total + movement
                 rates.append(movement / (dt * 1e-9))
                 halves.append(half)
                 per_s.append(half / (dt * 1e-9))
@@ -234,16 +234,17 @@ def by_the_words(thresholds: Any, least: int, counted: Any, margin: float, steps
             if counted[i] and code < 3:
                 left = (abs(after - start) > (upper - lower) / 2 / margin).any()
                 still = n > 1 and (before == after).all()
+                rests, times = after[i] == 0.0, max(1.0, seconds / longest) if longest >= 1.0 else 1.0
                 enough, shown = len(rates) >= least, len(rates) > 0 and seconds >= slow_s
                 code = 2 if seconds > longest + dt * 1e-9 / 2 else 1
                 if not outside and seconds > usual:
-                    if far > run_most:
+                    if far > times * run_most and not rests and not still:
                         code, size = 3, far
-                    elif away > sum_most and seconds > longest and left:
+                    elif away > times * sum_most and seconds > longest and left and not rests:
                         code, size = 4, away
-                    elif enough and activity > active:
+                    elif enough and activity > max(active, 1.0 if rests else 1.0 / len(rates)):
                         code, size = 5, activity
-                    elif (shown or (enough and seconds >= noise_s)) and after[i] != 0.0 and not still:
+                    elif (shown or (enough and seconds >= noise_s)) and not rests and not still:
                         code = 6
             codes[k, i], sizes[k, i] = code, size
     return codes, sizes, most

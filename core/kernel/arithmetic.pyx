@@ -18,7 +18,7 @@ from uncertain_lti.base.arrays import LARGEST
 
 cimport cython
 from cpython cimport array as arrays
-from libc.math cimport INFINITY, NAN, fabs, fmax, llrint
+from libc.math cimport INFINITY, NAN, fabs, fmax, fmin, llrint
 from libc.stdlib cimport calloc, free
 from libc.string cimport memcpy
 

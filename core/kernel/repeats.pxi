@@ -24,6 +24,9 @@ cdef enum:
     _NOISE = 6
 
 
+cdef double _REST_S = 1.0  # from so long a repeat on the fit has seen the machine at rest
+
+
 cdef struct Repeat:
     int code  # _FRESH where there is none
     long long begin  # ns
@@ -146,7 +149,7 @@ cdef class Repeating:
             if not outside:
                 movement = 0.5 * (lower[i] + upper[i]) - after[i]
                 half = 0.5 * (upper[i] - lower[i]) / self.margin
-                repeat.run += dt * own[i] * repeat.run + movement
+                repeat.run += dt * fmin(own[i], 0.0) * repeat.run + movement
                 repeat.total += movement
                 repeat.half = half if half > repeat.half else repeat.half
                 repeat.steps += 1
@@ -172,23 +175,25 @@ cdef class Repeating:
         """Why a state is frozen; 0 where it is not."""
         cdef Py_ssize_t n = self.n, j, steps = self.of[i].steps
         cdef const double* found = self.measures + i
-        cdef bint parked = n > 1
+        cdef double longest = self.limit(i, 1), times = found[0] / longest if longest >= _REST_S else 1.0
+        cdef bint rests = after[i] == 0.0, parked = n > 1
         if found[0] <= self.limit(i, 0):
             return 0
-        if found[n] > self.limit(i, 2):
+        for j in range(n):
+            parked &= before[j] == after[j]
+        times = fmax(times, 1.0)  # a rest may be longer than those of the fit
+        if found[n] > times * self.limit(i, 2) and not (rests or parked):
             self.of[i].size = found[n]
             return _RUN
-        if found[2 * n] > self.limit(i, 3) and found[0] > self.limit(i, 1):
+        if found[2 * n] > times * self.limit(i, 3) and found[0] > longest and not rests:
             for j in range(n):  # some state has left the place that it had when the repeat began
                 if fabs(after[j] - self.start[i * n + j]) > 0.5 * (upper[j] - lower[j]) / self.margin:
                     self.of[i].size = found[2 * n]
                     return _SUM
-        if steps >= self.least and found[3 * n] > self.limit(i, 4):
+        if steps >= self.least and found[3 * n] > fmax(self.limit(i, 4), 1.0 if rests else 1.0 / steps):
             self.of[i].size = found[3 * n]
             return _ACTIVE
         if (steps > 0 and found[0] >= self.limit(i, 6)) or (steps >= self.least and found[0] >= self.limit(i, 5)):
-            for j in range(n):
-                parked &= before[j] == after[j]
-            if after[i] != 0.0 and not parked:
+            if not (rests or parked):
                 return _NOISE
         return 0

@@ -12,7 +12,7 @@ r"""Repeats: how long states repeat exactly in healthy recordings, how far the m
 A repeat of state i is a run of transitions over which its recorded value stays the same, to the bit. With the step
 :math:`Δt_j`, the centre of the bounds :math:`\hat x_j` and the repeated value r, the nominal model moves the state by
 
-    run_{j+1} = run_j + Δt_j a_ii run_j + (\hat x_j - r),    sum_{j+1} = sum_j + (\hat x_j - r)
+    run_{j+1} = run_j + Δt_j min(a_ii, 0) run_j + (\hat x_j - r),    sum_{j+1} = sum_j + (\hat x_j - r)
 
 both from 0 at the last fresh sample: the run is the state's own equation followed freely, with every other state as it
 was recorded, and the sum holds the state where it was read. Both are given in half-widths, the largest of the repeat.
@@ -25,11 +25,12 @@ Noise is told by the steps in which the controls kept their values and the state
 it, if hardly a value of the state came twice in a recording.
 
 A parked machine repeats too, so a repeat alone is a warning. A state is frozen if one of four measures of a repeat is
-beyond its half-width and beyond twice what healthy recordings reached (`Repeats`): how far its own equation runs from
-the repeated value; the sum of the movements, where another state has moved; how active the machine is meanwhile; or,
-of a state that noise always changed, the time, unless the value is 0, as of what is switched off, or all states
-repeat, as of a machine that is parked. Nothing counts outside the fitted domain, nor what a coarse sensor does by
-chance.
+beyond its half-width and beyond twice what healthy recordings reached (`Repeats`), of the first two in so long a time:
+how far its own equation runs from the repeated value; the sum of the movements, where another state has moved; how
+active the machine is meanwhile; or, of a state that noise always changed, the time. Where the value is 0, as of what
+rests or is switched off, or all states repeat, as of a machine that is parked, only activity counts: brakes and
+friction hold against what the model expects. Nothing counts outside the fitted domain, nor what a coarse sensor does
+by chance.
 """
 
 from __future__ import annotations

@@ -133,11 +133,21 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
 
     `ways`: options of `fit_monitored`, from the simplest on; `options`: further ones, for all. Where the recordings do
     not repeat one another the simplest is kept: nothing shows there that another holds. The others are compared on what
-    was fitted, and the best of them with the first on what was left out.
+    was fitted, and the best of them with the first on what was left out. Horizons, on which no panel depends, are those
+    of the way that is taken.
     """
+    over = {name: options.pop(name) for name in ("horizons", "widths", "drop_horizons") if name in options}
+    taken, way = _chosen(transients, ways, options)
+    return fit_monitored(transients, **{**options, **way, **over}) if over.get("horizons") else taken
+
+
+def _chosen(
+    transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], options: Mapping[str, Any]
+) -> tuple[Monitored, Mapping[str, Any]]:
+    """What `choose_monitored` takes, and how it is fitted, without horizons."""
     first = fit_monitored(transients, **{**options, **ways[0]})
     if len(ways) == 1 or first.panel is None or len(first.panel.unlike) > ALONE * first.panel.units:
-        return first
+        return first, ways[0]
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
 
@@ -156,10 +166,11 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
             continue
         if size < CLEARLY * least:
             best, least = way, size
-    if best is ways[0]:
-        return first
-    taken = fit_monitored(transients, **{**options, **best})
-    return taken if taken.panel is not None and taken.panel.figure < CLEARLY * first.panel.figure else first
+    if best is not ways[0]:
+        taken = fit_monitored(transients, **{**options, **best})
+        if taken.panel is not None and taken.panel.figure < CLEARLY * first.panel.figure:
+            return taken, best
+    return first, ways[0]
 
 
 def point_of(transient: Transient) -> OperatingPoint:
