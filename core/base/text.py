@@ -140,6 +140,16 @@ def lasting(hours: float) -> str:
     return f"{seconds:.3g} s" if seconds < 120 else f"{60 * hours:.3g} min" if hours < 2 else f"{hours:.3g} h"
 
 
+def apart(values: Sequence[float]) -> list[str]:
+    """Numbers with as many digits, four at least, as tell those apart that differ."""
+    texts: list[str] = []
+    for digits in range(4, 18):
+        texts = [f"{value:.{digits}g}" for value in values]
+        if len(set(texts)) == len(set(values)):
+            break
+    return texts
+
+
 def share(value: float | None, digits: int = 3) -> str:
     """A share in percent, or a dash for nothing."""
     return "-" if value is None else f"{value:.{digits}%}"

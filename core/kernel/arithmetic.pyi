@@ -25,6 +25,7 @@ UNKNOWN: int
 UNLISTED: int
 LEFT: int
 REPEATS: int
+BEYOND: float
 LONGER: int
 BY_RUN: int
 BY_SUM: int

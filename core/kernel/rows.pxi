@@ -113,6 +113,12 @@ def pair_count(Py_ssize_t size):
     return size * (size - 1) // 2 if size > 1 else 1
 
 
+BEYOND = 0.1
+"""Share of the fitted range of a signal beyond it from which on a sample is outside of what was fitted."""
+cdef double _SLACK = BEYOND
+cdef double _SAME = 1e-12  # of two numbers that rounding tells apart
+
+
 def cells_per_unit(least, greatest, Py_ssize_t cells):
     """Cells per normalised unit of each signal, what `cell_of` takes; 0 where it does not move."""
     span = np.subtract(greatest, least)
@@ -132,19 +138,21 @@ cdef void left_domain(
     int* cell,
     unsigned char* out,
 ) noexcept nogil:
-    """Whether each [x; u], in columns a stride wide, leaves the box in some element, or is a combination not fitted.
+    """Whether each [x; u], in columns a stride wide, is beyond a range by BEYOND of it, or a combination not fitted.
 
     `occupied`: of `domain.Occupancy`, with so many cells, 0 for none; `cell` (size, _TOGETHER): room.
     """
     cdef Py_ssize_t i, j, q, low, many
+    cdef double slack
     cdef int* first
     cdef int* second
     cdef const unsigned char* pair
     for q in range(count):
         out[q] = 0
     for i in range(size):
+        slack = _SLACK * (greatest[i] - least[i]) + _SAME * fmax(fabs(least[i]), fabs(greatest[i]))
         for q in range(count):
-            out[q] |= is_outside(z[i * stride + q], least[i], greatest[i])
+            out[q] |= is_outside(z[i * stride + q], least[i] - slack, greatest[i] + slack)
     for low from 0 <= low < (count if cells else 0) by _TOGETHER:
         many = count - low if count - low < _TOGETHER else _TOGETHER
         for i in range(size):
@@ -161,7 +169,7 @@ cdef void left_domain(
 
 
 def outside_domain(z, least, greatest, occupied=None):
-    """Whether each of z (n + m, K) leaves the box in some element, or is a combination that was not fitted."""
+    """Whether each of z (n + m, K) is beyond a range by BEYOND of it or more, or is a combination not fitted."""
     cdef const double[:, ::1] columns = np.ascontiguousarray(z)
     cdef arrays.array low = doubles(least), high = doubles(greatest)
     cdef Py_ssize_t size = columns.shape[0], count = columns.shape[1]

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.text import plural, shortlist
+from uncertain_lti.base.text import apart, plural, shortlist
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
 from uncertain_lti.model.operating_point import recorded
 
@@ -165,14 +165,11 @@ class Domain:
         return np.concatenate((self.x_max, self.u_max))
 
     def beyond(self, z: Array) -> NDArray[np.bool_]:
-        """Whether columns z = [x; u; ...] (n + m + q, K) leave the box in some element by more than a tenth of it."""
-        least, greatest = self.least[:, None], self.greatest[:, None]
-        slack = 0.1 * (greatest - least)
-        z = z[: len(least)]
-        return np.asarray(((z < least - slack) | (z > greatest + slack)).any(axis=0))
+        """Whether columns z = [x; u; ...] (n + m + q, K) leave the box in some element by a tenth of it or more."""
+        return np.asarray(outside_domain(z[: len(self.least)], self.least, self.greatest))
 
     def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:
-        """Whether z = [x; u] leaves the box in some element, or is a combination that was not fitted."""
+        """Whether z = [x; u] leaves the box as `beyond` says, or is a combination that was not fitted."""
         x, u = np.asarray(x, dtype=np.float64), np.asarray(u, dtype=np.float64)
         lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1])
         z = np.concatenate([np.broadcast_to(v, (*lead, v.shape[-1])) for v in (x, u)], axis=-1)
@@ -181,24 +178,37 @@ class Domain:
         return np.asarray(outside_domain(columns, self.least, self.greatest, occupied)).reshape(lead)
 
 
+_PAIRS_IN, _NAMED = 2000, 3  # samples whose combinations are looked at, and signals or pairs of them that are named
+
+
 def outside_in_words(model: Any, z: Array) -> str:
     """Which signals of some samples [x; u; ...] (n + m + q, K), normalised, lie beyond what was fitted, and where.
 
-    Those that do most often come first; empty if none lies outside its range by itself.
+    Those that do most often come first; then the pairs of signals whose combination was not fitted, where no signal
+    lies beyond its own range.
     """
-    point, found = model.operating_point, []
-    least, greatest = model.domain.least, model.domain.greatest
+    domain, point, found = model.domain, model.operating_point, []
+    least, greatest, signals = domain.least, domain.greatest, model.signals.signals
     z = z[: len(least)]
-    beyond = (z < least[:, None]) | (z > greatest[:, None])
+    beyond = np.array([outside_domain(z[i : i + 1], least[i : i + 1], greatest[i : i + 1]) for i in range(len(z))])
     for i in np.argsort(-beyond.sum(axis=1), kind="stable")[: beyond.any(axis=1).sum()].tolist():
         there = z[i, beyond[i]]
-        ends = recorded(
-            np.array([there.min(), there.max(), least[i], greatest[i]]), float(point.steady[i]), float(point.scale[i])
-        )
-        low, high, *fitted = (f"{value:.4g}" for value in ends.tolist())
+        ends = np.array([there.min(), there.max(), least[i], greatest[i]])
+        low, high, *fitted = apart(recorded(ends, float(point.steady[i]), float(point.scale[i])).tolist())
         at = " to ".join(dict.fromkeys((low, high)))
-        found.append(f"{model.signals.signals[i].name} at {at} (fitted: {' to '.join(fitted)})")
-    return shortlist(found, 3)
+        found.append(f"{signals[i].name} at {at} (fitted: {' to '.join(fitted)})")
+    others = np.flatnonzero(~beyond.any(axis=0))
+    if domain.measure is None or len(others) <= z.shape[1] // 2:
+        return shortlist(found, _NAMED)
+    some = np.ascontiguousarray(z[:, others[:: -(-len(others) // _PAIRS_IN)]])
+    counts = {
+        (i, j): int(outside_domain(some[[i, j]], least[[i, j]], greatest[[i, j]], held[None]).sum())
+        for (i, j), held in zip(combinations(range(len(z)), 2), domain.measure.occupied, strict=False)
+    }
+    pairs = sorted((pair for pair, count in counts.items() if count), key=lambda pair: -counts[pair])
+    named = [f"{signals[i].name} with {signals[j].name}" for i, j in pairs]
+    together = [f"combinations of {shortlist(named, _NAMED)} that were not fitted"] if named else []
+    return "; ".join([*filter(None, [shortlist(found, _NAMED)]), *together])
 
 
 def largest_steps(model: Any, found: Iterable[Any]) -> Array:

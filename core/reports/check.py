@@ -25,6 +25,7 @@ from uncertain_lti.base.text import (
     Block,
     Table,
     beyond,
+    list_of,
     named,
     number,
     plural,
@@ -48,8 +49,8 @@ from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient, Transitions
 
 UNVOUCHED, STRANGE = 0.2, 0.5
-"""Share of the verdicts outside the fitted domain from which on their quiet says nothing; there, or in alarm from early
-on, from which the machine may be another."""
+"""Share of the verdicts outside the fitted domain from which on their quiet says nothing, unless what was left out of a
+fit had as many; there, or in alarm from early on, from which on the machine may be another, whatever was left out."""
 JUDGED = 0.5
 """Share of the steps that must have a verdict for their quiet to say something."""
 APART = 10
@@ -319,7 +320,7 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
             "the alarm was armed at no verdict: --enable did not hold, or --grace was not over; give others, or check "
             "a recording in which the machine is in use"
         )
-    if (outside := data["outside_domain_share"]) > UNVOUCHED:
+    if (outside := data["outside_domain_share"]) > _vouched(model):
         ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
         why = "; ".join(filter(None, [data["beyond"], *data["unknown"]]))
         return (
@@ -338,6 +339,13 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
             f"another machine, in other units, or run as in no recording of the fit"
         )
     return ""
+
+
+def _vouched(model: UncertainLTI) -> float:
+    """Share of the verdicts that may be outside the fitted domain: the alarm was learnt on what was left out."""
+    parts = list_of((model.validation or {}).get("part"))
+    shares = [part["outside_domain"] / part["verdicts"] for part in parts if part["verdicts"]]
+    return float(min(max([UNVOUCHED, *shares]), STRANGE))
 
 
 def _inside(bad: int, count: int) -> float | None:

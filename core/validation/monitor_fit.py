@@ -136,9 +136,9 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
     was fitted, and the best of them with the first on what was left out. Horizons, on which no panel depends, are those
     of the way that is taken.
     """
-    over = {name: options.pop(name) for name in ("horizons", "widths", "drop_horizons") if name in options}
-    taken, way = _chosen(transients, ways, options)
-    return fit_monitored(transients, **{**options, **way, **over}) if over.get("horizons") else taken
+    alone = {name: value for name, value in options.items() if name not in ("horizons", "widths", "drop_horizons")}
+    taken, way = _chosen(transients, ways, alone)
+    return fit_monitored(transients, **{**options, **way}) if options.get("horizons") else taken
 
 
 def _chosen(

@@ -21,12 +21,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.text import plural
+from uncertain_lti.kernel.arithmetic import BEYOND
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
 from uncertain_lti.sampling.transient import Transient, Transitions
 
-BEYOND, FAR = (0.1, 2.0), (1.0, 10.0)
+REACHES = (BEYOND, 2.0), (1.0, 10.0)
 """Share of the range of a signal beyond it, and multiple of the largest leverage of the fit, from which on a sample is
 beyond what was fitted, or far beyond."""
 _SAME = 1e-12
@@ -60,7 +61,7 @@ class Reach:
         z = self._model.normalised_columns(steps)
         found = np.zeros(z.shape[1], dtype=np.intp)
         span, leverage = self._high - self._low, self._leverage(self._lever(z))
-        for level, (share, times) in enumerate((BEYOND, FAR), start=1):
+        for level, (share, times) in enumerate(REACHES, start=1):
             edge = share * span + _SAME * np.maximum(np.abs(self._low), np.abs(self._high))
             beyond = ((z < self._low - edge) | (z > self._high + edge)).any(axis=0)
             found[beyond | (leverage > times * self._largest)] = level
