@@ -23,6 +23,7 @@ from processes import bounded
 from uncertain_lti import SignalMap, UncertainLTI, read_transients
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cli.main import main
+from uncertain_lti.proposal.init import run_column
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
 from uncertain_lti.recordings.table_files import read_table
@@ -183,6 +184,8 @@ def lines(delimiter=",", point=".", time=lambda t: f"{t:.1f}"):
         "time\tspeed\tcmd\n" + lines("\t"),
         "time, speed, cmd\n" + lines(", "),
         "time,speed,cmd,\n" + lines().replace("\n", ",\n"),
+        "time,speed,cmd\n" + lines().replace("\n", ",\n"),
+        "time_on,t,speed,cmd\n" + "".join(f"0,{line}\n" for line in lines().split()),  # no time stands still
         "time_ms,speed,cmd\n" + lines(time=lambda t: f"{t * 1000:.0f}"),
         "t (us),speed,cmd\n" + lines(time=lambda t: f"{t * 1e6:.0f}"),
         "elapsed_time,speed,cmd\n" + lines(time=lambda t: f"0:00:{t:04.1f}"),
@@ -440,6 +443,27 @@ def test_only_line_ends_end_a_line(tmp_path, odd):
     path = tmp_path / "a.csv"
     path.write_text(f"made by{odd}somebody{odd}\ntime,x\n0,1\n1,2\n2,3\n", encoding="utf-8")
     assert len(Table(path).times) == 3
+
+
+def test_a_column_that_stands_still_is_no_time(tmp_path):
+    with pytest.raises(BagError, match="'time_on' is the same in all rows, and no other is called time"):
+        Table(write(tmp_path / "a.csv", "speed,time_on", "3,0", "1,0", "2,0"))
+
+
+def test_a_damaged_time_costs_its_row(tmp_path):
+    path = write(tmp_path / "a.csv", "time,x", "0,1", "1,2", "2.7e151,3", "3,4", "4,5")
+    table = Table(path)
+    assert table.columns_by_field["x"].tolist() == [1, 2, 4, 5]
+    assert any("1 row without a time left out" in text for text in table.warnings)
+    with pytest.raises(BagError, match="past the year 2262"):
+        Table(write(tmp_path / "b.csv", "time,x", "1e151,1", "2e151,2", "3,3"))
+
+
+def test_a_counter_tells_no_runs_where_stamps_repeat(tmp_path):
+    path = write(
+        tmp_path / "a.csv", "time,speed,minutes_on", *(f"{k // 40},{math.sin(k)},{k // 40}" for k in range(400))
+    )
+    assert run_column(group_recordings([path])) == ""
 
 
 def test_an_unsigned_column_that_falls_is_no_time(tmp_path):

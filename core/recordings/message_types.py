@@ -204,7 +204,10 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
         elif type_name in _jazzy().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
-            raise TypesysError(f"the file holds no definition of {type_name}, and ROS 2 Jazzy has none")
+            raise TypesysError(
+                f"the file holds no definition of {type_name}, nor does ROS 2; convert it to MCAP where its package is "
+                f"installed (`ros2 bag convert`)"
+            )
         used: dict[str, int] = {}
         _complete(type_name, types, (), used)
         _hold_bounds({name: types[name] for name in used})

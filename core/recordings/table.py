@@ -125,6 +125,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
             bare = re.sub(r"[\[(].*", "", name).strip().lower().replace(" ", "_").strip("/")
             if re.fullmatch(pattern, bare) and table.columns[name].ndim == 1:
                 called.append(name)
+    still = [name for name in called if _stands_still(table.columns[name])]
+    called = [name for name in called if name not in still]
     if likely := [name for name in called if _may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not _may_be(table.columns[called[0]])
         return called[0] if words_first and not _goes_forward(table.columns[likely[0]]) else likely[0], ""
@@ -137,8 +139,9 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
         values = table.columns[names[0]]
         if values.ndim == 1 and values.dtype.kind in "iuf" and len(values) > 2 and (values[1:] > values[:-1]).all():
             return names[0], "it is taken for the time, as it grows from row to row"
+    none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
     raise BagError(
-        f"{path}: no column is called time or looks like it; rename the one that is, or name it in a signals file, "
+        f"{path}: {none} is called time or looks like it; rename the one that is, or name it in a signals file, "
         f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
         f"{shortlist(names, 50)}"
     )
@@ -153,6 +156,10 @@ def _days_beside(table: RawTable, column: str) -> str:
     }
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
     return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
+
+
+def _stands_still(column: Column) -> bool:
+    return column.dtype.kind in "iuf" and len(column) > 2 and bool((column == column[0]).all())
 
 
 def _may_be(column: Column) -> bool:
@@ -238,7 +245,10 @@ def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[
     known = np.isfinite(values)
     if not known.any():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
-    largest = float(np.abs(values[known]).max()) * factor
+    sizes = np.abs(np.where(known, values, 0.0)) * factor
+    if np.median(sizes[known]) <= LATEST:  # the unit is right, and a row beyond is damaged
+        known &= sizes <= LATEST
+    largest = float(sizes[known].max())
     if largest > LATEST:
         raise _too_late(where)
     times = np.full(len(values), NO_TIME, dtype=np.int64)

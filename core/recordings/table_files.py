@@ -264,6 +264,9 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
         raise BagError(f"{path}: its cells are apart by spaces alone; write commas, semicolons or tabs between them")
     above = [_split(line.lstrip("#% "), delimiter) for line in lines[:-begin]]
     above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
+    rows = [cells for line in lines[-begin:] if len(cells := _split(line, delimiter)) == wide]
+    if not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none at that of the names
+        above = [[*cells, ""] if len(cells) == wide - 1 else cells for cells in above]
     above = [cells for cells in above if len(cells) == wide]
     kinds = [len(set(cells) - {""}) for cells in above]
     named = [i for i, kind in enumerate(kinds) if kind > 1]
