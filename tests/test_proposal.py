@@ -26,7 +26,7 @@ from test_signals import quaternion
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
-from uncertain_lti.proposal.candidates import Candidate, Source, Steps
+from uncertain_lti.proposal.candidates import Candidate, Source, Steps, role_by_name, role_of_column
 from uncertain_lti.proposal.choosing import _function, _may_follow, _may_move_with, _moves_with, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 
@@ -185,6 +185,42 @@ def test_a_command_is_found_by_its_effect_where_names_say_nothing(tmp_path):
     path, proposal = proposed(tmp_path, driven(("/b/state", "/a")))
     assert signals_of(proposal) == ([("/b/state", "data")], [("/a", "data")])
     assert "by correlation alone" in proposal.text
+
+
+@pytest.mark.parametrize("other", ["/imu_2", "/actuator_cmd"])
+def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_be_read(tmp_path, other):
+    """Joint states and an IMU that tells where they go; or beside a command whose type the file does not define."""
+    measured = other == "/imu_2"
+    messages = driven(("/b/state", other if measured else "/a"))
+    topics = [Topic("/b/state", FLOAT64), Topic(messages[1].topic, FLOAT64)]
+    if not measured:
+        topics.append(Topic(other, "some_msgs/msg/Command", schema=""))
+        messages += [Message(other, m.log_time, b"\0\1\0\0", m.log_time) for m in messages[::2]]
+    path = write(topics, messages).save(tmp_path / "run.mcap")
+    proposal = propose([path])
+    assert not proposal.controls and "by correlation" not in proposal.text
+    told = [
+        text for text in proposal.warnings if text.startswith(f"{other} is a command by its name, and cannot be read")
+    ]
+    assert len(told) == (not measured)
+
+
+@pytest.mark.parametrize(
+    ("topic", "role"),
+    [
+        ("/controller/forward_kinematics", ""), ("/arm_controller/state", "state"), ("/motor_controls", "control"),
+        ("/thruster/cmd/left", "control"), ("/controller/cmd_out", "control"),
+    ],
+)  # fmt: skip
+def test_a_controller_publishes_all_kinds(topic, role):
+    assert role_by_name(topic, "std_msgs/msg/Float64") == role
+
+
+@pytest.mark.parametrize(
+    ("column", "role"), [("q_des1", "reference"), ("tau_des", "reference"), ("description", "state")]
+)
+def test_what_is_desired_is_a_reference(column, role):
+    assert role_of_column(column) == role
 
 
 def test_a_cascade_keeps_every_tank(tmp_path):

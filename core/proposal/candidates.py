@@ -93,7 +93,7 @@ class Source:
     can be used; `offset`: median of log time less header stamp, s; None without a stamp; `arrival` (messages,): log
     times per recording, ns; `stamp` (messages,): header stamps per recording, ns; negative for none; `candidates`: its
     numbers; `reason`: why none of them is proposed; empty otherwise; `halting`: its header stamps mostly repeat the one
-    before.
+    before; `unreadable`: its messages cannot be read.
     """
 
     topic: str
@@ -106,6 +106,7 @@ class Source:
     candidates: list[Candidate] = field(default_factory=list)
     reason: str = ""
     halting: bool = False
+    unreadable: bool = False
 
     @property
     def count(self) -> int:
@@ -296,7 +297,8 @@ def explained(state: Source, controls: Sequence[Source]) -> float:
 
 
 # Words in the name of a topic or of its type; the last word of a name counts most.
-_COMMAND = re.compile(r"(cmd|command|contr|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory)")
+_COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory"
+_COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 
 
 _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in a table
@@ -308,7 +310,7 @@ _LABELS = 30
 """Values that a label takes, at most."""
 
 
-_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$)")
+_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$))")
 
 
 _STATE = re.compile(
@@ -360,7 +362,7 @@ def role_by_name(topic: str, type_name: str) -> str:
             return "state"
         if _REFERENCE.search(text):
             return "reference"
-        if _COMMAND.search(text):
+        if (_ABOVE if text == name != last else _COMMAND).search(text):
             return "control"
         if text == last and kind == "twist" and text.endswith("vel"):
             return "control"  # a bare Twist is what drives a base
@@ -500,15 +502,15 @@ def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]
     for source in references:
         source.reason = "a reference for some controller, and there is a command"
     states = [s for s in moving if s.role == "state"]
-    unknown = [s for s in moving if s.role == ""]
+    unknown = unnamed = [s for s in moving if s.role == ""]
     if not states:
         states, unknown = unknown, []
     if not states and len(controls) > 1:  # commands everywhere by their names: the one that the others explain best
         best = max(controls, key=lambda s: explained(s, [c for c in controls if c is not s]))
         controls, states = [c for c in controls if c is not best], [best]
-    if not controls and len(states) + len(unknown) > 1:
+    if not controls and not any(s.role == "control" for s in sources) and len(states) + len(unknown) > 1:
         by_effect = max(
-            (s for s in [*unknown, *states] if len(states) > 1 or s not in states),
+            (s for s in unnamed if len(states) > 1 or s not in states),  # what is measured by its name is no command
             key=lambda s: max((explained(o, [s]) for o in states if o is not s), default=0.0),
             default=None,
         )

@@ -99,7 +99,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
         source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
         sources.append(source)
         if not fact.info.readable:
-            source.reason = fact.info.reason
+            source.reason, source.unreadable = fact.info.reason, True
         elif source.role == "apart":
             source.reason = "no signal of a machine by its name or type"
         elif total < (3 if source.role == "control" else FEWEST):
@@ -159,7 +159,7 @@ def _tells_runs(table: Table, name: str) -> bool:
     runs = len(changes) + 1
     if not 2 <= runs <= len(column) // FEWEST or len(set(column[[0, *changes]].tolist())) < runs:
         return False
-    return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] <= 0).all())
+    return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] < 0).all())
 
 
 def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
@@ -415,6 +415,9 @@ def propose(
     for candidate in ready:
         set_own_scale(candidate)
     warnings += [doubt] if doubt else []
+    if not commands:
+        unread = (s for s in sources if s.role == "control" and s.unreadable)
+        warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]
     for topic in (s.topic for s in sources if s.role == "control"):
         lacking = [str(bag.path) for bag in bags if topic not in bag.topics or not bag.topics[topic].count]
         if 0 < len(lacking) < len(bags):

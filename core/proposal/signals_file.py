@@ -209,7 +209,7 @@ def signals_file(
     else:
         lines += [
             "",
-            "# No topic looks like a command. Without controls the envelope must cover what they do.",
+            "# No command can be used. Without controls the envelope must cover what they do.",
             "controls: []",
         ]
     proposed = [*states, *controls, *(c for alike in members.values() for c in alike)]
