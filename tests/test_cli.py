@@ -26,7 +26,7 @@ from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.reports.check import check_data
+from uncertain_lti.reports.check import check_data, check_text
 
 
 def refused(cli, *words):
@@ -117,6 +117,7 @@ REFUSED = [
     ("check leibov206 run.mcap", "(is leibov2006 meant?)"),
     ("check run.mcap m.model.json", "an MCAP recording, and a model file is wanted here; are the arguments swapped?"),
     ("topics text.mcap", "text.mcap"),
+    ("check table.csv m.model.json", "this is a table, and a model file is wanted here; are the arguments swapped?"),
     ("topics signals.yaml", "a signals file, and a recording is wanted here; are the arguments swapped?"),
     (FIT.replace("run", "nope"), "nope.mcap"),
     (FIT.replace("run", "empty"), "empty"),
@@ -182,6 +183,7 @@ def test_bad_input_gets_one_sentence_and_changes_nothing(folder, words, said, mo
     (folder / "empty.mcap").write_bytes(b"")
     (folder / "lfs.mcap").write_text("version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n")
     (folder / "text.mcap").write_text("not a bag")
+    (folder / "table.csv").write_text("time,x\n0,1\n1,2\n")
     (folder / "link.mcap").symlink_to(folder / "bad.mcap")
     parts = {f"bag_{i}.mcap": write([Topic("/a")], ramp("/a", range(i * 10, i * 10 + 10))) for i in range(2)}
     write_folder(folder / "parts", parts, metadata_yaml(parts))
@@ -258,6 +260,30 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, cli):
     assert 0.4 < recording["outside_domain_share"] < 0.6 and "nothing vouches" in recording["reason"]
     (happened,) = cli.json("report", path, folder / "run.mcap", status=3)["happened"]
     assert happened["state"] == "unknown" and "nothing vouches" in happened["text"]
+    share = recording["outside_domain_share"]
+    for part, status in ((share - 0.05, 3), (min(share + 0.05, 0.5), 0 if share <= 0.5 else 3)):
+        model["validation"] = {"part": [{"verdicts": 1000, "outside_domain": round(1000 * of)} for of in (0.1, part)]}
+        path.write_text(json.dumps(model))
+        assert cli.json("check", path, folder / "run.mcap", status=status)["exit_status"] == status
+
+
+@pytest.mark.parametrize(
+    ("begin_s", "step_s", "lasts", "words"),
+    [
+        (1.7e9, 3600, 80, "first at 2023-11-15T23:13:20 UTC, 25 h on, for 3.29 days"),
+        (0.0, 3600, 2, "first at 90000.0000 s for 60 min"),
+        (1.7e9, 0.1, 1, "first at 2.5000 s for one verdict"),
+        (1.7e9, 0.1, 3, "first at 2.5000 s for 0.2 s"),
+    ],
+)
+def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, words):
+    x = np.zeros((200, 1))
+    x[25 : 25 + lasts, 0] = np.arange(1, lasts + 1)
+    x[25 + lasts :] = x[24 + lasts]
+    t_ns = np.round((begin_s + step_s * np.arange(200)) * 1e9).astype(np.int64)
+    model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[0.5])
+    verdicts = EnvelopeMonitor(model).check(Transient(t_ns, x, np.zeros((200, 1))))
+    assert f"ALARM: raised once, {words}" in check_text(check_data(model, verdicts))
 
 
 def test_a_model_is_written_over_with_force_alone(folder, cli):

@@ -120,7 +120,7 @@ def test_control_lost_in_the_noise_is_named():
     u = steps(np.random.default_rng(4), 1501)
     u[:, 1] *= 1e-5
     (message,) = [m for m in messages(run(u=u, noise=1e-2)) if WORDS["weak"] in m]
-    assert "'pump'" in message and "standard errors" in message
+    assert "'pump'" in message and "its standard error" in message
     assert not any(WORDS["weak"] in m for m in messages(run(u=u, noise=0.0, count=1500, seed=4)) if "'valve'" in m)
 
 

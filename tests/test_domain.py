@@ -25,7 +25,8 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.kernel.arithmetic import Judge
-from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for, jumps
+from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for, jumps, outside_in_words
+from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 
 def levels(values: list[float], rng: np.random.Generator, count: int = 1000) -> Transient:
@@ -41,6 +42,19 @@ def levels(values: list[float], rng: np.random.Generator, count: int = 1000) -> 
 def outside(model: UncertainLTI, transient: Transient) -> float:
     verdicts = EnvelopeMonitor(model).check(transient)
     return float(verdicts.outside_domain[verdicts.judged].mean())
+
+
+def test_what_is_outside_is_named_by_signal_or_by_pair() -> None:
+    """With as many digits as tell a value from the ends; pairs only where no signal leaves its own range."""
+    held = np.zeros((1, 4, 4), dtype=bool)
+    held[0, :, :2] = True
+    signals = SignalMap((Signal("x0", "", "x0", 3.28e6),), (Signal("u0", "", "u0"),))
+    sides = np.array([0.0]), np.array([1.0])
+    domain = Domain(*sides, *sides, Occupancy(4, held))
+    model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], signals=signals, domain=domain)
+    assert outside_in_words(model, np.array([[1.5], [0.2]])) == "x0 at 3280002 (fitted: 3280000 to 3280001)"
+    assert outside_in_words(model, np.array([[0.5], [0.9]])) == "combinations of x0 with u0 that were not fitted"
+    assert not outside_in_words(model, np.array([[0.5], [0.2]]))
 
 
 def test_levels_between_those_fitted_and_larger_jumps_are_outside() -> None:

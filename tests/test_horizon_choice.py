@@ -22,6 +22,7 @@ import uncertain_lti
 from uncertain_lti import EnvelopeMonitor, SignalMap
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import text_of
+from uncertain_lti.proposal import search
 from uncertain_lti.proposal.search import MOST, choose_horizons, lengths_of
 from uncertain_lti.reports.model_text import horizon_blocks
 from uncertain_lti.signals.values import HorizonRule
@@ -118,6 +119,14 @@ def test_horizons_that_lose_are_refused() -> None:
     chosen, table = choose_horizons(odd, HorizonRule(longest=1.2), [2, 60], additive="noise", criterion="lp")
     assert 60 not in chosen
     assert any("left-out windows are outside" in row["why"] for row in table["candidates"] if row["steps"] == 60)
+
+
+def test_pieces_of_long_recordings_choose_the_same_horizons(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = {"additive": "noise", "criterion": "lp"}
+    whole, _ = choose_horizons(RUNS, HorizonRule(), [2, 4, 8], **asked)
+    monkeypatch.setattr(search, "_OF_HORIZONS", sum(map(len, RUNS)) // 2)
+    pieces, table = choose_horizons(RUNS, HorizonRule(), [2, 4, 8], **asked)
+    assert pieces == whole and table["units"] == len(RUNS)
 
 
 def test_an_empty_list_means_one_step_whatever_the_signals_file_asks_for() -> None:

@@ -239,7 +239,7 @@ def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
     little = fit(runs, "lp", additive="noise", false_alarms=1e-3)
     assert little.alarm == quiet.alarm
     said = little.fit_summary["alarm"]["promises"][-1]
-    assert "cannot show that" in said and "h more without an alarm would" in said
+    assert "cannot show that" in said and "days more without an alarm would" in said
     with pytest.raises(FitError, match="positive number per hour"):
         fit(runs, false_alarms=-1.0, progress=pytest.fail)  # before the work
 

@@ -645,7 +645,7 @@ def test_motors_are_taken_or_left_as_one_with_the_true_reason(tmp_path):
     states = {c.path for c in proposal.states}
     families = [{"wx", "wy", "wz"}, {"vx", "vy", "vz"}, {f"rpm_{i}" for i in range(4)}]
     assert all(family <= states or not family & states for family in families) and len(states) >= 6
-    assert "at most 8 states are proposed" in proposal.text and "too short" not in proposal.text
+    assert "at most 8 states are tried together" in proposal.text and "too short" not in proposal.text
 
 
 def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):

@@ -134,6 +134,10 @@ def try_to_write(path: Path) -> None:
         raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
+TABLES = (".csv", ".tsv", ".parquet", ".feather", ".mat", ".npz")
+"""Suffixes of tables."""
+
+
 def kind_of(path: str | os.PathLike[str]) -> str:
     """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known."""
     if os.path.isdir(path):
@@ -149,5 +153,7 @@ def kind_of(path: str | os.PathLike[str]) -> str:
         return "a recorded bag"
     if head.lstrip().startswith(b"{") and b'"uncertain-lti/' in head:
         return "a model file"
+    if os.fspath(path).lower().endswith(TABLES):
+        return "a table"
     lines = head.splitlines()
     return "a signals file" if any(line.startswith((b"states:", b"controls:")) for line in lines) else ""

@@ -137,7 +137,15 @@ def number(value: float | None) -> str:
 def lasting(hours: float) -> str:
     """A time in the unit that one would say it in."""
     seconds = 3600.0 * hours
-    return f"{seconds:.3g} s" if seconds < 120 else f"{60 * hours:.3g} min" if hours < 2 else f"{hours:.3g} h"
+    return (
+        f"{seconds:.3g} s"
+        if seconds < 120
+        else f"{60 * hours:.3g} min"
+        if hours < 2
+        else f"{hours:.3g} h"
+        if hours < 48
+        else f"{hours / 24:.3g} days"
+    )
 
 
 def apart(values: Sequence[float]) -> list[str]:

@@ -255,7 +255,7 @@ def _weak(
     """Controls whose effect is lost in the noise."""
     return [
         f"control '{names[j]}' moves too little to be distinguished from the noise: its strongest effect, on "
-        f"'{names[state]}', is {certainty:.2g} standard errors; record it with larger or more steps "
+        f"'{names[state]}', is {certainty:.2g} times its standard error; record it with larger or more steps "
         f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
         for j, (state, certainty) in lost(problem, sums, past).items()
         if state not in lacking

@@ -261,7 +261,9 @@ class _Room(NamedTuple):
     @classmethod
     def of(cls, carried: int, most: int, what: str) -> _Room:
         if carried >= most:
-            return cls(most, f"others show more, and at most {most} {what} are proposed; exchange one if this matters")
+            return cls(
+                most, f"others show more, and at most {most} {what} are tried together; exchange one if this matters"
+            )
         return cls(max(1, carried), f"the recording is too short for more than {max(1, carried)} {what}")
 
 

@@ -45,6 +45,7 @@ other recording is outside of any envelope, the more the narrower it is."""
 PAYS = 0.8
 """Width of a horizon, or size of the jumps seen with a memory or with controls at the arrival, over those without, from
 which on it is worth having."""
+_OF_HORIZONS = 50_000  # transitions that horizons are chosen on, at most
 PIECE = 200
 """Transitions of a piece of a larger recording."""
 
@@ -191,14 +192,14 @@ def _rms(values: Array) -> Array:
     return np.asarray(np.sqrt((values**2).mean(axis=0)))
 
 
-def thinned(transients: Sequence[Transient], most: int) -> list[Transient]:
+def thinned(transients: Sequence[Transient], most: int, piece: int = PIECE) -> list[Transient]:
     """Pieces of each recording, evenly spread, so that about this many transitions are left in total."""
     share = most / max(sum(len(t) for t in transients), 1)
-    return list(transients) if share >= 1 else [_pieces(t, share) for t in transients]
+    return list(transients) if share >= 1 else [_pieces(t, share, piece) for t in transients]
 
 
-def _pieces(transient: Transient, share: float) -> Transient:
-    length = min(PIECE, max(20, int(share * len(transient))))
+def _pieces(transient: Transient, share: float, piece: int) -> Transient:
+    length = min(piece, max(20, int(share * len(transient))))
     count = max(1, round(share * len(transient) / length))
     if count * (length + 2) >= len(transient):
         return transient
@@ -389,8 +390,11 @@ def choose_horizons(
     that grow are taken if they are narrower by PAYS and no more of the left-out windows are outside than with constant
     ones: than 1 + SLACK times as many of each part and EXCESS of all; else constant ones. A horizon that was not asked
     for by its length stays if the same holds of its windows and the transitions of one step, and if its half-width per
-    step is at most PAYS of that of the horizon before it: then it sees slower changes.
+    step is at most PAYS of that of the horizon before it: then it sees slower changes. Of very long recordings pieces
+    are looked at.
     """
+    if options.get("weights") is None:  # else of every step
+        transients = thinned(transients, _OF_HORIZONS, 20 * max(lengths, default=1))
     dropped: dict[int, str] = {}
     kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)
     asked = bool(rule.steps or rule.seconds)

@@ -23,12 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import YEARS as _YEARS
 from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
-from uncertain_lti.recordings.unreadable import TABLES, missing
+from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import UNITS, TableLayout
 

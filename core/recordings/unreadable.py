@@ -23,13 +23,11 @@ from pathlib import Path
 from typing import Any
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.files import MAGIC, kind_of, natural
+from uncertain_lti.base.files import MAGIC, TABLES, kind_of, natural
 from uncertain_lti.base.text import shortlist
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 """Suffixes of files that hold ROS messages."""
-TABLES = (".csv", ".tsv", ".parquet", ".feather", ".mat", ".npz")
-"""Suffixes of files that hold a table."""
 
 
 def not_mcap(path: Path, head: bytes) -> BagError:

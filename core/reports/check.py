@@ -25,6 +25,7 @@ from uncertain_lti.base.text import (
     Block,
     Table,
     beyond,
+    lasting,
     list_of,
     named,
     number,
@@ -513,12 +514,19 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     if data["alarm"]:
         first = data["alarms"][0]
         often = times(len(data["alarms"]))
-        blocks.append(f"ALARM: raised {often}, first at {first['t']:.4f} s for {number(first['seconds'])} s")
+        at, seconds = f"{first['t']:.4f} s", first["seconds"]
+        if first["t"] >= 86400 and first["t_ns"] > _DATED_NS:
+            at = f"{np.datetime64(first['t_ns'], 'ns').astype('datetime64[s]')} UTC, {lasting(first['t'] / 3600)} on,"
+        last = f"for {number(seconds)} s" if seconds < 120 else f"for {lasting(seconds / 3600)}"
+        blocks.append(f"ALARM: raised {often}, first at {at} {last if seconds else 'for one verdict'}")
         by = [r["words"] for r in first["raised"] if r["rule"] != "containment"]
         blocks += [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
     elif data["verdicts"]:
         blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return blocks
+
+
+_DATED_NS = 10**17  # since 1970, from which on a time is one of a calendar
 
 
 def episodes_table(data: Mapping[str, Any]) -> Table:

@@ -133,8 +133,8 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
 
     `ways`: options of `fit_monitored`, from the simplest on; `options`: further ones, for all. Where the recordings do
     not repeat one another the simplest is kept: nothing shows there that another holds. The others are compared on what
-    was fitted, and the best of them with the first on what was left out. Horizons, on which no panel depends, are those
-    of the way that is taken.
+    was fitted, and the best of them with the first on what was left out, all by their envelopes of one step: horizons
+    are fitted to the way that is taken.
     """
     alone = {name: value for name, value in options.items() if name not in ("horizons", "widths", "drop_horizons")}
     taken, way = _chosen(transients, ways, alone)
