@@ -452,6 +452,7 @@ def test_a_slow_sensor_repeats_regularly() -> None:
 
     model = fit([slow(run(1)), slow(run(2))], additive="noise")
     assert model.repeats is not None and model.repeats.longest_repeat_s[0] == pytest.approx(0.09)
+    assert (model.repeats.largest_run == LARGEST).tolist() == [True, False], "how far it runs between two says nothing"
     for seed in range(40, 43):
         assert not EnvelopeMonitor(model).check(slow(run(seed))).frozen.any()
         verdicts = EnvelopeMonitor(model).check(held(slow(run(seed)), 0, 200, 400))

@@ -69,6 +69,7 @@ ACTIVE = 0.5
 _BLOCK, _MOST = 1 << 16, 1 << 16  # transitions that are looked at together, and of one recording for its activity
 _SPREAD = 1 << 13  # transitions of each part that is looked at where a recording has more than that
 _DISTINCT = 4096  # values of a block that are compared with one another
+_OFTEN, _FEW = 0.3, 10  # share of repeats, and values, from which on a state may be held between its values
 _TWICE = 1e-3  # share of them that may come twice: more do so by chance in a coarse sensor
 MORE_ACTIVE = 2.0
 """How much more active than during any repeat of the fit the machine must be."""
@@ -82,7 +83,8 @@ class Repeats:
     longest_repeat_s : array (n,)
         The longest repeat, s; 0 for a state that never repeated.
     largest_run : array (n,), optional
-        The farthest that the nominal model ran over any of them, in half-widths; default unknown, infinite.
+        The farthest that the nominal model ran over any of them, in half-widths; beyond all numbers of a state that
+        mostly is held between its values; default unknown, infinite.
     largest_sum : array (n,), optional
         The largest sum of its one-step movements, likewise.
     active_beyond : array (n,), optional
@@ -218,7 +220,16 @@ def repeats_in(model: Any, transient: Any) -> Found:
 
     if some.any():
         follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
-    return Found(follow.most, windows, noisy, largest)
+    most = follow.most
+    if some.mean() >= _OFTEN:
+        most[1, _held(transient.x, steps.k)] = LARGEST  # it runs on between two values, the farther the faster
+    return Found(most, windows, noisy, largest)
+
+
+def _held(x: Array, k: NDArray[np.intp]) -> NDArray[np.bool_]:
+    """States (n,) that mostly repeat their last value between two that are new, as of a slower or a coarse sensor."""
+    fresh = [np.flatnonzero(column[k + 1] != column[k]) for column in x.T]
+    return np.array([len(at) > _FEW and np.median(np.diff(at)) >= 2 for at in fresh], dtype=bool)
 
 
 def together(n: int, found: Sequence[Found]) -> Repeats:
