@@ -250,6 +250,36 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     return outside, largest[0], largest[1], total, np.stack([mirrored(part) for part in products]), *widths
 
 
+cdef inline void lower(const double* values, Py_ssize_t count, double* least) noexcept nogil:
+    """The least of some numbers and of the one that is there."""
+    cdef double a = least[0], b = a, c = a, d = a
+    cdef Py_ssize_t q
+    for q from 0 <= q < count - 3 by 4:  # four at a time, as each comparison waits for the one before
+        a = values[q] if values[q] < a else a
+        b = values[q + 1] if values[q + 1] < b else b
+        c = values[q + 2] if values[q + 2] < c else c
+        d = values[q + 3] if values[q + 3] < d else d
+    for q in range(count - count % 4, count):
+        a = values[q] if values[q] < a else a
+    a, c = b if b < a else a, d if d < c else c
+    least[0] = c if c < a else a
+
+
+cdef inline void raised(const double* values, Py_ssize_t count, double* greatest) noexcept nogil:
+    """The greatest of some numbers and of the one that is there."""
+    cdef double a = greatest[0], b = a, c = a, d = a
+    cdef Py_ssize_t q
+    for q from 0 <= q < count - 3 by 4:
+        a = values[q] if values[q] > a else a
+        b = values[q + 1] if values[q + 1] > b else b
+        c = values[q + 2] if values[q + 2] > c else c
+        d = values[q + 3] if values[q + 3] > d else d
+    for q in range(count - count % 4, count):
+        a = values[q] if values[q] > a else a
+    a, c = b if b > a else a, d if d > c else c
+    greatest[0] = c if c > a else a
+
+
 def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):
     """Ranges of [dt z; dt] over transitions that are in a box together, and the least room that bounds leave them.
 
@@ -259,7 +289,7 @@ def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):
     """
     cdef Elements elements = Elements(*tables)
     cdef Tiles tiles = Tiles(elements.n, elements.p, z, dt, base, after)
-    cdef Py_ssize_t i, j, q, b, n = elements.n, p = tiles.p
+    cdef Py_ssize_t i, j, q, r, b, n = elements.n, p = tiles.p
     cdef const Py_ssize_t[:] box = np.ascontiguousarray(numbers, dtype=np.intp)
     cdef arrays.array most = doubles([] if widest is None else widest)
     cdef bint limited = widest is not None
@@ -272,32 +302,44 @@ def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):
     cdef double[:, ::1] least = low
     cdef double[:, ::1] largest = high
     cdef double[:, ::1] room = left
-    cdef double* psi = room_for(elements.p + 2)
+    cdef double* psi = room_for(elements.p + 4)
     cdef double* centre = psi + elements.p * _TOGETHER
     cdef double* half = centre + _TOGETHER
-    cdef double value
+    cdef double* below = half + _TOGETHER
+    cdef double* above = below + _TOGETHER
+    cdef Py_ssize_t first[_TOGETHER + 1]  # of the runs of transitions in one box; their end
+    cdef Py_ssize_t runs
     with nogil:
         while tiles.take():
             tiles.sizes(elements.p, psi)
+            runs = 0
+            for q in range(tiles.many):
+                if not q or box[tiles.index[q]] != box[tiles.index[q - 1]]:
+                    first[runs] = q
+                    runs += 1
+            first[runs] = tiles.many
             for j in range(p + 1):
                 for q in range(tiles.many):
-                    b = box[tiles.index[q]]
+                    below[q] = tiles.step[q] * (tiles.phi[j * _TOGETHER + q] if j < p else 1.0)
+                for r in range(runs):
+                    b = box[tiles.index[first[r]]]
                     if b >= 0:
-                        value = tiles.step[q] * (tiles.phi[j * _TOGETHER + q] if j < p else 1.0)
-                        least[j, b] = value if value < least[j, b] else least[j, b]
-                        largest[j, b] = value if value > largest[j, b] else largest[j, b]
+                        lower(below + first[r], first[r + 1] - first[r], &least[j, b])
+                        raised(below + first[r], first[r + 1] - first[r], &largest[j, b])
             for i in range(n):
                 tiles.bounds(elements, i, psi, centre, half)
                 for q in range(tiles.many):
-                    b = box[tiles.index[q]]
+                    above[q] = half[q] - (tiles.end[i * _TOGETHER + q] - centre[q])
+                    below[q] = half[q] + (tiles.end[i * _TOGETHER + q] - centre[q])
+                    if limited:
+                        half[q] = most.data.as_doubles[i] - half[q]
+                for r in range(runs):
+                    b = box[tiles.index[first[r]]]
                     if b >= 0:
-                        value = half[q] - (tiles.end[i * _TOGETHER + q] - centre[q])
-                        room[i, b] = value if value < room[i, b] else room[i, b]
-                        value = half[q] + (tiles.end[i * _TOGETHER + q] - centre[q])
-                        room[n + i, b] = value if value < room[n + i, b] else room[n + i, b]
+                        lower(above + first[r], first[r + 1] - first[r], &room[i, b])
+                        lower(below + first[r], first[r + 1] - first[r], &room[n + i, b])
                         if limited:
-                            value = most.data.as_doubles[i] - half[q]
-                            room[2 * n + i, b] = value if value < room[2 * n + i, b] else room[2 * n + i, b]
+                            lower(half + first[r], first[r + 1] - first[r], &room[2 * n + i, b])
     free(psi)
     return low, high, left
 
