@@ -274,6 +274,28 @@ def test_a_flapping_alarm_does_not_flood_the_log_and_each_is_named_or_counted() 
     assert len(starts) + left_out == alarms, "every alarm is named or counted"
 
 
+@pytest.mark.parametrize("every", [1, 30])
+def test_a_steady_control_that_ceases_is_told_while_its_publisher_stays(every: int) -> None:
+    """One that comes every 0.3 s may be silent for 6 s."""
+    rig = Rig()
+    signals = rig.model.signals
+    held = replace(signals, controls=tuple(replace(control, max_hold=None) for control in signals.controls))
+    rig.watch(rig.model.replace(signals=held), rig.session.rule)
+    for _ in range(25):
+        rig.send(1)
+        rig.send(every - 1, control=False)
+    rig.lines.clear()
+    rig.send(400, control=False)
+    ceased = f"no message on {CONTROL} for 1 s, and at least every 0.01 s before; its last values count on"
+    assert rig.lines == ([ceased] if every == 1 else [])
+    monitor = rig.session.report(rig.now, TIMEOUT)[0]
+    assert (f"no message on {CONTROL} for 4 s" in monitor.message) == (every == 1)
+    assert monitor.level == (WARN if every == 1 else OK)
+    rig.send(200 * every, control=False)
+    rig.send(30)
+    assert f"messages on {CONTROL} again" in rig.lines and not rig.session.ceased(rig.now, TIMEOUT)
+
+
 def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     rig = Rig()
     rig.wait(30.0)

@@ -287,9 +287,8 @@ def test_statistics_and_the_reason_are_those_of_the_recording_and_of_a_snapshot(
     said = [text for _, text in over_recording(checked, loaded)]
     assert any("mean square of the utilisation over 0.05 s above 0.5: a" in text for text in said)
     world.monitor(path, **{"snapshot.folder": str(tmp_path / "snapshots"), "state_timeout": 60.0})
-    kept = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     outputs = Outputs.of(world, "statistics")
-    reason = world.listen(String, "/envelope_monitor/reason", kept).connected()
+    reason = world.listen(String, "/envelope_monitor/reason", KEPT).connected()
     reason.count(1)
     world.command("play", bag, "--rate", 2.0).succeed()
     got = outputs.topics["statistics"].count(len(verdicts))
@@ -298,7 +297,7 @@ def test_statistics_and_the_reason_are_those_of_the_recording_and_of_a_snapshot(
     until(lambda: reason.messages[-1].data == said[-1], "the last reason")
     expected = iter(["no verdict yet", *said])  # the publisher keeps one: of several at once a reader may miss some
     assert all(any(text == m.data for text in expected) for m in reason.messages) and len(reason.messages) > 3
-    assert world.listen(String, "/envelope_monitor/reason", kept).count(1)[0].data == said[-1]
+    assert world.listen(String, "/envelope_monitor/reason", KEPT).count(1)[0].data == said[-1]
     assert world.call(Trigger, "/envelope_monitor/snapshot", Trigger.Request()).success
     until(lambda: list((tmp_path / "snapshots").glob("*.mcap")), "the snapshot")
     (snapshot,) = (tmp_path / "snapshots").glob("*.mcap")
@@ -339,6 +338,10 @@ def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp
 
 
 # --- behaviour ----------------------------------------------------------------------------------------------
+
+
+KEPT = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+"""Of a reader that gets the last message of before."""
 
 
 class Plant:
@@ -572,6 +575,28 @@ def test_the_alarm_rule_can_be_set_and_is_checked(bench: StartBench) -> None:
     until(lambda: violation.messages[-1].data, "the alarm")
 
 
+def test_the_reason_stays_while_every_message_is_dropped(world: World, tmp_path: Path) -> None:
+    """Equal stamps, ten a second and more: the last word is not that of the last verdict."""
+    model = by_hand()
+    world.monitor(saved(model, tmp_path), state_timeout=0.3)
+    plant = Plant(world, model).subscribed()
+    reason = world.listen(String, "/envelope_monitor/reason", KEPT).connected()
+    plant.send(5)
+    until(lambda: [m.data for m in reason.messages][-1:] == ["no alarm"], "a verdict")
+    said = "no verdict for more than 0.3 s: no sample could be judged"
+
+    def stands() -> bool:
+        plant.t_ns -= STEP_NS  # as the last one
+        plant.send(1)
+        return reason.messages[-1].data == said
+
+    until(stands, "the reason")
+    told = len(reason.messages)
+    for _ in range(100):
+        stands()
+    assert len(reason.messages) == told
+
+
 def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Path) -> None:
     model = by_hand()
     process = world.run_node(
@@ -593,8 +618,9 @@ def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Pa
     assert world.change("activate") and world.state() == "active"
     plant.subscribed().send(5)
     assert np.isnan(flags.count(5)[0].position).all() and violation.messages
+    reason = world.listen(String, "/envelope_monitor/reason", KEPT).connected()
     assert world.change("deactivate") and world.state() == "inactive"
-    time.sleep(0.2)
+    until(lambda: reason.messages[-1].data == "inactive: no verdicts are given", "the reason")
     heard = len(violation.messages)
     plant.send(5)
     assert world.change("activate")

@@ -273,6 +273,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; no heartbeat is published from now on."""
         self._unsubscribe()
+        self.outputs.sender.send_reason("inactive: no verdicts are given")
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
 

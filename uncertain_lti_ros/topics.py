@@ -500,7 +500,8 @@ class Diagnostics:
                 problems.append(f"{subscription.topic}: nothing received in {waited:.0f} s, and there is {heard}")
             lost, late = self._reported.get(topic, (0, 0))
             if subscription.lost > lost:
-                problems.append(f"{subscription.topic}: {subscription.lost - lost} messages lost on the way")
+                of = f"{subscription.lost - lost} messages lost"
+                problems.append(f"{subscription.topic}: {of} on the way, or as the queue was full (qos.depth)")
             if subscription.late > late:
                 problems.append(f"{subscription.topic}: {subscription.late - late} deadlines missed by its publishers")
         return problems

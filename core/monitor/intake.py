@@ -175,8 +175,8 @@ class Sender:
             self._send(ways, messages)
         if turned:
             self.send_alarm(session.alarm, now)
-        if self._reason_heard:
-            self.send_reason(session.reasons.text)
+        if self._reason_heard and (beats or turned or "no verdict:" in session.reasons.text):
+            self.send_reason(session.reasons.text)  # else it is that of an earlier sample: `Session.reason` has more
 
     @cython.cfunc
     def _send(self, ways: list[Any], messages: list[bytes]) -> None:

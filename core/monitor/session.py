@@ -38,6 +38,7 @@ from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal import Signal
 
 _BURST, _REFILL = 6, 10.0  # lines on one subject at once, and s until one more is allowed
+_PAUSES, _CEASED = 20, 20  # pauses that tell a steady topic, and times the longest that it has ceased after
 _LOGGED = 5.0  # s between two log entries on unexpected errors
 OK, WARN, ERROR, STALE = 0, 1, 2, 3
 """Levels of diagnostic_msgs/DiagnosticStatus."""
@@ -63,6 +64,7 @@ class Session(Stream):
     def __init__(self, model: UncertainLTI, *args: Any, **kwargs: Any) -> None:
         super().__init__(model, *args, **kwargs)
         self.days = Days(model)
+        self._steady: dict[str, tuple[float, float, int]] = {}  # of topics: heard, longest pause before, pauses
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call."""
@@ -97,6 +99,7 @@ class Session(Stream):
                     why += f" ({shortlist([signal.name for signal in lacking], SHOWN)})"
                 complaints.append(f"{count} samples without a verdict: {why}")
         complaints += self.absent(lacking)
+        complaints += self.ceased(now, timeout).values()
         if dropped := Counter({status.value: n for status, n in period.statuses.items() if status.dropped}):
             which = ", ".join(f"{kind} {n}" for kind, n in dropped.items())
             coarse = self.coarse_clock(period.statuses[Status.EQUAL])
@@ -153,6 +156,26 @@ class Session(Stream):
         why = f"nothing received on {', '.join(never)}" if never else why
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
+
+    def ceased(self, now: float, timeout: float) -> dict[str, str]:
+        """Topics that came steadily and do no more, while their last values count for ever, and what is said of them.
+
+        Pauses are those between two calls; some longer than all before is none of a steady topic.
+        """
+        found = {}
+        for topic in self.types:
+            heard = self.heard(topic)
+            if heard is None or topic == self.sampler.clock or math.isfinite(self.held(topic)):
+                continue
+            before, longest, count = self._steady.get(topic, (heard, 0.0, 0))
+            if heard > before:
+                usual = count < _PAUSES or heard - before <= _CEASED * longest
+                longest, count = max(longest, heard - before) if usual else longest, count + 1
+            self._steady[topic] = heard, longest, count
+            if count >= _PAUSES and now - heard > max(timeout, _CEASED * longest):
+                every = f"at least every {longest:.2g} s before"
+                found[topic] = f"no message on {topic} for {now - heard:.0f} s, and {every}; its last values count on"
+        return found
 
     def why_no_condition(self) -> str:
         """Why the last message of the enable condition's topic says nothing on it, in words; empty if it does."""
@@ -395,21 +418,25 @@ class EventLog:
             if (lines or name == "problems") and self._matters[name].becomes(value, now):
                 for line in lines:
                     self._log(OK, line)
+        ceased = session.ceased(now, timeout)
         for topic in session.types:
             if topic != clock:
-                self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0))
+                self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0), ceased.get(topic, ""))
         self._look_at_verdicts(session, now, timeout)
 
-    def _look_at_topic(self, session: Session, topic: str, now: float, timeout: float, publishers: int) -> None:
+    def _look_at_topic(
+        self, session: Session, topic: str, now: float, timeout: float, publishers: int, ceased: str
+    ) -> None:
         heard = session.heard(topic)
         if heard is None:
             return  # the line on verdicts has it
         held = session.held(topic)
         age = now - heard
-        silent = age > max(timeout, held) or (age > timeout and math.isinf(held) and not publishers)
+        gone = age > timeout and math.isinf(held) and not publishers
+        silent = age > max(timeout, held) or gone or bool(ceased)
         if self._matters[f"silence {topic}"].becomes(silent or None, now):
-            held_on = " and no publisher any more; its last values are held" if math.isinf(held) else ""
-            self._log(OK, f"no message on {topic} for {age:.1f} s{held_on}" if silent else f"messages on {topic} again")
+            said = f"no message on {topic} for {age:.1f} s{' and no publisher any more' * gone}"
+            self._log(OK, (said if gone else ceased or said) if silent else f"messages on {topic} again")
 
     def _look_at_verdicts(self, session: Session, now: float, timeout: float) -> None:
         without = session.without_verdict(now)
