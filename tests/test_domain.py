@@ -57,6 +57,12 @@ def test_what_is_outside_is_named_by_signal_or_by_pair() -> None:
     assert not outside_in_words(model, np.array([[0.5], [0.2]]))
 
 
+def test_rounding_of_what_never_moved_is_not_outside() -> None:
+    still = Domain(*(np.array([0.7]) for _ in range(4)))
+    for share, outside in ((1e-13, False), (1e-11, True)):
+        assert still.outside([0.7 * (1 + share)], [0.7]) == still.outside([0.7], [0.7 * (1 - share)]) == outside
+
+
 def test_levels_between_those_fitted_and_larger_jumps_are_outside() -> None:
     """Both lie inside the box of what was fitted."""
     rng = np.random.default_rng(1)

@@ -265,7 +265,7 @@ def test_repeats_are_told_as_the_words_say() -> None:
         half = rng.uniform(0.1, 0.5, (count, n)) * (rng.uniform(size=n) < 0.95)
         follows, outside = rng.uniform(size=count) < 0.97, rng.uniform(size=count) < 0.1
         own = rng.normal(size=(count, n)) * 5.0
-        often = np.array([0.05, 0.1, 3.0, 6.0, 1.0, 0.1, 0.2]) * rng.choice([0.3, 1.0, np.inf], size=(n, 7))
+        often = np.array([0.05, 0.1, 3.0, 6.0, 0.2, 0.1, 0.2]) * rng.choice([0.3, 1.0, np.inf], size=(n, 7))
         counted = rng.uniform(size=n) < 0.9
         follow = Repeating(often, 3, counted.tolist(), margin)
         given = (follows, t_ns, dt * 1e-9, x[:-1], x[1:], centre - half, centre + half, own, outside)
@@ -285,3 +285,31 @@ def test_repeats_are_told_as_the_words_say() -> None:
             more = np.flatnonzero(codes[k] > 1).tolist()
             assert [(i, c, s) for i, _, c, s in told] == [(i, codes[k, i], sizes[k, i]) for i in more]
     assert seen == set(range(7))
+
+
+@pytest.mark.parametrize("limited", [False, True])
+@pytest.mark.parametrize("each", [1, 3, 40, 700])
+def test_boxes_hold_what_their_transitions_have(each: int, limited: bool) -> None:
+    """Ranges and least room of transitions that follow one another, some of which are in none."""
+    rng = np.random.default_rng(each)
+    n, p, count = 2, 3, 1500
+    model = UncertainLTI(
+        rng.normal(size=(n, n)),
+        rng.normal(size=(n, p - n)),
+        rng.uniform(size=(n, n)),
+        rng.uniform(size=(n, p - n)),
+        v=[0.1, 0.2],
+    )
+    z, dt, after = rng.normal(size=(p, count)), rng.uniform(0.1, 0.2, count), rng.normal(size=(n, count))
+    numbers = np.where(rng.uniform(size=count) < 0.9, np.arange(count) // each, -1)
+    numbers[numbers >= 0] = np.unique(numbers[numbers >= 0], return_inverse=True)[1]
+    boxes, widest = int(numbers.max()) + 1, np.array([3.0, 4.0]) if limited else None
+    low, high, room = arithmetic.boxes_of(model.tables, z, dt, after, None, widest, numbers, boxes)
+    centre, half = model.columns_centre_and_half(z, dt)
+    moved = np.vstack([dt * z, dt])
+    left = [half - (after - centre), half + (after - centre), *([widest[:, None] - half] if widest is not None else [])]
+    for b in range(boxes):
+        inside = numbers == b
+        assert np.array_equal(low[:, b], moved[:, inside].min(axis=1))
+        assert np.array_equal(high[:, b], moved[:, inside].max(axis=1))
+        assert np.array_equal(room[:, b], np.vstack(left)[:, inside].min(axis=1))
