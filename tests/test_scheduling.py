@@ -28,6 +28,8 @@ from uncertain_lti.model.free_run import run_over
 from uncertain_lti.proposal.search import EXCESS, KnotCandidate, Score, choose_knots, chosen_of
 from uncertain_lti.proposal.tune import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap
+from uncertain_lti.validation.left_out import leave_out
+from uncertain_lti.validation.monitor_fit import FOLDS
 
 DT = 0.05
 
@@ -80,10 +82,10 @@ def test_a_plant_with_regimes_gets_knots_and_narrower_bounds_on_what_is_left_out
     assert model.fit_summary["mean_width"][1] < 0.6 * one.fit_summary["mean_width"][1]
 
 
-def test_the_table_is_that_of_validate(model):
+def test_the_table_is_that_of_what_is_left_out(model):
     (facts,) = model.fit_summary["schedule"]
     row = next(row for row in facts["candidates"] if row["knots"] == facts["chosen"])
-    left = validate(model, RUNS)
+    left = leave_out(RUNS, full=model, folds=FOLDS, **options())
     assert row["outside"] == pytest.approx(1 - left.to_dict()["inside"], abs=1e-12)
     assert left.model.schedule == model.schedule
 
@@ -125,10 +127,10 @@ def test_a_recording_unlike_all_others_excuses_nothing():
     assert more.share < base.share and not more.holds(base)
 
 
-def test_many_recordings_are_left_out_ten_times():
+def test_many_recordings_are_left_out_several_together():
     short = [run(seed, 100) for seed in range(23)]
     chosen, table = choose_knots(short, "x1", **options())
-    assert table["units"] == 10 and table["left_out"] == "10th part of the recordings"
+    assert table["units"] == FOLDS and table["left_out"] == f"{FOLDS}th part of the recordings"
     assert chosen.score.judged.sum() == 2300
 
 
@@ -262,7 +264,7 @@ def command(folder, cli):
 
 def test_the_command_prints_the_table_and_the_reason(folder, command):
     printed = command("--schedule", "fan=auto")
-    assert "knots on fan, by leaving out one block of 10 at a time" in printed
+    assert "knots on fan, by leaving out one block of 5 at a time" in printed
     assert "1 (chosen)" in printed and "note: schedule: 1 knot on fan" in printed
     assert UncertainLTI.load(folder / "m.model.json").schedule is None
 

@@ -31,13 +31,11 @@ from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.monitor_fit import ALONE, CLEARLY, fit_monitored
+from uncertain_lti.validation.monitor_fit import ALONE, CLEARLY, FOLDS, fit_monitored
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import by_unit, fitted_parts
 from uncertain_lti.validation.result import Validation
 
-FOLDS = 10
-"""Times that something is left out, at most; of more recordings or groups, several are left out together."""
 SLACK, EXCESS = 0.25, 0.005
 """Share of what the simplest candidate leaves outside of a left-out part by which another one may leave more, and share
 of all that is left out that may be outside beyond that, times as many as the jumps seen are smaller: what resembles no

@@ -38,15 +38,13 @@ from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 from uncertain_lti.signals.values import Additive
-from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
+from uncertain_lti.validation.monitor_fit import CLEARLY, FOLDS, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
 
 PROMISING, SIGNALS = 0.9, 2
 """Largest least-squares residual with three knots, relative to one, up to which a signal is tried; and how many are."""
 TRANSITIONS = 4000
 """Transitions by which promising signals are found, about; of larger recordings pieces are taken."""
-FOLDS = 5
-"""Times that something is left out to choose memories, at most."""
 FEWEST_STEPS, MOST_STEPS = 3, 0.05
 """A control whose steps are events changes in at least so many transitions, and in at most this share of them."""
 

@@ -34,7 +34,7 @@ CLEARLY = 0.9
 ALONE = 1 / 3
 """Share of recordings, groups or blocks not covered by the others beyond which only the simplest way is tried."""
 FOLDS = 5
-"""Fits without a part of the recordings, groups or, of a single recording, blocks."""
+"""Fits without a part of the recordings, groups or, of a single recording, blocks, for an alarm or any other choice."""
 LIMIT = 1e9
 """Elements of all left-out problems together up to which parts are left out: some minutes."""
 _SHOWN, _COMPARED = 1_000_000, 200_000  # transitions that a panel is learnt from, and ways to fit are compared on
