@@ -249,7 +249,7 @@ STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
-MOST_STATES, MOST_CONTROLS = 8, 6
+MOST = 8  # states, and controls
 
 
 class _Room(NamedTuple):
@@ -296,11 +296,11 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     steps = steps_of(pool, every, used)
     N = len(steps.X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(steps, used, _Room.of(room // 2, MOST_CONTROLS, "controls"))
+    used = _strongest(steps, used, _Room.of(room // 2, MOST, "controls"))
     steps = steps_of(pool, every, used)
-    states_room = _Room.of(room - len(used), MOST_STATES, "states")
+    states_room = _Room.of(room - len(used), MOST, "states")
     if N < FEWEST:
-        keep = pool[:MOST_STATES]
+        keep = pool[:MOST]
     elif _is_pose(pool):
         keep = _steered(pool, states_room, _driven(pool, every, used))
     else:
