@@ -265,6 +265,9 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, cli):
         model["validation"] = {"part": [{"verdicts": 1000, "outside_domain": round(1000 * of)} for of in (0.1, part)]}
         path.write_text(json.dumps(model))
         assert cli.json("check", path, folder / "run.mcap", status=status)["exit_status"] == status
+    model["validation"] = {"part": [3, {"verdicts": "many"}, {"verdicts": 0, "outside_domain": 0}]}  # of another hand
+    path.write_text(json.dumps(model))
+    assert cli.json("check", path, folder / "run.mcap", status=3)["outcome"] == "unknown"
 
 
 @pytest.mark.parametrize(

@@ -137,15 +137,10 @@ def number(value: float | None) -> str:
 def lasting(hours: float) -> str:
     """A time in the unit that one would say it in."""
     seconds = 3600.0 * hours
-    return (
-        f"{seconds:.3g} s"
-        if seconds < 120
-        else f"{60 * hours:.3g} min"
-        if hours < 2
-        else f"{hours:.3g} h"
-        if hours < 48
-        else f"{hours / 24:.3g} days"
-    )
+    for most, each, unit in ((120.0, 1.0, "s"), (7200.0, 60.0, "min"), (172_800.0, 3600.0, "h")):
+        if seconds < most:
+            return f"{seconds / each:.3g} {unit}"
+    return f"{hours / 24:.3g} days"
 
 
 def apart(values: Sequence[float]) -> list[str]:

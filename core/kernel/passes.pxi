@@ -250,7 +250,7 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     return outside, largest[0], largest[1], total, np.stack([mirrored(part) for part in products]), *widths
 
 
-cdef inline void lower(const double* values, Py_ssize_t count, double* least) noexcept nogil:
+cdef inline void lowered(const double* values, Py_ssize_t count, double* least) noexcept nogil:
     """The least of some numbers and of the one that is there."""
     cdef double a = least[0], b = a, c = a, d = a
     cdef Py_ssize_t q
@@ -324,7 +324,7 @@ def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):
                 for r in range(runs):
                     b = box[tiles.index[first[r]]]
                     if b >= 0:
-                        lower(below + first[r], first[r + 1] - first[r], &least[j, b])
+                        lowered(below + first[r], first[r + 1] - first[r], &least[j, b])
                         raised(below + first[r], first[r + 1] - first[r], &largest[j, b])
             for i in range(n):
                 tiles.bounds(elements, i, psi, centre, half)
@@ -336,10 +336,10 @@ def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):
                 for r in range(runs):
                     b = box[tiles.index[first[r]]]
                     if b >= 0:
-                        lower(above + first[r], first[r + 1] - first[r], &room[i, b])
-                        lower(below + first[r], first[r + 1] - first[r], &room[n + i, b])
+                        lowered(above + first[r], first[r + 1] - first[r], &room[i, b])
+                        lowered(below + first[r], first[r + 1] - first[r], &room[n + i, b])
                         if limited:
-                            lower(half + first[r], first[r + 1] - first[r], &room[2 * n + i, b])
+                            lowered(half + first[r], first[r + 1] - first[r], &room[2 * n + i, b])
     free(psi)
     return low, high, left
 

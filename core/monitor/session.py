@@ -160,7 +160,7 @@ class Session(Stream):
     def ceased(self, now: float, timeout: float) -> dict[str, str]:
         """Topics that came steadily and do no more, while their last values count for ever, and what is said of them.
 
-        Pauses are those between two calls; some longer than all before is none of a steady topic.
+        Each call looks whether they have come since the one before, so it must be called often.
         """
         found = {}
         for topic in self.types:

@@ -29,6 +29,7 @@ from uncertain_lti.base.text import (
     list_of,
     named,
     number,
+    numbers_of,
     plural,
     share,
     shortened,
@@ -344,8 +345,9 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
 
 def _vouched(model: UncertainLTI) -> float:
     """Share of the verdicts that may be outside the fitted domain: the alarm was learnt on what was left out."""
-    parts = list_of((model.validation or {}).get("part"))
-    shares = [part["outside_domain"] / part["verdicts"] for part in parts if part["verdicts"]]
+    parts = [part for part in list_of((model.validation or {}).get("part")) if isinstance(part, Mapping)]
+    counts = [numbers_of([part.get("outside_domain"), part.get("verdicts")], 2) for part in parts]
+    shares = [outside / judged for outside, judged in filter(None, counts) if judged > 0]
     return float(min(max([UNVOUCHED, *shares]), STRANGE))
 
 
