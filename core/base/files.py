@@ -139,7 +139,7 @@ TABLES = (".csv", ".tsv", ".parquet", ".feather", ".mat", ".npz")
 
 
 def kind_of(path: str | os.PathLike[str]) -> str:
-    """What a file is by its first bytes, with an article: a recording, a model, signals; "" where that is not known."""
+    """What a file is by its first bytes, or of a table by its name, with an article; "" where that is not known."""
     if os.path.isdir(path):
         return "a folder"
     try:

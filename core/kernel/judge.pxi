@@ -282,7 +282,7 @@ cdef class Judge:
         """`left_domain` of [x; u] in columns a stride wide."""
         left_domain(
             z, stride, count, self.least, self.greatest, self.per_unit, self.occupied, self.size, self.cells,
-            self.cell, out,
+            self.cell, _SLACK, out,
         )
 
     cdef int read(self, before) except -2:

@@ -252,32 +252,18 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
 
 cdef inline void lowered(const double* values, Py_ssize_t count, double* least) noexcept nogil:
     """The least of some numbers and of the one that is there."""
-    cdef double a = least[0], b = a, c = a, d = a
-    cdef Py_ssize_t q
-    for q from 0 <= q < count - 3 by 4:  # four at a time, as each comparison waits for the one before
-        a = values[q] if values[q] < a else a
-        b = values[q + 1] if values[q + 1] < b else b
-        c = values[q + 2] if values[q + 2] < c else c
-        d = values[q + 3] if values[q + 3] < d else d
-    for q in range(count - count % 4, count):
-        a = values[q] if values[q] < a else a
-    a, c = b if b < a else a, d if d < c else c
-    least[0] = c if c < a else a
+    cdef double found = least[0]
+    for q in range(count):
+        found = values[q] if values[q] < found else found
+    least[0] = found
 
 
 cdef inline void raised(const double* values, Py_ssize_t count, double* greatest) noexcept nogil:
     """The greatest of some numbers and of the one that is there."""
-    cdef double a = greatest[0], b = a, c = a, d = a
-    cdef Py_ssize_t q
-    for q from 0 <= q < count - 3 by 4:
-        a = values[q] if values[q] > a else a
-        b = values[q + 1] if values[q + 1] > b else b
-        c = values[q + 2] if values[q + 2] > c else c
-        d = values[q + 3] if values[q + 3] > d else d
-    for q in range(count - count % 4, count):
-        a = values[q] if values[q] > a else a
-    a, c = b if b > a else a, d if d > c else c
-    greatest[0] = c if c > a else a
+    cdef double found = greatest[0]
+    for q in range(count):
+        found = values[q] if values[q] > found else found
+    greatest[0] = found
 
 
 def boxes_of(tables, z, dt, after, base, widest, numbers, Py_ssize_t count):

@@ -132,7 +132,7 @@ cdef class Repeating:
         const double* upper, const double* own, bint outside,
     ) noexcept nogil:
         """Take one transition."""
-        cdef Py_ssize_t i, j, n = self.n
+        cdef Py_ssize_t i, j, n = self.n, same = 0
         cdef double movement, half
         cdef double* found = self.measures
         cdef Repeat* repeat
@@ -141,6 +141,7 @@ cdef class Repeating:
             if after[i] != before[i]:
                 repeat.code, repeat.size = _FRESH, 0.0
                 continue
+            same += 1
             if repeat.code == _FRESH:
                 repeat.code, repeat.begin, repeat.steps = _USUAL, t_ns - llrint(dt * 1e9), 0
                 repeat.run = repeat.total = repeat.half = repeat.per_second = 0.0
@@ -163,25 +164,23 @@ cdef class Repeating:
                 self.largest[j, i] = fmax(self.largest[j, i], found[j * n + i])
         for i in range(n):
             if self.of[i].code != _FRESH and self.counted[i] and self.of[i].code < _RUN:
-                j = _FRESH if outside else self.why(i, before, after, lower, upper)
+                j = _FRESH if outside else self.why(i, after, lower, upper, n > 1 and same == n)
                 self.of[i].code = j if j else _LONGER if found[i] > self.limit(i, 1) + dt / 2 else _USUAL
 
     cdef inline double limit(self, Py_ssize_t i, Py_ssize_t which) noexcept nogil:
         return self.thresholds[i * _THRESHOLDS + which]
 
     cdef int why(
-        self, Py_ssize_t i, const double* before, const double* after, const double* lower, const double* upper
+        self, Py_ssize_t i, const double* after, const double* lower, const double* upper, bint parked
     ) noexcept nogil:
-        """Why a state is frozen; 0 where it is not."""
+        """Why a state is frozen; 0 where it is not. `parked`: all of several states repeat."""
         cdef Py_ssize_t n = self.n, j, steps = self.of[i].steps
         cdef const double* found = self.measures + i
-        cdef double longest = self.limit(i, 1), times = found[0] / longest if longest >= _REST_S else 1.0
-        cdef bint rests = after[i] == 0.0, parked = n > 1
+        cdef double longest = self.limit(i, 1)
+        cdef double times = fmax(found[0] / longest, 1.0) if longest >= _REST_S else 1.0  # a rest may be longer
+        cdef bint rests = after[i] == 0.0
         if found[0] <= self.limit(i, 0):
             return 0
-        for j in range(n):
-            parked &= before[j] == after[j]
-        times = fmax(times, 1.0)  # a rest may be longer than those of the fit
         if found[n] > times * self.limit(i, 2) and not (rests or parked):
             self.of[i].size = found[n]
             return _RUN
@@ -193,7 +192,8 @@ cdef class Repeating:
         if steps >= self.least and found[3 * n] > fmax(self.limit(i, 4), 1.0 if rests else 1.0 / steps):
             self.of[i].size = found[3 * n]
             return _ACTIVE
+        if rests or parked:
+            return 0
         if (steps > 0 and found[0] >= self.limit(i, 6)) or (steps >= self.least and found[0] >= self.limit(i, 5)):
-            if not (rests or parked):
-                return _NOISE
+            return _NOISE
         return 0

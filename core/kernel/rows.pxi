@@ -136,9 +136,10 @@ cdef void left_domain(
     Py_ssize_t size,
     Py_ssize_t cells,
     int* cell,
+    double share,
     unsigned char* out,
 ) noexcept nogil:
-    """Whether each [x; u], in columns a stride wide, is beyond a range by BEYOND of it, or a combination not fitted.
+    """Whether each [x; u], in columns a stride wide, is beyond a range by a share of it, or a combination not fitted.
 
     `occupied`: of `domain.Occupancy`, with so many cells, 0 for none; `cell` (size, _TOGETHER): room.
     """
@@ -150,7 +151,7 @@ cdef void left_domain(
     for q in range(count):
         out[q] = 0
     for i in range(size):
-        slack = _SLACK * (greatest[i] - least[i]) + _SAME * fmax(fabs(least[i]), fabs(greatest[i]))
+        slack = share * (greatest[i] - least[i]) + _SAME * fmax(fabs(least[i]), fabs(greatest[i]))
         for q in range(count):
             out[q] |= is_outside(z[i * stride + q], least[i] - slack, greatest[i] + slack)
     for low from 0 <= low < (count if cells else 0) by _TOGETHER:
@@ -168,8 +169,8 @@ cdef void left_domain(
                 pair += cells * cells
 
 
-def outside_domain(z, least, greatest, occupied=None):
-    """Whether each of z (n + m, K) is beyond a range by BEYOND of it or more, or is a combination not fitted."""
+def outside_domain(z, least, greatest, occupied=None, double share=BEYOND):
+    """Whether each of z (n + m, K) is beyond a range by more than a share of it, or is a combination not fitted."""
     cdef const double[:, ::1] columns = np.ascontiguousarray(z)
     cdef arrays.array low = doubles(least), high = doubles(greatest)
     cdef Py_ssize_t size = columns.shape[0], count = columns.shape[1]
@@ -187,7 +188,7 @@ def outside_domain(z, least, greatest, occupied=None):
         with nogil:
             left_domain(
                 &columns[0, 0], count, count, low.data.as_doubles, high.data.as_doubles, per_unit.data.as_doubles,
-                &flags[0], size, cells, cell.data.as_ints, &left[0],
+                &flags[0], size, cells, cell.data.as_ints, share, &left[0],
             )
     return found
 

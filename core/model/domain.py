@@ -165,7 +165,7 @@ class Domain:
         return np.concatenate((self.x_max, self.u_max))
 
     def beyond(self, z: Array) -> NDArray[np.bool_]:
-        """Whether columns z = [x; u; ...] (n + m + q, K) leave the box in some element by a tenth of it or more."""
+        """Whether columns z = [x; u; ...] (n + m + q, K) leave the box in some element by more than a tenth of it."""
         return np.asarray(outside_domain(z[: len(self.least)], self.least, self.greatest))
 
     def outside(self, x: ArrayLike, u: ArrayLike) -> NDArray[np.bool_]:

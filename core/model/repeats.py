@@ -217,7 +217,6 @@ def repeats_in(model: Any, transient: Any) -> Found:
     windows, noisy = _activity(model, transient, steps)
     some, largest = changes(transient.x, steps.k)
     follow = Repeating(np.full((model.n, 7), np.inf), LEAST, [False] * model.n, 1.0)
-
     if some.any():
         follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
     most = follow.most

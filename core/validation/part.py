@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.text import plural
-from uncertain_lti.kernel.arithmetic import BEYOND
+from uncertain_lti.kernel.arithmetic import BEYOND, outside_domain
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import back_and_restarts
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -40,8 +40,8 @@ class Reach:
     def __init__(self, model: UncertainLTI, transients: Sequence[Transient]) -> None:
         self._model = model
         every = [model.normalised_columns(t.transitions()) for t in transients]
-        self._low = np.min([z.min(axis=1, initial=np.inf) for z in every], axis=0)[:, None]
-        self._high = np.max([z.max(axis=1, initial=-np.inf) for z in every], axis=0)[:, None]
+        self._low = np.min([z.min(axis=1, initial=np.inf) for z in every], axis=0)
+        self._high = np.max([z.max(axis=1, initial=-np.inf) for z in every], axis=0)
         stride = max(1, sum(z.shape[1] for z in every) // _MOST)
         some = self._lever(np.hstack([z[:, ::stride] for z in every]))
         self._scale = np.maximum(np.abs(some).max(axis=1, keepdims=True), 1e-300)
@@ -60,11 +60,9 @@ class Reach:
         """(K,): 0 where a transition begins within what was fitted, 1 beyond it, 2 far beyond."""
         z = self._model.normalised_columns(steps)
         found = np.zeros(z.shape[1], dtype=np.intp)
-        span, leverage = self._high - self._low, self._leverage(self._lever(z))
+        leverage = self._leverage(self._lever(z))
         for level, (share, times) in enumerate(REACHES, start=1):
-            edge = share * span + _SAME * np.maximum(np.abs(self._low), np.abs(self._high))
-            beyond = ((z < self._low - edge) | (z > self._high + edge)).any(axis=0)
-            found[beyond | (leverage > times * self._largest)] = level
+            found[outside_domain(z, self._low, self._high, share=share) | (leverage > times * self._largest)] = level
         return found
 
 
