@@ -595,6 +595,12 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
     proposal = propose([path], states=["/other/st*:data"], controls=["/other/cmd"])
     assert signals_of(proposal) == ([("/other/state", "data")], [("/other/cmd", "data")])
     assert "not asked for by --controls" in proposal.text
+    rng = np.random.default_rng(0)
+    b = np.repeat(rng.normal(size=(20, 1)), 20, axis=0)  # both in one topic
+    table = table_of(tmp_path / "a.csv", {"A": answers(rng, b)[:, 0], "B": b[:, 0], "C": rng.normal(size=len(b))})
+    for more in (["/table:A"], ["/table:*"]):
+        proposal = propose([table], states=more, controls=["/table:B"])
+        assert signals_of(proposal) == ([("/table", "A")], [("/table", "B")])
     for asked in ({"states": ["/none"]}, {"controls": ["/other/cmd:date"]}):
         with pytest.raises(BagError, match="meets nothing that moves"):
             propose([path], **asked)

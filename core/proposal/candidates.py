@@ -435,8 +435,8 @@ def at_rest(sources: Sequence[Source]) -> str:
     )
 
 
-def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
-    """Give the roles that a person asks for in place of those by name."""
+def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
+    """Give the roles that a person asks for in place of those by name; a source that has both is split in two."""
     asked = [("state", p) for p in states] + [("control", p) for p in controls]
     met: dict[str, set[Candidate]] = {"state": set(), "control": set()}
     for role, pattern in asked:
@@ -456,6 +456,14 @@ def ask_for(sources: Sequence[Source], states: Sequence[str], controls: Sequence
                 why = f"; a field is asked for with its topic, {' or '.join(fields[:3])}"
             raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
         met[role].update(found)
+    fewer, more = sorted(met, key=lambda role: len(met[role]))
+    met[more] -= met[fewer]
+    for source in list(sources):
+        mine = met["control"].intersection(source.candidates)
+        if mine and met["state"].intersection(source.candidates):
+            held = [c for c in source.candidates if c in mine]
+            sources.append(replace(source, candidates=held, role="control", reason=""))
+            source.candidates = [c for c in source.candidates if c not in mine]
     for source in sources:
         for role, patterns in (("state", states), ("control", controls)):
             mine, why = met[role].intersection(source.candidates), f"not asked for by --{role}s"
