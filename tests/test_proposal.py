@@ -389,6 +389,16 @@ def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     assert "Pump_speed_cmd" not in model.state_names and "Valve_cmd" in model.state_names
 
 
+@pytest.mark.parametrize("names", ["B1_Temp,B1_Press,B1_Valve1,B1_Valve2", "Temp1,Temp2,Temp3,Temp4"])
+def test_what_differs_in_its_numbers_alone_goes_together_and_some_state_is_left(tmp_path, names):
+    """All of a unit, whose number the names begin with, went with its two valves: no state was left."""
+    rng = np.random.default_rng(0)
+    valves = np.repeat(rng.integers(0, 2, (40, 2)), 10, axis=0)
+    columns = [*answers(rng, 1.0 * valves, 0.01).T, *valves.T]
+    path = table_of(tmp_path / "a.csv", dict(zip(names.split(","), columns, strict=True)), 10.0 * np.arange(400))
+    assert [c.path for c in propose([path]).states] == names.split(",")[:2]
+
+
 # --- many columns ------------------------------------------------------------------------------------------------
 
 

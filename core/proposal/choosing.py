@@ -486,10 +486,10 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.why = f"0 whenever {on.path} is off"
             controls.append(candidate)
     stems = [_stem(c) for c in controls if not c.why.startswith("always")]
-    for candidate in free:  # alike signals go together
-        if candidate not in controls and stems.count(_stem(candidate)) > 1:
-            candidate.why = f"one of the {_stem(candidate)}*, of which the others are controls"
-            controls.append(candidate)
+    alike = [c for c in free if c not in controls and stems.count(_stem(c)) > 1]
+    for candidate in alike if len(controls) + len(alike) < len(free) else ():  # they go together, unless none is left
+        candidate.why = f"one of the {_stem(candidate)}, of which the others are controls"
+        controls.append(candidate)
     for candidate in free:
         if candidate not in controls and (rows := _held_for(candidate)):
             candidate.reason, candidate.ready = f"an analyser: holds each value for {rows} rows", "state"
@@ -553,7 +553,8 @@ def _gated(candidate: Candidate, switch: Candidate) -> bool:
 
 
 def _stem(candidate: Candidate) -> str:
-    return re.sub(r"\d.*$", "", candidate.path)
+    """Name with its numbers replaced: of alike signals, such as `F_PU1` and `F_PU2`, and not of one unit's."""
+    return re.sub(r"\d+", "*", candidate.path)
 
 
 def _held_for(candidate: Candidate) -> int:
