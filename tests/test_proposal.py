@@ -399,6 +399,18 @@ def test_what_differs_in_its_numbers_alone_goes_together_and_some_state_is_left(
     assert [c.path for c in propose([path]).states] == names.split(",")[:2]
 
 
+def test_a_staircase_is_a_control_whatever_its_name_and_an_analyser_is_none(tmp_path):
+    rng = np.random.default_rng(0)
+    flow = np.repeat(rng.normal(size=(200, 1)), 10, axis=0)
+    hot = answers(rng, flow, 0.01, 0.8)[:, 0]
+    seen = hot[np.arange(2000) // 5 * 5]  # of the row in which it changes
+    path = table_of(tmp_path / "a.csv", {"q": flow[:, 0], "hot": hot, "seen": seen}, 6.0 * np.arange(2000))
+    proposal = propose([path])
+    assert signals_of(proposal) == ([("/table", "hot")], [("/table", "q")])
+    assert "set, for 10 rows each: the others follow it" in proposal.text
+    assert re.search('"seen".*an analyser: holds each value for 5 rows', proposal.text)
+
+
 # --- many columns ------------------------------------------------------------------------------------------------
 
 

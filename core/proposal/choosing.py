@@ -451,6 +451,8 @@ MOST_VALUES = 8
 """Values of a command that is switched, at most."""
 TOLD = 0.9
 """Share of a measurement that the controls of the same row tell from which on it answers within a row."""
+LASTS = 0.5
+"""Share of what they do not tell that the row before tells, from which on it has a memory of its own."""
 RARE = 0.05
 """Share of the rows in which a set point changes, up to which nothing before tells of its changes."""
 _BY_NAME = "set by a controller or a person, by its name; "
@@ -490,9 +492,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for candidate in alike if len(controls) + len(alike) < len(free) else ():  # they go together, unless none is left
         candidate.why = f"one of the {_stem(candidate)}, of which the others are controls"
         controls.append(candidate)
-    for candidate in free:
-        if candidate not in controls and (rows := _held_for(candidate)):
-            candidate.reason, candidate.ready = f"an analyser: holds each value for {rows} rows", "state"
+    controls += _set_or_analysed([c for c in free if c not in controls], {s.topic: s for s in sources})
     known = [c for c in controls if not c.judged]
     for candidate in free:
         if candidate not in controls and not candidate.reason and (share := _told(candidate, known)) >= TOLD:
@@ -567,14 +567,39 @@ def _held_for(candidate: Candidate) -> int:
     return rows if rows > 1 and counts[rows] >= HELD * len(gaps) else 0
 
 
+def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> list[Candidate]:
+    """Of columns that hold each value for some rows those that are set; the others, which an analyser holds, go.
+
+    A set value shows in the next rows of what is measured, of which none tells before what it will be. Columns that
+    hold as long are of one analyser, unless most of them are set: a controller acts on some of what an analyser says.
+    """
+    held = {c: rows for c in measured if (rows := _held_for(c))}
+    rest, found = [c for c in measured if c not in held and np.ptp(_finite(c)) > 0], []
+    for rows in dict.fromkeys(held.values()) if rest else ():
+        group = [c for c in held if held[c] == rows]
+        leads = steps_of(rest, of, group).effect_of_each().max(axis=1, initial=0.0) > SHOWS
+        for j, candidate in enumerate(group):
+            before = steps_of([candidate], of, rest)
+            set_at = before.dX[:, 0] != 0
+            leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effect([0])[0] <= SHOWS
+        found += group if 2 * leads.sum() > len(group) else []
+    for candidate, rows in held.items():
+        candidate.why = f"set, for {rows} rows each: the others follow it"
+        if candidate not in found:
+            candidate.reason, candidate.ready = f"an analyser: holds each value for {rows} rows", "state"
+    return found
+
+
 def _told(candidate: Candidate, controls: Sequence[Candidate]) -> float:
-    """Share of the variance that a linear function of the controls of the same row tells."""
+    """Share of the variance that a linear function of the controls of the same row tells; 0 if the rest lasts."""
     y, U = np.concatenate(candidate.values), np.column_stack([np.concatenate(c.values) for c in [candidate, *controls]])
     good = np.isfinite(U).all(axis=1)
     y, U = y[good], np.column_stack([U[good, 1:], np.ones(good.sum())])
     if len(y) < FEWEST * U.shape[1] or y.var() == 0:
         return 0.0
-    return 1.0 - float((y - U @ np.linalg.lstsq(U, y, rcond=None)[0]).var() / y.var())
+    rest = y - U @ np.linalg.lstsq(U, y, rcond=None)[0]
+    lasts = rest.std() > 1e-9 * y.std() and float(np.corrcoef(rest[1:], rest[:-1])[0, 1]) ** 2 >= LASTS
+    return 0.0 if lasts else 1.0 - float(rest.var() / y.var())
 
 
 def _known(candidate: Candidate) -> float:
