@@ -411,6 +411,14 @@ def test_a_staircase_is_a_control_whatever_its_name_and_an_analyser_is_none(tmp_
     assert re.search('"seen".*an analyser: holds each value for 5 rows', proposal.text)
 
 
+def test_of_a_plant_a_twin_is_judged_and_what_says_the_same_to_the_last_digit_is_not(tmp_path):
+    rng = np.random.default_rng(0)
+    p = 50 + 20 * answers(rng, np.zeros((2000, 1)), 1.0, 0.9)[:, 0]
+    columns = {"P1": p.round(3), "P2": (0.5 * p + 0.05 * rng.normal(size=2000)).round(3), "P1_bar": (1e-2 * p).round(4)}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 60.0 * np.arange(2000))])
+    assert [c.path for c in proposal.states] == ["P1", "P2"] and "P1_bar: moves with P1" in proposal.text
+
+
 # --- many columns ------------------------------------------------------------------------------------------------
 
 

@@ -194,12 +194,16 @@ _NEARLY = 0.999
 """Correlation from which on it is looked at closer."""
 
 
-def drop_copies(pool: Sequence[Candidate]) -> list[Candidate]:
-    """Leave out what moves as another candidate of the same topic does; returns the rest."""
+def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidate]:
+    """Leave out what moves as another candidate of the same topic does; returns the rest.
+
+    `exact`: only what is another one but for scale, offset and rounding. Of two sensors that move together, each shows
+    the faults of the other.
+    """
     kept: list[Candidate] = []
-    may = _may_move_with(pool)
+    may, same = _may_move_with(pool), _is_copy if exact else _moves_with
     for candidate in pool:
-        if twin := next((c for c in kept if (id(c), id(candidate)) in may and _moves_with(candidate, c)), None):
+        if twin := next((c for c in kept if (id(c), id(candidate)) in may and same(candidate, c)), None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
@@ -241,6 +245,18 @@ def _moves_with(one: Candidate, other: Candidate) -> bool:
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
     return bool(len(a) > 2 and np.ptp(a) > 0 and np.ptp(b) > 0 and abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
+
+
+def _is_copy(one: Candidate, other: Candidate) -> bool:
+    """Whether a line through the other's numbers gives these, but for the last digit of both."""
+    a, b = np.concatenate(one.values), np.concatenate(other.values)
+    both = np.isfinite(a) & np.isfinite(b)
+    if len(a) != len(b) or both.sum() < 3 or not all(np.ptp(v[both]) for v in (a, b)):
+        return False
+    slope, offset = np.polyfit(b[both], a[both], 1)
+    digits = [float(np.diff(np.unique(v[both])).min()) for v in (a, b)]
+    off = np.abs(a - slope * b - offset)[both].max()
+    return bool(off <= digits[0] + abs(slope) * digits[1] + 1e-9 * np.ptp(a[both]))
 
 
 ALIKE = 0.8
@@ -478,7 +494,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     every = [c for s in sources for c in s.candidates if c.values]
     for candidate in every:
         candidate.reason = _unfit(candidate)
-    drop_copies([c for c in every if not c.reason and np.ptp(_finite(c)) > 0])
+    drop_copies([c for c in every if not c.reason and np.ptp(_finite(c)) > 0], exact=True)
     free = [c for c in every if not c.reason]
     controls = [c for c in free if _is_set(c)]
     switches = [c for c in controls if c.why.startswith("switched")]
