@@ -26,7 +26,7 @@ from test_signals import quaternion
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
-from uncertain_lti.proposal.candidates import Candidate, Source, Steps, role_by_name, role_of_column
+from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column
 from uncertain_lti.proposal.choosing import _function, _may_follow, _may_move_with, _moves_with, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 
@@ -221,6 +221,18 @@ def test_a_controller_publishes_all_kinds(topic, role):
 )
 def test_what_is_desired_is_a_reference(column, role):
     assert role_of_column(column) == role
+
+
+@pytest.mark.parametrize(
+    ("columns", "controls"),
+    [
+        ("x u v r delta n", "delta n"), ("U_m_s V_m_s Q_rad_s rudder", "rudder"), ("x v u", "u"), ("n delta u", "u"),
+        ("T_brine_in T_brine_out", ""), ("T_brine_in T_out in", "T_brine_in in"), ("Brake_IN Speed", "Brake_IN"),
+    ],
+)  # fmt: skip
+def test_a_velocity_of_a_body_and_an_inlet_are_measured_and_its_rudder_is_set(columns, controls):
+    beside = {bare(column) for column in columns.split()}
+    assert [c for c in columns.split() if role_of_column(c, beside) == "control"] == controls.split()
 
 
 def test_a_cascade_keeps_every_tank(tmp_path):

@@ -62,6 +62,8 @@ FROZEN = 25
 UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
 """|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `_jittering`."""
 
+CONSTANT = "never moved in what was fitted"
+"""Words on controls that never moved: nothing is to be mended for the operation that was recorded."""
 _CODE, _NOISE, _BEFORE, _FEW = (
     "a number that stands for no value",
     "like noise from sample to sample",
@@ -103,29 +105,24 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
     names = [*names, "the disturbance c"] if problem.columns.drift else list(names)
     dead = sums.phi_scale == 0
-    messages, still = [], [names[j] for j in np.flatnonzero(dead)]
-    if still:
-        several = len(still) > 1
-        be, columns, them = ("are", "their columns are", "them") if several else ("is", "its column is", "it")
+    still = np.pad(sums.high == sums.low, (0, len(dead) - problem.p))
+    messages = []
+    if constant := [names[j] for j in np.flatnonzero(still[: problem.n])]:
         messages.append(
-            f"rank deficient: {_quoted(still)} {be} 0 in every transition, so {columns} not identifiable and set to 0; "
-            f"record {them} moving, or leave {them} out"
+            f"rank deficient: {_quoted(constant)} never moved, so what follows from it is not identifiable; record the "
+            f"machine moving it, or leave it out"
         )
     free = np.flatnonzero(~dead)
-    values, vectors = _directions(sums, free)
+    values, _ = _directions(sums, free)
     limit = 1e-12 * len(free)
-    for value, vector in zip(values, vectors.T, strict=True):
+    moving = np.flatnonzero(~dead & ~still)
+    for value, vector in zip(*[a.T for a in _directions(sums, moving)], strict=True):
         if value <= limit:
-            part = [names[free[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
+            part = [names[moving[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
             messages.append(
                 f"rank deficient: {_quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
-    messages += [
-        f"'{names[j]}' is constant ({problem.z[0, j]:.4g}) in every transition, so its column cannot be told from "
-        f"the disturbance c; record it moving, or leave it out"
-        for j in np.flatnonzero((sums.high == sums.low) & ~dead[: problem.p])
-    ]
     return int(np.count_nonzero(values > limit)), messages
 
 
@@ -172,6 +169,8 @@ def describe(
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
     messages += _wide(sums, mean_width, names)
+    if still := [names[j] for j in range(problem.n, problem.p) if sums.high[j] == sums.low[j]]:
+        messages.append(f"{_quoted(still)} {CONSTANT}, so what a move would do is unknown")
     if problem.columns.names == {"c", "v"}:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return rank, messages

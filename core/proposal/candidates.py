@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
@@ -371,9 +371,24 @@ def role_by_name(topic: str, type_name: str) -> str:
     return ""
 
 
-def role_of_column(name: str) -> str:
-    """What a column of a table seems to be by its name."""
-    low = name.lower()
+_BODY = {"u", "v"}, {"w", "p", "q", "r"}
+"""Velocities of a body in its own frame: where both of the first and one of the others are columns, u is no control."""
+_EFFECTOR = re.compile(r"(delta|rudder|aileron|elevator|flap|fin|sail|prop(eller)?|n|n_?prop|rpm)(_?\w{1,2})?")
+
+
+def bare(name: str) -> str:
+    """Name of a column without capitals and the unit of a speed."""
+    return re.sub(r"_(m|rad|deg)_s$", "", name.lower())
+
+
+def role_of_column(name: str, beside: Collection[str] = ()) -> str:
+    """What a column of a table seems to be by its name, and those `beside` it, as `bare` gives them."""
+    low = bare(name)
+    if (outlet := re.sub(r"(^|_)in(?=_|$)", r"\1out", low)) != low and outlet in beside:
+        return "state"
+    if _BODY[0].issubset(beside) and not _BODY[1].isdisjoint(beside):
+        if low in _BODY[0] or _EFFECTOR.fullmatch(low):
+            return "state" if low in _BODY[0] else "control"
     if _ANSWER.search(low):
         return "state"
     if _REFERENCE.search(low):

@@ -32,7 +32,6 @@ from uncertain_lti.proposal.candidates import (
     Steps,
     explained,
     is_physical,
-    role_of_column,
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
@@ -496,7 +495,8 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         candidate.reason = _unfit(candidate)
     drop_copies([c for c in every if not c.reason and np.ptp(_finite(c)) > 0], exact=True)
     free = [c for c in every if not c.reason]
-    controls = [c for c in free if _is_set(c)]
+    called = {c for s in sources if s.role in ("control", "reference") for c in s.candidates}
+    controls = [c for c in free if _is_set(c, c in called)]
     switches = [c for c in controls if c.why.startswith("switched")]
     for candidate in free:
         on = next((s for s in switches if _gated(candidate, s)), None) if candidate not in controls else None
@@ -542,10 +542,10 @@ def _unfit(candidate: Candidate) -> str:
     return "" if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason) else candidate.reason
 
 
-def _is_set(candidate: Candidate) -> bool:
-    """Whether a column is a control by its values or its name; says why."""
+def _is_set(candidate: Candidate, called: bool) -> bool:
+    """Whether a column is a control by its values or its name, or is `called` one; says why."""
     values = np.unique(_finite(candidate))
-    by_name = role_of_column(candidate.path) in ("control", "reference") or _TURNED.search(candidate.path.lower())
+    by_name = called or _TURNED.search(candidate.path.lower())
     if len(values) == 1:
         candidate.why = (
             f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"

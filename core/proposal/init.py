@@ -35,6 +35,7 @@ from uncertain_lti.proposal.candidates import (
     ask_for,
     assign_roles,
     at_rest,
+    bare,
     earlier,
     residual,
     role_by_name,
@@ -165,8 +166,9 @@ def _tells_runs(table: Table, name: str) -> bool:
 def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
     """The columns of a table, those that are commands by their names apart from the others."""
     by_role: dict[str, list[str]] = {}
+    beside = {bare(field) for field in fact.fields}
     for field in fact.fields:
-        by_role.setdefault(role_of_column(field), []).append(field)
+        by_role.setdefault(role_of_column(field, beside), []).append(field)
     sources = []
     for role, fields in by_role.items():
         source = Source(fact.info.topic, TYPE, role, False, None)

@@ -20,6 +20,7 @@ from typing import Any
 from uncertain_lti import __version__
 from uncertain_lti.base.files import sha256
 from uncertain_lti.base.text import finite_data, list_of, number, numbers_of, plural, shortened, shortlist, times
+from uncertain_lti.identification.diagnosis import CONSTANT
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -201,7 +202,7 @@ def _messages(model: UncertainLTI) -> list[str]:
 def _fit_reasons(model: UncertainLTI) -> Reasons:
     messages = _messages(model)
     for message in messages:  # widths and the blocks of a schedule have reasons of their own below
-        if not message.startswith(("the bounds are over", "the block at")):
+        if not message.startswith(("the bounds are over", "the block at")) and CONSTANT not in message:
             yield CARE, "fit", message
     if not model.fit_summary:
         yield CARE, "fit", "the model file does not say how it was fitted"

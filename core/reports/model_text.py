@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from uncertain_lti.base.text import Block, Table, list_of, named, number, numbers_of, plural, share, shortlist, text_of
-from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.identification.diagnosis import CONSTANT, remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -123,7 +123,7 @@ def alarm_text(model: UncertainLTI) -> str:
 def next_text(model: UncertainLTI, file: str) -> str:
     """What to look at after a fit: the first thing that a person can mend, and the commands that tell more."""
     facts = model.fit_summary
-    minded = [text for text in facts.get("messages", []) if "schedules nothing" not in text]
+    minded = [text for text in facts.get("messages", []) if "schedules nothing" not in text and CONSTANT not in text]
     blind = facts.get("alarm", {}).get("worth") in ("none", "some")
     remedy = remedies(facts.get("messages", []), facts["additive"], model.state_names[0]) if blind else ""
     worry = remedy or (minded[0] if minded else "")
