@@ -811,6 +811,21 @@ def trials(path, column, ids, restart=True, rows=60):
     return path
 
 
+def test_a_servo_whose_command_comes_in_the_row_of_its_answer_is_a_state(tmp_path):
+    rng = np.random.default_rng(0)
+    commands = np.cumsum(rng.normal(size=(400, 2)), axis=0)
+    place = answers(rng, commands)
+    for k in range(399):
+        place[k + 1, 1] = place[k, 1] + 0.9 * (commands[k + 1, 1] - place[k, 1]) + 1e-3 * rng.normal()
+    path = table_of(
+        tmp_path / "a.csv", {"x": place[:, 0], "y": place[:, 1], "cmd_x": commands[:, 0], "cmd_y": commands[:, 1]}
+    )
+    assert signals_of(propose([path])) == (
+        [("/table", "x"), ("/table", "y")],
+        [("/table", "cmd_x"), ("/table", "cmd_y")],
+    )
+
+
 @pytest.mark.parametrize("moves", [True, False])
 def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, moves):
     rng = np.random.default_rng(4)

@@ -264,11 +264,32 @@ def steps_of(
     return Steps(np.concatenate([n, *X]), np.concatenate([m, *U]), np.concatenate([n, *dX]))
 
 
+ALIGNED = 0.5
+"""Least cosine between what a control does to a state from either end of a step, where it is no controller's answer."""
+
+
+def from_both_ends(X: Array, U: Array, V: Array, dX: Array, new: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Whether what is new in the controls at the arrival moves each state as from the departure on.
+
+    `X` (N, n), `U` (N, m): states and controls at the departure; `V` (N, k): controls at the arrival, those that are
+    `new` of the m; `dX` (N, n): changes of the states. Returns (n,), and (N, n) twice: what of the changes nothing
+    before the arrival tells, and the part of it that the controls at the arrival do.
+    """
+    move, fresh = left(np.hstack([X, U]), dX, V)
+    own, change = left(X, U, dX)
+    early = fresh @ np.linalg.lstsq(own, change, rcond=None)[0][new]
+    late = fresh @ np.linalg.lstsq(fresh, move, rcond=None)[0]
+    sizes = ((early**2).mean(axis=0) * (late**2).mean(axis=0)) ** 0.5
+    return np.asarray((early * late).mean(axis=0) >= ALIGNED * sizes), move, late
+
+
 def earlier(values: Array, samples: int) -> Array:
-    """Each value some samples before.
+    """Each value some samples before, or later.
 
     `values` (N,): one per sample; Returns (N,): naN where there is none.
     """
+    if samples < 0:
+        return earlier(values[::-1], -samples)[::-1]
     return np.concatenate([np.full(min(samples, len(values)), np.nan), values[: max(len(values) - samples, 0)]])
 
 

@@ -31,6 +31,7 @@ from uncertain_lti.proposal.candidates import (
     Source,
     Steps,
     explained,
+    from_both_ends,
     is_physical,
     steps_of,
 )
@@ -143,14 +144,13 @@ def drop_noise(
     return [c for c in pool if not c.reason], ""
 
 
-def drop_idle_controls(steps: Steps, used: Sequence[Candidate]) -> None:
-    """Leave out controls that show nowhere given the others, and those that move with another one."""
+def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) -> None:
+    """Leave out controls that show nowhere given the others, and those that move with another one; `shows` (m,)."""
     if len(steps.X) < FEWEST or len(used) < 2:
         return
     moving = np.ptp(steps.U, axis=0) > 0
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(np.corrcoef(steps.U.T)) > 0.99
-    shows = steps.effect_of_each().max(axis=1, initial=0.0)
     for j, candidate in enumerate(used):
         twin = next((i for i in range(j) if alike[i, j] and not used[i].reason), None)
         if not moving[j]:
@@ -311,7 +311,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     steps = steps_of(pool, every, used)
     N = len(steps.X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(steps, used, _Room.of(room // 2, MOST, "controls"))
+    used = _strongest(_driven(pool, every, used), used, _Room.of(room // 2, MOST, "controls"))
     steps = steps_of(pool, every, used)
     states_room = _Room.of(room - len(used), MOST, "states")
     if N < FEWEST:
@@ -320,22 +320,32 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
         keep = _steered(pool, states_room, _driven(pool, every, used))
     else:
         keep = _coupled(steps, pool, states_room, _driven(pool, every, used).max(axis=0, initial=0.0))
-    drop_idle_controls(steps_of(keep, every, used), used)
+    drop_idle_controls(steps_of(keep, every, used), used, _driven(keep, every, used, 0)[1:].max(axis=1, initial=0.0))
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
     return keep, doubt
 
 
-def _driven(pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> Array:
+def _driven(
+    pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate], latest: int = LONGEST_DELAY
+) -> Array:
     """How clearly all controls, and each, show in the next step of each candidate, at the delay at which they do most.
 
+    It may be none: a servo carries a command out before the next message, which is the first to hold it.
     Returns (1 + m, n).
     """
     found = np.zeros((1 + len(used), len(pool)))
-    for lag in range(LONGEST_DELAY + 1):
+    for lag in range(latest + 1):
         steps = steps_of(pool, every, used, [lag] * len(used))
         if used and len(steps.X) >= FEWEST:
             found = np.maximum(found, np.vstack([steps.effect(range(len(pool))), steps.effect_of_each()]))
+    m = len(used)
+    steps = steps_of(pool, every, [*used, *used], [0] * m + [-1] * m)
+    if used and len(steps.X) >= FEWEST:
+        U, V = np.hsplit(steps.U / _spread(steps.U).T, 2)
+        arrival, servo = Steps(steps.X, V, steps.dX), from_both_ends(steps.X, U, V, steps.dX, np.ones(m, dtype=bool))[0]
+        at_arrival = np.vstack([arrival.effect(range(len(pool))), arrival.effect_of_each()])
+        found = np.where(servo, np.maximum(found, at_arrival), found)
     return found
 
 
@@ -364,11 +374,11 @@ def _one_element(
     return [c for c in pool if not c.reason], [c for c in used if not c.reason]
 
 
-def _strongest(steps: Steps, used: list[Candidate], room: _Room) -> list[Candidate]:
-    """The controls that show most, up to a number."""
+def _strongest(driven: Array, used: list[Candidate], room: _Room) -> list[Candidate]:
+    """The controls that show most, up to a number; `driven` (1 + m, n): of all controls, and of each."""
     order = used
-    if len(used) > room.most and len(steps.X) >= FEWEST:
-        order = [used[j] for j in np.argsort(steps.effect_of_each().max(axis=1, initial=0.0))[::-1]]
+    if len(used) > room.most:
+        order = [used[j] for j in np.argsort(driven[1:].max(axis=1, initial=0.0))[::-1]]
     _first(order, room)
     return [c for c in used if not c.reason]
 

@@ -26,7 +26,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.candidates import left
+from uncertain_lti.proposal.candidates import from_both_ends, left
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule
@@ -118,8 +118,6 @@ ENOUGH, COMPARED = 20, 20_000
 UNITS = 3
 """Recordings, groups or blocks from which on they are: of two runs at one speed the arrival had smaller jumps, and ten
 times the false alarms at another speed."""
-ALIGNED = 0.5
-"""Least cosine between what a control does to a state from either end of a step, where it is no controller's answer."""
 
 
 def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, str]:
@@ -171,15 +169,11 @@ def _promising_ends(transients: Sequence[Transient], arrival: Sequence[Transient
         return []
     size = np.maximum(np.abs(U).max(axis=0, initial=0.0), 1e-300)
     U, V, dX = U / size, (V / size)[:, free], after - X
-    move, fresh = left(np.hstack([X, U]), dX, V)  # what nothing before the arrival tells
-    own, change = left(X, U, dX)
-    early = fresh @ np.linalg.lstsq(own, change, rcond=None)[0][free]
-    late = fresh @ np.linalg.lstsq(fresh, move, rcond=None)[0]
+    aligned, move, late = from_both_ends(X, U, V, dX, free)
     rest = {"arrival": left(np.hstack([X, U[:, ~free], V]), dX)[0], "both": move - late}
     floor = 1e-9 * np.ptp(after, axis=0) + 1e-300
     ratio = {at: (_rms(values) + floor) / (_rms(move) + floor) for at, values in rest.items()}
     gains = ratio["both"] < CLEARLY
-    aligned = (early * late).mean(axis=0) >= ALIGNED * _rms(early) * _rms(late)
     if not aligned[gains].all():
         return []
     better = [at for at in get_args(At) if at in ratio and _geometric(ratio[at]) < CLEARLY]
