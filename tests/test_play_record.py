@@ -24,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import JAZZY, Message, Topic, cdr, float64, header, ramp, write
+from bag_writer import JAZZY, Message, Topic, cdr, float64, header, message, ramp, write
 from conftest import ROOT
 from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
@@ -330,8 +330,8 @@ def test_each_message_goes_out_at_its_time_and_after_a_delay_in_no_burst(
     assert len(sent) == len(messages) and late <= 3 / crowd + 1e-6, "the delay is caught up with"
     assert np.diff(sent).min() > 1 / crowd - 1e-6
     taken: list[Any] = []
-    for message, _ in player.when_due(messages, rate, crowd, lambda: len(taken) < 5):
-        taken.append(message)
+    for due, _ in player.when_due(messages, rate, crowd, lambda: len(taken) < 5):
+        taken.append(due)
     assert taken == messages[:5]
 
 
@@ -361,11 +361,16 @@ def test_the_clock_goes_before_each_message(world: World, tmp_path: Path) -> Non
 
 def test_another_speed_without_stamps_is_warned_of(command: Command, tmp_path: Path) -> None:
     """At 100 times its speed, a machine without header stamps seems to take steps a hundred times as short."""
-    stamped = Topic("/stamped", "geometry_msgs/msg/TwistStamped")
-    bag = write([Topic("/x"), stamped], [Message("/x", START_NS, float64(1.0))]).save(tmp_path / "in.mcap")
+    stamped = Topic("/stamped", "geometry_msgs/msg/PointStamped")
+    point = message("geometry_msgs/msg/Point", x=0.0, y=0.0, z=0.0)
+    zero = Topic("/zero", stamped.type)
+    messages = [Message("/x", START_NS, float64(1.0))]
+    for topic, stamp in ((stamped, START_NS), (zero, 0)):
+        messages.append(Message(topic.name, START_NS, cdr(topic.type, header=header(stamp), point=point), START_NS))
+    bag = write([Topic("/x"), stamped, zero], messages).save(tmp_path / "in.mcap")
     quick = ["play", bag, "--wait", "0.1", "--rate", "100"]
     said = command(*quick)[1]
-    assert "no header stamps: /x; a node that uses the time of receipt sees steps 100 times as fast" in said
+    assert "no header stamps: /x, /zero; a node that uses the time of receipt sees steps 100 times as fast" in said
     for arguments in ([*quick, "--clock"], quick[:4], [*quick, "--topics", "/stamped"]):
         status, said = command(*arguments)
         assert status == 0 and "no header stamps" not in said

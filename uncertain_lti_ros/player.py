@@ -16,9 +16,10 @@ import json
 import math
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import yaml
@@ -42,6 +43,7 @@ from uncertain_lti_ros.topics import live_fields, message_class
 
 CLOCK = "/clock"
 _DEPTH = 1000
+_LOOKED_AT = 10_000  # messages in which a header stamp is looked for
 _CROWD = 2000.0
 """Messages a second up to which a subscriber keeps up; faster only where the recording itself is faster."""
 _SIGNALLED = 128  # exit status of a process that a signal ended: this and its number
@@ -79,6 +81,16 @@ class _Played:
     sent: int = 0
 
 
+def _unstamped(bag: Bag, topics: Sequence[str]) -> list[str]:
+    """Topics without a header stamp, or with none but zeros as far as one looks."""
+    stamped: dict[str, bool] = {}
+    for raw in islice(bag.raw_messages(topics), _LOOKED_AT) if topics else ():
+        topic, definition = raw.channel.topic, raw.channel.definition
+        if not stamped.get(topic):
+            stamped[topic] = bool(definition.reason or (definition.has_header and definition.stamp_ns(raw.data)))
+    return [topic for topic in topics if not stamped.get(topic, True)]
+
+
 def run(args: argparse.Namespace) -> Result:
     """Play a recording to its end, or until a signal."""
     note = args.progress.note
@@ -89,8 +101,7 @@ def run(args: argparse.Namespace) -> Result:
         played = _offer(life.node, bag, args.topics, args.clock, note)
         clock = life.node.create_publisher(Clock, CLOCK, QoSProfile(depth=_DEPTH)) if args.clock else None
         note(*bag.warnings)
-        unstamped = [topic for topic in played if "header" not in live_fields(bag.topics[topic].type)]
-        if unstamped and not args.clock and args.rate not in (None, 1.0):
+        if not args.clock and args.rate not in (None, 1.0) and (unstamped := _unstamped(bag, list(played))):
             note(
                 f"no header stamps: {', '.join(unstamped)}; a node that uses the time of receipt sees steps "
                 f"{args.rate:g} times as fast; play with --clock, and start the listeners with use_sim_time"
