@@ -24,10 +24,13 @@ from typing import Any
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC, TABLES, kind_of, natural
-from uncertain_lti.base.text import shortlist
+from uncertain_lti.base.text import printable, shortlist
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 """Suffixes of files that hold ROS messages."""
+
+
+_SENTENCE = 300  # letters
 
 
 def not_mcap(path: Path, head: bytes) -> BagError:
@@ -134,9 +137,8 @@ def aside(function: Callable[[Path], Any], path: Path, what: str) -> Any:
 
 
 def one_line(error: BaseException | str) -> str:
-    """What an error of a library says, short enough for a sentence."""
-    text = " ".join(str(error).split()) or type(error).__name__
-    return text if len(text) <= 120 else text[:120] + " ..."
+    """What an error says, short enough for a sentence; its end, which may be a remedy, stays."""
+    return printable(" ".join(str(error).split()) or type(error).__name__, _SENTENCE)
 
 
 def _main() -> None:
