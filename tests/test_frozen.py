@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -317,7 +318,12 @@ def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     data = check_data(model, verdicts)
     assert {r["state"] for r in data["repeats"]} == {"position", "velocity"} and not data["frozen"]
     assert data["repeats"][0]["seconds"] == pytest.approx(6.99)
-    assert "warning: position repeats exactly for 6.99 s (at most 0.99 s in the fit) from 2.0000 s" in check_text(data)
+    said = "warning: position repeats exactly for 6.99 s (at most 0.99 s in the fit) from 2.0000 s, "
+    assert f"{said}as of a machine at rest" in check_text(data)
+    u = parked.u.copy()
+    u[400:600] = u.max()
+    verdicts = replace(verdicts, transient=parked.replace(u=u))  # by its own verdicts it would be frozen
+    assert f"{said}while {model.control_names[0]} moved" in check_text(check_data(model, verdicts))
 
 
 def test_jitter_of_the_steps_makes_no_repeat_longer() -> None:

@@ -55,6 +55,8 @@ UNVOUCHED, STRANGE = 0.2, 0.5
 fit had as many; there, or in alarm from early on, from which on the machine may be another, whatever was left out."""
 JUDGED = 0.5
 """Share of the steps that must have a verdict for their quiet to say something."""
+MOVES = 0.1
+"""Share of its range in the recording from which on a signal moved while a state repeated."""
 APART = 10
 """Verdicts without a violation that end an episode."""
 MOST_EPISODES, MOST_EXPLAINED = 1000, 100
@@ -216,6 +218,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
     if model.repeats is None or not which.any():
         return []
     transient, found = verdicts.transient, []
+    z = np.hstack([transient.x, transient.u])
     for i, name in enumerate(model.state_names):
         fresh = np.concatenate([[True], (np.diff(transient.x[:, i]) != 0) | (np.diff(transient.segment) > 0)])
         begins = np.maximum.accumulate(np.where(fresh, np.arange(len(fresh)), 0))
@@ -225,6 +228,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
             begin = int(begins[start])
             seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, start))
             longest = float(model.repeats.longest_repeat_s[i])
+            moving = np.flatnonzero(np.ptp(z[begin:stop], axis=0) > MOVES * np.ptp(z, axis=0))
             found.append(
                 {
                     "state": name,
@@ -233,6 +237,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
                     "told_after": told,
                     "longest_in_fit": longest,
                     "why": verdicts.why_frozen.get((start, i), ""),
+                    "moving": [model.signals.signals[j].name for j in moving],
                     "text": f"{name} {repeat_words(seconds, longest)} from {transient.t[begin]:.4f} s",
                 }
             )
@@ -510,7 +515,9 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
     longest = {r["state"]: r for r in sorted(data["repeats"], key=lambda repeat: repeat["seconds"])}
     blocks += _first(frozen, "frozen repeat")
-    blocks += [f"warning: {r['text']}, as of a machine at rest: the model does not move it" for r in longest.values()]
+    rest = "as of a machine at rest: the model does not move it"
+    moves = {name: f"while {shortlist(r['moving'], 3)} moved" if r["moving"] else rest for name, r in longest.items()}
+    blocks += [f"warning: {r['text']}, {moves[name]}" for name, r in longest.items()]
     told = [f"the alarm from {like['t']:.4f} s {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
     if data["alarm"]:
