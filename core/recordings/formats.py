@@ -21,7 +21,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.bag import Bag, group_bags
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.recordings.table import Table, is_table
+from uncertain_lti.recordings.table import is_table, read_tables
 from uncertain_lti.signals.values import TableLayout
 
 
@@ -40,9 +40,7 @@ class Format:
 
 
 FORMATS: list[Format] = [
-    Format(
-        "table", is_table, lambda paths, _, layout: [run for path in paths for run in Table.every_run(path, layout)]
-    ),
+    Format("table", is_table, lambda paths, _, layout: read_tables(paths, layout)),
     Format("ROS recording", lambda path: True, lambda paths, indexed, _: group_bags(paths, indexed)),
 ]
 """Every format; the first that recognises a path reads it. Bags are last: their errors say what another file is."""

@@ -46,7 +46,7 @@ _UNIT = {
     "ns": r"ns|nsecs?|nanos(econds?)?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
-_DAY = re.compile(r"(\d{1,2})[/.](\d{1,2})[/.](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
+_DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _HALF = re.compile(r"(|.*[T\s])(\d{1,2})(?:[:.](\d\d))?(?:[:.](\d\d(?:[.,:]\d+)?))?\s*([AaPp])\.?\s?[Mm]\.?")  # 1:05 PM
 _NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
@@ -58,8 +58,8 @@ _NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
 )
 _MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
 _YEAR_FIRST = re.compile(r"(\d{4})([-/.])(\d{1,2})\2(\d{1,2})(?:[T,\s]+(\d{1,2}))?((?::\d\d)*)(.*)")
-_DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-(\d{4}.*)")
-_COMPACT = re.compile(r"((?:19|20)\d\d)([01]\d)([0-3]\d)[T_ ]?([0-2]\d)([0-5]\d)([0-5]\d(?:\.\d+)?)(.*)")
+_DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
+_COMPACT = re.compile(r"((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _LARGEST_ZONE = 14  # hours
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
@@ -123,8 +123,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     called = []
     for pattern in _NAMES:
         for name in names:
-            bare = re.sub(r"[\[(].*", "", name).strip().lower().replace(" ", "_").strip("/")
-            if re.fullmatch(pattern, bare) and table.columns[name].ndim == 1:
+            if re.fullmatch(pattern, _bare(name)) and table.columns[name].ndim == 1:
                 called.append(name)
     still = [name for name in called if _stands_still(table.columns[name])]
     called = [name for name in called if name not in still]
@@ -134,17 +133,30 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and _may_be(table.columns[name])]
     if len(dated) == 1:
         return dated[0], ""
-    first = next((n for n in names if not re.fullmatch(r"column 1|index|unnamed.*|row|no\.?|id|nr", n.lower())), "")
-    values = table.columns[first] if first else np.empty(0)
-    if first == names[0] or names[:1] == ["column 1"]:
-        values = table.columns[names[0]]
-        if values.ndim == 1 and values.dtype.kind in "iuf" and len(values) > 2 and (values[1:] > values[:-1]).all():
-            return names[0], "it is taken for the time, as it grows from row to row"
+    first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
+    for name in [*(n for n in names if re.fullmatch(r"\w+_time", _bare(n))), *first]:
+        if _grows(table.columns[name]):
+            return name, "it is taken for the time, as it grows from row to row"
     none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
+    texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
+    if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
+        none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
     raise BagError(
         f"{path}: {none} is called time or looks like it; rename the one that is, or name it in a signals file, "
         f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
         f"{shortlist(names, 50)}"
+    )
+
+
+def _bare(name: str) -> str:
+    """Name of a column without its unit, as `_NAMES` has it."""
+    return re.sub(r"[\s/]+", "_", re.sub(r"[\[(].*", "", name).strip(" /").lower())
+
+
+def _grows(column: Column) -> bool:
+    """Whether numbers grow from each row to the next."""
+    return (
+        column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2 and bool((column[1:] > column[:-1]).all())
     )
 
 
@@ -328,10 +340,13 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
     if not found or len(found) < len(texts):
         return cells, ""
     orders = {}
-    for order, day, month in (("day, month, year", 1, 2), ("month, day, year", 2, 1)):
+    tried = [("day, month, year", 1, 2, 3), ("month, day, year", 2, 1, 3)]
+    if len({m[3] for m in found}) > len({m[1] for m in found}):  # years that change more often than days are days
+        tried = [("year, month, day", 3, 2, 1)]
+    for order, day, month, year in tried:
         texts = [
-            f"{m[3] if len(m[3]) == 4 else '20' + m[3]}-{int(m[month]):02}-{int(m[day]):02}T{int(m[4] or 0):02}:"
-            f"{m[5] or '00'}:{m[6] or '00'}"
+            f"{m[year] if len(m[year]) == 4 else f'20{m[year]:0>2}'}-{int(m[month]):02}-{int(m[day]):02}"
+            f"T{int(m[4] or 0):02}:{m[5] or '00'}:{m[6] or '00'}"
             for m in found
         ]
         if all(1 <= int(text[5:7]) <= 12 for text in texts) and sorted(texts) in (texts, texts[::-1]):
@@ -386,6 +401,7 @@ TYPE = "table"
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _SECOND = 10**9
+_DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
@@ -462,9 +478,13 @@ class Table(Recording):
             kept = kept[::-1]
             self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
+            columns = {name: raw.columns[name][kept] for name in raw.columns if name not in apart}
+            number, unit = _for_each_time(times[kept], columns)
             self._warnings.append(
                 f"{path}: {equal} of {len(kept)} rows have the time of a row before, and only the first of such rows "
-                f"counts; write times with more decimals"
+                f"counts: are the {number} rows of a time one for each of {number} units? then "
+                + f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
+                + "write a file for each; else write times with more decimals"
             )
         self.times = times[kept]
         names = [name for name in raw.columns if name not in apart]
@@ -561,6 +581,37 @@ class Table(Recording):
         if wanted and not self.topics[TOPIC].readable:
             raise BagError(f"{self.path}: cannot be used: {self.topics[TOPIC].reason}")
         return wanted
+
+
+def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:
+    """Every run of some files; those that hold one signal each of the same time get a warning."""
+    tables = [run for path in paths for run in Table.every_run(path, layout)]
+    alone = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED and _is_alone(t)]
+    for other in alone[1:]:
+        if np.isin(other.times, alone[0].times).mean() > 0.5:
+            other._warnings.append(
+                f"{other.path}: is of the time of {alone[0].path}; if each of them is of another signal of one "
+                f"machine, write them as columns of one file"
+            )
+    return tables
+
+
+def _is_alone(table: Table) -> bool:
+    """Whether it holds one column of numbers."""
+    return [column.dtype.kind in "OM" for column in table.columns_by_field.values()].count(False) == 1
+
+
+def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> tuple[int, str]:
+    """Rows that a time usually has, and the column of few values that tells them apart, if there is one."""
+    _, rows = np.unique(times, return_counts=True)
+    number = int(np.median(rows))
+    for name, column in columns.items():
+        if column.ndim > 1:
+            continue
+        names, which = np.unique(column.astype(str) if column.dtype.kind == "O" else column, return_inverse=True)
+        if 2 <= len(names) <= 2 * number and len(np.unique(np.column_stack([times, which]), axis=0)) == len(times):
+            return number, name
+    return number, ""
 
 
 def _file_and_run(path: Path) -> tuple[Path, str | None]:
