@@ -196,13 +196,13 @@ _NEARLY = 0.999
 def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidate]:
     """Leave out what moves as another candidate of the same topic does; returns the rest.
 
-    `exact`: only what is another one but for scale, offset and rounding. Of two sensors that move together, each shows
-    the faults of the other.
+    `exact`: only what is another one but for scale, offset and the last digits: of two sensors that move together, each
+    shows the faults of the other.
     """
     kept: list[Candidate] = []
-    may, same = _may_move_with(pool), _is_copy if exact else _moves_with
+    may = _may_move_with(pool)
     for candidate in pool:
-        if twin := next((c for c in kept if (id(c), id(candidate)) in may and same(candidate, c)), None):
+        if twin := next((c for c in kept if (id(c), id(candidate)) in may and _moves_with(candidate, c, exact)), None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
@@ -237,25 +237,19 @@ def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
     return may
 
 
-def _moves_with(one: Candidate, other: Candidate) -> bool:
+def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
     a, b = np.concatenate(one.values), np.concatenate(other.values)
     if one.topic != other.topic or len(a) != len(b):
         return False
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
-    return bool(len(a) > 2 and np.ptp(a) > 0 and np.ptp(b) > 0 and abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
-
-
-def _is_copy(one: Candidate, other: Candidate) -> bool:
-    """Whether a line through the other's numbers gives these, but for the last digit of both."""
-    a, b = np.concatenate(one.values), np.concatenate(other.values)
-    both = np.isfinite(a) & np.isfinite(b)
-    if len(a) != len(b) or both.sum() < 3 or not all(np.ptp(v[both]) for v in (a, b)):
+    if len(a) <= 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return False
-    slope, offset = np.polyfit(b[both], a[both], 1)
-    digits = [float(np.diff(np.unique(v[both])).min()) for v in (a, b)]
-    off = np.abs(a - slope * b - offset)[both].max()
-    return bool(off <= digits[0] + abs(slope) * digits[1] + 1e-9 * np.ptp(a[both]))
+    if not exact:
+        return bool(abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
+    slope, offset = np.polyfit(b, a, 1)
+    last_digits = np.diff(np.unique(a)).min() + abs(slope) * np.diff(np.unique(b)).min()
+    return bool(np.abs(a - slope * b - offset).max() <= last_digits + 1e-9 * np.ptp(a))
 
 
 ALIKE = 0.8
@@ -311,7 +305,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     steps = steps_of(pool, every, used)
     N = len(steps.X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(_driven(pool, every, used), used, _Room.of(room // 2, MOST, "controls"))
+    used = _strongest(_driven(pool, every, used, 0), used, _Room.of(room // 2, MOST, "controls"))
     steps = steps_of(pool, every, used)
     states_room = _Room.of(room - len(used), MOST, "states")
     if N < FEWEST:
