@@ -93,12 +93,6 @@ def test_of_two_that_which_calls_fewer_states_frozen_counts() -> None:
     assert list(both.to_dict().values()) == [[1.0, 0.25], [7.0, 4.0], [8.0, 5.0], [9.0, 6.0], [1200.0, 0.0]]
 
 
-def test_the_recordings_of_the_fit_raise_no_alarm(model: UncertainLTI) -> None:
-    for transient in (run(1), run(2, rest=(3.0, 4.0))):
-        verdicts = EnvelopeMonitor(model).check(transient)
-        assert not (verdicts.frozen.any() or verdicts.repeating.any() or verdicts.alarm.any())
-
-
 @pytest.mark.parametrize("state", [0, 1, slice(None)])
 def test_a_held_state_is_reported_while_the_machine_moves(model: UncertainLTI, state: int | slice) -> None:
     late = []
@@ -326,16 +320,6 @@ def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     assert f"{said}while {model.control_names[0]} moved" in check_text(check_data(model, verdicts))
 
 
-def test_jitter_of_the_steps_makes_no_repeat_longer() -> None:
-    """Each value comes twice, as in the fit, whose longest step was a little shorter."""
-    t = np.cumsum(np.tile([0.0099, 0.0101], 100))
-    transient = Transient(t, np.repeat(np.arange(100.0), 2)[:, None], np.zeros((200, 1)))
-    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[2.0], repeats=Repeats([0.01], [40.0], [40.0], [1e9]))
-    assert not EnvelopeMonitor(model).check(transient).repeating.any()
-    short = model.replace(repeats=Repeats([0.0], [40.0], [40.0], [1e9]))
-    assert EnvelopeMonitor(short).check(transient).repeating.any()
-
-
 def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:
     model = fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise", horizons=[2, 5])
     frozen = held(run(12), 0, 200, 350)
@@ -417,23 +401,6 @@ def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -
     off = off.replace(x=np.where(np.arange(61)[:, None] > 30, 0.0, off.x), u=np.where(off.t[:, None] > 20, 0.0, off.u))
     verdicts = EnvelopeMonitor(model).check(off)
     assert verdicts.repeating[32:].all() and not verdicts.frozen.any()
-
-
-def test_a_parked_machine_is_not_frozen_by_its_noise() -> None:
-    """Every state repeats there; one alone does not, whatever the others do before they stop."""
-    repeats = Repeats([0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [LARGEST] * 2, [5000.0] * 2)
-    zeros = np.zeros((2, 2))
-    model = UncertainLTI(zeros, zeros[:, :1], zeros, zeros[:, :1], v=[0.5, 0.5], repeats=repeats)
-    noise = np.random.default_rng(1).normal(1.0, 0.1, (300, 2))
-    parked, stopping, stuck = noise.copy(), noise.copy(), noise.copy()
-    parked[100:] = parked[100]
-    stopping[100:, 0], stopping[120:, 1] = stopping[100, 0], stopping[120, 1]
-    stuck[100:, 0] = stuck[100, 0]
-    for x, frozen in ((parked, []), (stopping, []), (stuck, list(range(125, 300)))):
-        transient = Transient(0.01 * np.arange(300), x, np.zeros((300, 1)))
-        verdicts = EnvelopeMonitor(model).check(transient)
-        assert np.flatnonzero(verdicts.frozen.any(axis=1)).tolist() == frozen
-        assert verdicts.repeating[299].any() or frozen
 
 
 @pytest.mark.parametrize("recur", [False, True])

@@ -212,12 +212,6 @@ def test_predicted_bounds_are_those_that_will_be_judged(seed: int, n: int, m: in
     assert lower.tobytes() == verdict.lower.tobytes() and upper.tobytes() == verdict.upper.tobytes()
 
 
-def test_what_is_given_replaces_the_rule_of_the_model() -> None:
-    model = scalar(alarm_rule=AlarmRule(2, 5, 1.5))
-    assert EnvelopeMonitor(model).rule == AlarmRule(2, 5, 1.5)
-    assert EnvelopeMonitor(model, violations=3, margin=1.0).rule == AlarmRule(3, 5, 1.0)
-
-
 def test_a_transient_of_other_size_is_refused() -> None:
     transient = Transient([0.0, 1.0], np.zeros((2, 2)), np.zeros((2, 1)), name="run")
     with pytest.raises(ModelError, match="run: 2 states and 1 control, and the model has 1 and 0"):

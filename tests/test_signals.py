@@ -159,16 +159,6 @@ def test_every_path_that_is_offered_can_be_read(type_name: str, side: str) -> No
         assert isinstance(path.read(message), float)
 
 
-@both
-def test_a_name_that_moves_in_the_name_array_is_followed(side: str) -> None:
-    path = FieldPath("position[core]")
-    names = ["fan", "core", "burner"]
-    for order in ([0, 1, 2], [1, 0, 2], [2, 0], [0, 2, 1], []):
-        content = {"name": [names[i] for i in order], "position": [float(i) for i in order]}
-        value = path.read(MESSAGES[side]("sensor_msgs/msg/JointState", content))
-        assert value == 1.0 if 1 in order else math.isnan(value)
-
-
 # --- angles -------------------------------------------------------------------------------------------------
 
 angle = st.floats(-3.1, 3.1)

@@ -181,17 +181,6 @@ def test_lists_and_other_layouts_are_the_same_numbers() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_missing_changes_nothing(kind: str) -> None:
-    rng = np.random.default_rng(3)
-    rows, dt = rng.normal(size=(200, 3)), np.full(200, 0.01)
-    without = np.insert(rows, [50, 50, 120], np.nan, axis=0)
-    _, plain = statistic(kind, 0.2).push_all(dt, rows)
-    alarm, broken = statistic(kind, 0.2).push_all(np.full(203, 0.01), without)
-    assert np.delete(broken, [50, 51, 122], axis=0).tobytes() == plain.tobytes()
-    assert broken[51].tobytes() == broken[49].tobytes() and alarm[51] == alarm[49]
-
-
-@pytest.mark.parametrize("kind", KINDS)
 def test_what_one_state_misses_changes_nothing_of_it_nor_of_the_others(kind: str) -> None:
     """Its window holds what it has; states that are seen together have no verdict."""
     rng = np.random.default_rng(4)
