@@ -9,8 +9,6 @@
 
 """MCAP files for tests, written with the `mcap` library and damaged on purpose afterwards."""
 
-from __future__ import annotations
-
 import io
 import os
 import struct
@@ -96,6 +94,12 @@ def message(type_name: str, **fields: Any) -> Any:
     return JAZZY.types[type_name](**fields)
 
 
+def array(values: Any, type_name: str = "std_msgs/msg/Float64MultiArray") -> bytes:
+    """CDR of an array message without a layout."""
+    layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+    return cdr(type_name, layout=layout, data=np.asarray(values))
+
+
 def header(stamp_ns: int, frame: str = "") -> Any:
     stamp = message("builtin_interfaces/msg/Time", sec=stamp_ns // 10**9, nanosec=stamp_ns % 10**9)
     return message("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
@@ -108,20 +112,13 @@ def write(topics: Iterable[Topic], messages: Iterable[Message], layout: Layout =
     """
     stream = io.BytesIO()
     written = list(messages)
-    writer = Writer(
-        stream,
-        chunk_size=layout.chunk_size,
-        compression=COMPRESSIONS[layout.compression],
-        index_types=IndexType.ALL if layout.indexes else IndexType.NONE,
-        repeat_channels=layout.summary,
-        repeat_schemas=layout.summary,
-        use_chunking=layout.chunked,
-        use_statistics=layout.summary,
-        use_summary_offsets=layout.summary,
-        enable_crcs=layout.checksums,
-        # Of channels without any message outside chunks the library writes a wrong one.
-        enable_data_crcs=layout.checksums and (layout.chunked or bool(written)),
-    )
+    of_summary = "repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets"
+    flags = dict.fromkeys(of_summary, layout.summary) | {"use_chunking": layout.chunked}
+    # Of channels without any message outside chunks the library writes a wrong one.
+    flags |= {"enable_data_crcs": layout.checksums and (layout.chunked or bool(written))}
+    kinds = {"compression": COMPRESSIONS[layout.compression], "chunk_size": layout.chunk_size}
+    kinds |= {"index_types": IndexType.ALL if layout.indexes else IndexType.NONE}
+    writer = Writer(stream, enable_crcs=layout.checksums, **kinds, **flags)
     writer.start(profile="ros2", library="uncertain-lti tests")
     channels: dict[str, list[int]] = {}
     for topic in topics:
@@ -154,9 +151,8 @@ def write_folder(folder: Path, parts: Mapping[str, File], metadata: str | None =
 def metadata_yaml(names: Iterable[str], storage: str = "mcap") -> str:
     """What of a rosbag2 metadata.yaml says which files a recording has."""
     listed = "".join(f"    - {name}\n" for name in names)
-    return (
-        f"rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: {storage}\n  relative_file_paths:\n{listed}"
-    )
+    about = f"rosbag2_bagfile_information:\n  version: 9\n  storage_identifier: {storage}\n  relative_file_paths:\n"
+    return about + listed
 
 
 @dataclass(frozen=True)

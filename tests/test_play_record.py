@@ -9,8 +9,6 @@
 
 """`play` and `record` through real topics: what comes out is what went in."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -24,7 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bag_writer import JAZZY, Message, Topic, cdr, float64, header, message, ramp, write
+from bag_writer import JAZZY, Message, Topic, cdr, float64, header, joint_state, message, ramp, write
 from conftest import ROOT
 from rosbags.highlevel import AnyReader
 from rosbags.typesys.store import Typestore
@@ -122,9 +120,8 @@ def some_messages(number: int) -> dict[str, Any]:
     pose = PoseWithCovarianceStamped(header=Header(stamp=stamp, frame_id="map"))
     pose.pose.pose.orientation.z = 0.1 * number
     pose.pose.covariance = np.arange(36) * 0.1 + number
-    status = DiagnosticStatus(
-        level=b"\x02", name="a", message="ü", hardware_id="", values=[KeyValue(key="k", value=str(number))]
-    )
+    values = [KeyValue(key="k", value=str(number))]
+    status = DiagnosticStatus(level=b"\x02", name="a", message="ü", hardware_id="", values=values)
     array = Float64MultiArray(data=[float(number), float("nan"), float("inf")])
     array.layout = MultiArrayLayout(dim=[MultiArrayDimension(label="x", size=3, stride=1)], data_offset=number)
     joints = JointState(header=Header(stamp=stamp), name=["a", "b"], position=[1.0 / (number + 1), -2.0])
@@ -181,9 +178,8 @@ def test_what_was_published_is_what_the_file_holds(world: World, tmp_path: Path)
     assert decoded["/status"][7].status[1].values[0].value == "7"
 
     with AnyReader([output]) as reader:  # another reader, from the definitions in the file
-        assert {c.topic: c.msgtype for c in reader.connections} == {
-            t: f"{type(m).__module__.split('.')[0]}/msg/{type(m).__name__}" for t, m in first.items()
-        }
+        kinds = {t: f"{type(m).__module__.split('.')[0]}/msg/{type(m).__name__}" for t, m in first.items()}
+        assert {c.topic: c.msgtype for c in reader.connections} == kinds
         store: Typestore = reader.typestore
         read = [(c.topic, store.deserialize_cdr(data, c.msgtype)) for c, _, data in reader.messages()]
     assert [m.data for topic, m in read if topic == "/text"] == ["x" * number for number in range(20)]
@@ -243,9 +239,7 @@ def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> N
         (["", "-o", "x.mcap", "--wait", "0.2"], "'' is no topic name"),
     ],
 )
-def test_what_cannot_be_recorded_is_said_in_a_sentence(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], sentence: str
-) -> None:
+def test_what_cannot_be_recorded_is_said_in_a_sentence(command, tmp_path, monkeypatch, arguments, sentence):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there.mcap").write_bytes(b"old")
     status, said = command("record", *arguments)
@@ -262,9 +256,7 @@ def test_a_recording_of_silence_is_said_and_leaves_no_file(world: World, tmp_pat
     assert not list(tmp_path.glob("*.mcap*"))
 
 
-def test_a_domain_without_ports_is_refused_by_the_commands_too(
-    command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_domain_without_ports_is_refused_by_the_commands_too(command, tmp_path, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "233")
     status, said = command("record", "/a", "--output", tmp_path / "x.mcap")
     assert status == 2 and "ROS_DOMAIN_ID is 233; choose one from 0 to 232" in said
@@ -278,11 +270,7 @@ def mixed_bag(path: Path, number: int = 300, step_ns: int = 4_000_000) -> Path:
     messages = []
     for k in range(number):
         t = START_NS + k * step_ns
-        stamp = header(t - 7)
-        joints = cdr(
-            "sensor_msgs/msg/JointState", header=stamp, name=["a"], position=rng.normal(size=1),
-            velocity=np.empty(0), effort=np.empty(0),
-        )  # fmt: skip
+        joints = joint_state(t - 7, rng.normal(size=1), ["a"])
         messages.append(Message("/joints", t, joints))
         messages.append(Message("/number", t + int(rng.integers(0, step_ns)), float64(float(k))))
         if k % 10 == 0:
@@ -311,9 +299,7 @@ def test_played_and_recorded_again_every_message_has_the_same_bytes(world: World
 
 
 @pytest.mark.parametrize("rate", [0.5, 1.0, 2.0])
-def test_each_message_goes_out_at_its_time_and_after_a_delay_in_no_burst(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rate: float
-) -> None:
+def test_each_message_goes_out_at_its_time_and_after_a_delay_in_no_burst(tmp_path, monkeypatch, rate):
     """By a clock that only sleeping and a delay on the way move."""
     now = [1000.0]
     monkeypatch.setattr(player, "time", SimpleNamespace(monotonic=lambda: now[0], sleep=lambda s: add(now, s)))
@@ -504,10 +490,8 @@ def arrays(bag: Bag) -> tuple[list[int], np.ndarray, list[int], np.ndarray]:
     found: list[Any] = []
     for topic in (STATE_TOPIC, CONTROL_TOPIC):
         read = [m for _, _, m in bag.messages([topic])]
-        found += [
-            [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in read],
-            np.array([m.position for m in read]),
-        ]
+        stamps = [m.header.stamp.sec * 10**9 + m.header.stamp.nanosec for m in read]
+        found += [stamps, np.array([m.position for m in read])]
     return tuple(found)  # type: ignore[return-value]
 
 
@@ -532,9 +516,7 @@ def drawn_as(bag: Bag, make: Callable[[int], Transient]) -> Transient:
     ],
     ids=["plant", "turbofan"],
 )
-def test_the_plant_is_recorded_to_the_last_bit(
-    world: World, tmp_path: Path, node: str, given: dict[str, Any], make: Callable[[int], Transient]
-) -> None:
+def test_the_plant_is_recorded_to_the_last_bit(world, tmp_path, node, given, make):
     output = tmp_path / "plant.mcap"
     recording = world.command("record", STATE_TOPIC, CONTROL_TOPIC, "--output", output)
     world.run_node(node, given).succeed()

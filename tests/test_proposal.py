@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from bag_writer import Message, Topic, cdr, header, joint_state, message, write
+from bag_writer import Message, Topic, array, cdr, header, joint_state, message, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import bounded
@@ -35,8 +35,18 @@ JOINT, POSE_2D = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Pose2D"
 MS = 10**6
 
 
+def at(k):
+    """When the messages of sample k come, 50 Hz."""
+    return 10**18 + k * 20 * MS
+
+
 def f64(topic, t_ns, value):
     return Message(topic, t_ns, cdr(FLOAT64, data=float(value)), t_ns)
+
+
+def beside(topic, value):
+    """What `driven` sends as well: a number of the state and the command."""
+    return lambda k, x, u: [f64(topic, at(k), value(x, u))]
 
 
 def pose(topic, t_ns, yaw):
@@ -56,7 +66,7 @@ def driven(names=("/plant/state", "/plant/cmd"), count=400, seed=0, extra=lambda
     x, u, messages = 0.0, [0.0] * 9, []
     for k in range(count):
         u.append(float(rng.normal()) if k % 37 == 0 else u[-1])
-        t = 10**18 + k * 20 * MS
+        t = at(k)
         messages += [f64(names[0], t, x + 1e-3 * rng.normal()), f64(names[1], t, u[-1]), *extra(k, x, u[-1])]
         x += 0.02 * (-2.0 * x + 3.0 * u[-1 - late])
     return messages
@@ -85,6 +95,11 @@ def signals_of(proposal):
     return [(c.topic, c.path) for c in proposal.states], [(c.topic, c.path) for c in proposal.controls]
 
 
+def csv(path, names, rows):
+    path.write_text("\n".join(",".join(map(str, row)) for row in [names, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
 # --- real machines ----------------------------------------------------------------------------------------------
 
 REAL = {
@@ -111,9 +126,8 @@ def test_real_recordings_fit_unedited(recordings, name):
     model = fitted([path], proposal)
     assert model.fit_summary["violations"] == 0
     assert "vector.y" not in controls and "twist.angular.z" not in states - wanted_states
-    assert not any("better when it is taken" in m or "like noise" in m for m in model.fit_summary["messages"]), (
-        proposal.text
-    )
+    said = " ".join(model.fit_summary["messages"])
+    assert "better when it is taken" not in said and "like noise" not in said, proposal.text
     if name in ("cougars_auv/SO_bag_0", "hunter_se/straight_odd_t_0_5_run_01"):  # depth is pressure; a rate is noise
         assert len(states) == 1
 
@@ -125,26 +139,21 @@ def test_a_memory_that_covers_the_other_recording_is_proposed_though_one_is_left
 
 
 def test_names_keep_the_letters_of_any_alphabet(tmp_path):
-    x, path = 0.0, tmp_path / "a.csv"
-    with open(path, "w", encoding="utf-8") as stream:
-        stream.write("Zeit,Größe [mm],油门\n")
-        for k in range(400):
-            u = math.copysign(1.0, math.sin(k / 17))
-            stream.write(f"{0.02 * k:.2f},{x:.5f},{u}\n")
-            x += 0.02 * (-2.0 * x + 3.0 * u) + 0.002 * math.sin(7 * k)
-    proposal = propose([path])
+    x, rows = 0.0, []
+    for k in range(400):
+        u = math.copysign(1.0, math.sin(k / 17))
+        rows.append((f"{0.02 * k:.2f}", f"{x:.5f}", u))
+        x += 0.02 * (-2.0 * x + 3.0 * u) + 0.002 * math.sin(7 * k)
+    proposal = propose([csv(tmp_path / "a.csv", ["Zeit", "Größe [mm]", "油门"], rows)])
     assert [c.name for c in (*proposal.states, *proposal.controls)] == ["größe_mm", "c_油门"]
 
 
 def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
     """Else no fit could read both; the others keep their places."""
-
-    def extra(k, x, u):
-        return [f64("/plant/more_state", 10**18 + k * 20 * MS, 2 * x)]
-
+    more = beside("/plant/more_state", lambda x, u: 2 * x)
     paths = [
         save(tmp_path / "a.mcap", driven(), {}),
-        save(tmp_path / "b.mcap", driven(seed=1, extra=extra), {}),
+        save(tmp_path / "b.mcap", driven(seed=1, extra=more), {}),
         save(tmp_path / "c.mcap", driven(seed=2), {"/plant/more_state": FLOAT64}),
     ]
     for order in (paths, paths[::-1]):
@@ -169,11 +178,7 @@ def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
     import uncertain_lti.proposal.init as module
 
     monkeypatch.setattr(module, "MOST_VALUES", 900)
-
-    def extra(k, x, u):
-        return [f64("/plant/z_state", 10**18 + k * 20 * MS, 2 * x)]
-
-    proposal = proposed(tmp_path, driven(extra=extra))[1]
+    proposal = proposed(tmp_path, driven(extra=beside("/plant/z_state", lambda x, u: 2 * x)))[1]
     assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
     assert "too large" in proposal.text
 
@@ -199,10 +204,8 @@ def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_
     path = write(topics, messages).save(tmp_path / "run.mcap")
     proposal = propose([path])
     assert not proposal.controls and "by correlation" not in proposal.text
-    told = [
-        text for text in proposal.warnings if text.startswith(f"{other} is a command by its name, and cannot be read")
-    ]
-    assert len(told) == (not measured)
+    words = f"{other} is a command by its name, and cannot be read"
+    assert sum(text.startswith(words) for text in proposal.warnings) == (not measured)
 
 
 @pytest.mark.parametrize(
@@ -216,9 +219,10 @@ def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
 
 
-@pytest.mark.parametrize(
-    ("column", "role"), [("q_des1", "reference"), ("tau_des", "reference"), ("description", "state")]
-)
+COLUMNS = [("q_des1", "reference"), ("tau_des", "reference"), ("description", "state")]
+
+
+@pytest.mark.parametrize(("column", "role"), COLUMNS)
 def test_what_is_desired_is_a_reference(column, role):
     assert role_of_column(column) == role
 
@@ -242,10 +246,8 @@ def test_a_cascade_keeps_every_tank(tmp_path):
     for k in range(600):
         u = float(rng.normal()) if k % 40 == 0 else u
         t = 10**18 + k * 100 * MS
-        level = list(x + 1e-4 * rng.normal(size=3))
-        layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-        messages += [Message("/tanks/level", t, cdr(ARRAY, layout=layout, data=np.array(level)), t)]
-        messages += [f64("/tanks/pump_cmd", t, u)]
+        level = x + 1e-4 * rng.normal(size=3)
+        messages += [Message("/tanks/level", t, array(level), t), f64("/tanks/pump_cmd", t, u)]
         x = x + 0.1 * np.array([u - x[0], x[0] - x[1], x[1] - 0.8 * x[2]])
     proposal = proposed(tmp_path, messages, {"/tanks/level": ARRAY})[1]
     assert [c.path for c in proposal.states] == ["data[0]", "data[1]", "data[2]"], proposal.text
@@ -265,7 +267,7 @@ def test_angles_are_unwrapped(tmp_path, kind, sent, field):
     yaw, rate, messages = 0.0, 1.0, []
     for k in range(800):
         rate = float(rng.uniform(0.2, 3.0)) if k % 50 == 0 else rate
-        t = 10**18 + k * 20 * MS
+        t = at(k)
         messages += [sent(t, yaw), f64("/body/rate_cmd", t, rate)]
         yaw += 0.02 * rate
     path, proposal = proposed(tmp_path, messages, {"/body/state": kind})
@@ -276,12 +278,11 @@ def test_angles_are_unwrapped(tmp_path, kind, sent, field):
 
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     def extra(k, x, u):
-        t = 10**18 + k * 20 * MS
-        layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-        values = np.array([x, 7.0, math.nan, float(k), math.inf if k < 390 else x, x])
+        t = at(k)
+        values = [x, 7.0, math.nan, float(k), math.inf if k < 390 else x, x]
         return [
-            Message("/plant/all_state", t, cdr(ARRAY, layout=layout, data=values), t),
-            Message("/plant/big_state", t, cdr(ARRAY, layout=layout, data=np.full(LONGEST_ARRAY + 1, x)), t),
+            Message("/plant/all_state", t, array(values), t),
+            Message("/plant/big_state", t, array(np.full(LONGEST_ARRAY + 1, x)), t),
             Message("/plant/talk", t, cdr("std_msgs/msg/String", data="x"), t),
         ]
 
@@ -307,13 +308,8 @@ def test_no_command_leaves_the_controls_empty(tmp_path):
 
 def test_commands_that_come_now_and_then(tmp_path):
     """Five commands in the run: held until the next one."""
-    messages, last = [], None
-    for m in driven(count=600):
-        if m.topic == "/plant/cmd":
-            if m.data == last:
-                continue
-            last = m.data
-        messages.append(m)
+    every = driven(count=600)  # state, command, state, ...
+    messages = [m for k, m in enumerate(every) if m.topic != "/plant/cmd" or k < 2 or m.data != every[k - 2].data]
     path, proposal = proposed(tmp_path, messages)
     assert [c.topic for c in proposal.controls] == ["/plant/cmd"]
     assert "max_hold" not in yaml.safe_load(proposal.text)["controls"][0]
@@ -341,7 +337,7 @@ def test_topics_and_names_that_yaml_would_misread(tmp_path):
     rng = np.random.default_rng(0)
     x, messages = np.zeros(4), []
     for k in range(400):
-        t = 10**18 + k * 20 * MS
+        t = at(k)
         u = rng.normal()
         messages += [Message("/j/states", t, joint_state(t, x, names), t), f64("/j/cmd", t, u)]
         x = x + 0.02 * (-np.arange(1, 5) * x + u) + 1e-3 * rng.normal(size=4)
@@ -353,9 +349,8 @@ def test_topics_and_names_that_yaml_would_misread(tmp_path):
 def test_nothing_to_propose_is_said(tmp_path):
     messages = [Message("/talk", k, cdr("std_msgs/msg/String", data="x"), k) for k in range(50)]
     path = save(tmp_path / "a.mcap", messages, {"/talk": "std_msgs/msg/String"})
-    with pytest.raises(
-        BagError, match="looks like the state of a machine .*; record .* in `uncertain-lti init --states`"
-    ):
+    words = "looks like the state of a machine .*; record .* in `uncertain-lti init --states`"
+    with pytest.raises(BagError, match=words):
         propose([path])
 
 
@@ -366,9 +361,8 @@ def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, cli):
     for k in range(300):
         u = float(np.sign(np.sin(k / 15)))
         for i, name in enumerate(("arm", "hand")):
-            messages.append(
-                Message("/joint_states", 20 * MS * k + i * MS, joint_state(20 * MS * k + i * MS, [x[i]], [name]))
-            )
+            t = 20 * MS * k + i * MS
+            messages.append(Message("/joint_states", t, joint_state(t, [x[i]], [name])))
         messages.append(f64("/cmd", 20 * MS * k + 2 * MS, u))
         x += 0.1 * (np.array([u, -u]) - x) + 0.01 * rng.normal(size=2)
     path = save(tmp_path / "a.mcap", messages, {"/joint_states": JOINT, "/cmd": FLOAT64})
@@ -386,13 +380,12 @@ def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, cli):
 
 def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     """Nothing before tells of its changes: `fit` said to take away the `judged: true` that `init` wrote."""
-    rng, x, rows = np.random.default_rng(0), 0.0, ["time,Pump_speed_cmd,Valve_cmd,Flow"]
+    rng, x, rows = np.random.default_rng(0), 0.0, []
     for k, speed in enumerate(np.repeat(rng.uniform(0.2, 1.0, 15), 60).tolist()):
         valve = 0.5 + 0.1 * (1.0 - x)  # by a controller
-        rows.append(f"{k},{speed:.3f},{valve:.4f},{x + 0.01 * rng.normal():.4f}")
+        rows.append((k, f"{speed:.3f}", f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
         x += 0.2 * (speed + valve - x)
-    (tmp_path / "a.csv").write_text("\n".join(rows))
-    proposal = propose([tmp_path / "a.csv"])
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "Pump_speed_cmd", "Valve_cmd", "Flow"], rows)])
     assert {c.path: c.judged for c in proposal.controls} == {"Pump_speed_cmd": False, "Valve_cmd": True}
     assert "not judged, as it changes in 1.6% of the rows only" in proposal.text
     assert [c.path for c in proposal.states] == ["Flow"]
@@ -438,18 +431,16 @@ def test_a_table_of_many_columns_takes_seconds(tmp_path):
     rng = np.random.default_rng(3)
     rows, commands, measured = 1000, 30, 270
     u = np.repeat(rng.normal(size=(rows // 25, commands)), 25, axis=0)
-    tau, gain = (
-        rng.uniform(3, 40, measured),
-        rng.normal(size=(measured, commands)) * (rng.random((measured, commands)) < 0.1),
-    )
+    tau = rng.uniform(3, 40, measured)
+    gain = rng.normal(size=(measured, commands)) * (rng.random((measured, commands)) < 0.1)
     x = np.zeros((rows, measured))
     for k in range(rows - 1):
         x[k + 1] = x[k] + (gain @ u[k] - x[k]) / tau
     x += 0.005 * rng.normal(size=x.shape)
     x[:, 3], x[:, 7] = 2 * x[:, 4] + 3, x[:, 8] ** 2
     names = [f"cmd_{j}" for j in range(commands)] + [f"temp_{j}" for j in range(measured)]
-    table = np.column_stack([0.1 * np.arange(rows), u, x])
-    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header=",".join(["time", *names]), comments="", fmt="%.6g")
+    columns = dict(zip(names, np.column_stack([u, x]).T, strict=True))
+    table_of(tmp_path / "a.csv", columns, 0.1 * np.arange(rows), fmt="%.6g")
     with bounded(seconds=60):  # 400 columns took 442 s
         text = propose([tmp_path / "a.csv"]).text
     assert "temp_4: moves with temp_3" in text and "temp_7: says what temp_8 says already" in text
@@ -515,17 +506,15 @@ def test_whatever_is_recorded_gets_a_file_or_a_sentence(tmp_path_factory, data):
     for topic in data.draw(st.lists(st.sampled_from(NAMES), min_size=1, max_size=4, unique=True)):
         count, width = data.draw(st.integers(0, 120)), data.draw(st.integers(0, 30))
         kind = data.draw(st.sampled_from(["walk", "weird", "constant", "steps"]))
-        values = rng.normal(size=(count, width))
-        values = np.cumsum(values, axis=0) if kind == "walk" else values
-        values = np.round(values) if kind == "steps" else values
-        values = np.ones_like(values) if kind == "constant" else values
-        if kind == "weird":
-            values = rng.choice(np.array(WEIRD), size=values.shape)
+        steps = rng.normal(size=(count, width))
+        values = {
+            "walk": np.cumsum(steps, axis=0), "weird": rng.choice(np.array(WEIRD), size=steps.shape),
+            "constant": np.ones_like(steps), "steps": np.round(steps),
+        }[kind]  # fmt: skip
         step = data.draw(st.sampled_from([0, 1, 10**6, 10**8]))
         for k, row in enumerate(values):
             some = row[: rng.integers(0, width + 1)] if data.draw(st.booleans()) and kind == "weird" else row
-            layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-            messages.append(Message(topic, k * step, cdr(ARRAY, layout=layout, data=some), k * step))
+            messages.append(Message(topic, k * step, array(some), k * step))
     messages.sort(key=lambda m: m.log_time)
     path = save(tmp_path_factory.mktemp("odd") / "a.mcap", messages, {m.topic: ARRAY for m in messages})
     try:
@@ -556,10 +545,7 @@ def test_whatever_is_recorded_gets_a_file_or_a_sentence(tmp_path_factory, data):
 )
 def test_a_function_of_a_state_in_another_topic_is_no_second_state(tmp_path, copy, name):
     rng = np.random.default_rng(1)
-    path = save(
-        tmp_path / "run.mcap", driven(extra=lambda k, x, u: [f64(name, 10**18 + k * 20 * MS, copy(x, rng))]), {}
-    )
-    proposal = propose([path])
+    proposal = proposed(tmp_path, driven(extra=beside(name, lambda x, u: copy(x, rng))))[1]
     assert len(proposal.states) == 1, proposal.text
     (left,) = {"/plant/state", name} - {proposal.states[0].topic}
     assert f"{left} data: says what {proposal.states[0].topic} data says already" in proposal.text
@@ -567,11 +553,8 @@ def test_a_function_of_a_state_in_another_topic_is_no_second_state(tmp_path, cop
 
 def test_noise_is_no_state(tmp_path):
     rng = np.random.default_rng(2)
-
-    def extra(k, x, u):
-        return [f64("/plant/temperature", 10**18 + k * 20 * MS, 20.0 + 0.1 * rng.normal() + 0.02 * u)]
-
-    proposal = proposed(tmp_path, driven(count=2000, extra=extra))[1]
+    noise = beside("/plant/temperature", lambda x, u: 20.0 + 0.1 * rng.normal() + 0.02 * u)
+    proposal = proposed(tmp_path, driven(count=2000, extra=noise))[1]
     assert [c.topic for c in proposal.states] == ["/plant/state"], proposal.text
     (line,) = [line for line in proposal.text.splitlines() if "/plant/temperature" in line]
     assert "noise: one sample predicts" in line or "the controls do not show" in line
@@ -579,7 +562,7 @@ def test_noise_is_no_state(tmp_path):
 
 def test_a_recording_of_noise_alone_says_so(tmp_path, cli):
     rng = np.random.default_rng(3)
-    messages = [f64("/plant/state", 10**18 + k * 20 * MS, 1.0 + 0.1 * rng.normal()) for k in range(500)]
+    messages = [f64("/plant/state", at(k), 1.0 + 0.1 * rng.normal()) for k in range(500)]
     path, proposal = proposed(tmp_path, messages)
     assert len(proposal.states) == 1 and "# Beware: nothing here is more than noise" in proposal.text
     assert "record the machine at work" in cli("init", path).err
@@ -613,7 +596,7 @@ def swinging(count=900):
     y, v, u, messages = 0.0, 0.0, 0.0, []
     for k in range(count):
         u = float(rng.normal()) if k % 40 == 0 else u
-        t = 10**18 + k * 20 * MS
+        t = at(k)
         messages += [f64("/plant/state", t, y + 1e-5 * rng.normal()), f64("/plant/cmd", t, u)]
         v += 0.02 * (-40.0 * y - v + u)
         y += 0.02 * v
@@ -622,11 +605,9 @@ def swinging(count=900):
 
 def test_a_rate_that_is_not_recorded_is_proposed_with_what_it_gains(tmp_path):
     path, proposal = proposed(tmp_path, swinging())
-    entry = yaml.safe_load(proposal.text)["states"][1]
-    assert entry["field"] in ("rate(data)", "lag(data, 1)") and "on left-out data" in proposal.text
-    blind = SignalMap.from_dict(
-        {**yaml.safe_load(proposal.text), "states": yaml.safe_load(proposal.text)["states"][:1]}
-    )
+    data = yaml.safe_load(proposal.text)
+    assert data["states"][1]["field"] in ("rate(data)", "lag(data, 1)") and "on left-out data" in proposal.text
+    blind = SignalMap.from_dict(data | {"states": data["states"][:1]})
     width = [m.fit_summary["mean_width"][0] for m in (fitted([path], proposal), fit(read_transients(path, blind)))]
     assert width[0] < 0.3 * width[1]
 
@@ -649,18 +630,19 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
 
 
 def test_a_column_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path):
-    rows = [f"{0.1 * k},{np.sin(k)},{np.cos(2 * k)}" for k in range(100)]
-    (tmp_path / "run.csv").write_text("\n".join(["time,speed,u", *rows]))
-    with pytest.raises(BagError, match="a field is asked for with its topic, /table:speed$"):
-        propose([tmp_path / "run.csv"], states=["speed"])
-    with pytest.raises(BagError, match="topics there: /table$"):
-        propose([tmp_path / "run.csv"], states=["none"])
+    path = csv(tmp_path / "run.csv", ["time", "speed", "u"], [(0.1 * k, np.sin(k), np.cos(2 * k)) for k in range(100)])
+    for asked, words in (
+        ("speed", "a field is asked for with its topic, /table:speed$"),
+        ("none", "topics there: /table$"),
+    ):
+        with pytest.raises(BagError, match=words):
+            propose([path], states=[asked])
 
 
-def table_of(path, columns, time=None):
+def table_of(path, columns, time=None, fmt="%.18e"):
     time = 0.01 * np.arange(len(next(iter(columns.values())))) if time is None else time
     rows = np.column_stack([time, *columns.values()])
-    np.savetxt(path, rows, delimiter=",", header=",".join(["time", *columns]), comments="")
+    np.savetxt(path, rows, delimiter=",", header=",".join(["time", *columns]), comments="", fmt=fmt)
     return path
 
 
@@ -762,7 +744,7 @@ def joints(still=""):
     for k in range(500):
         if k % 20 == 0:
             u = rng.uniform(-1.0, 1.0, 3) * moves
-        t = 10**18 + k * 20 * MS
+        t = at(k)
         for topic, values in (("/joint_states", x), ("/joint_commands", u)):
             messages.append(Message(topic, t, joint_state(t, values, names), t))
         x = x + (0.1 * (u - x) + 1e-3 * rng.standard_normal(3)) * moves
@@ -798,17 +780,16 @@ def test_what_a_person_may_want_of_a_body_is_one_letter_away(recordings):
     assert run.x.shape[1] == 3 and run.usable.sum() > 120
 
 
-def trials(path, column, ids, restart=True, rows=60):
+def trials(path, column, ids, restart=True, per_run=60):
     """A table of runs; `column` says which a row is of."""
-    lines, time, x = [f"{column},t,speed,command"], 0, 0.0
+    rows, time, x = [], 0, 0.0
     for number in ids:
-        for k in range(rows):
-            u = math.copysign(1.0 + 0.3 * len(lines) % 7, math.sin(len(lines) / 9))
-            lines.append(f"{number},{(k if restart else time) * 0.1:.1f},{x:.6f},{u}")
-            x += 0.1 * (u - x) + 0.003 * math.sin(11 * len(lines))
+        for k in range(per_run):
+            u = math.copysign(1.0 + 0.3 * (len(rows) + 1) % 7, math.sin((len(rows) + 1) / 9))
+            rows.append((number, f"{(k if restart else time) * 0.1:.1f}", f"{x:.6f}", u))
+            x += 0.1 * (u - x) + 0.003 * math.sin(11 * (len(rows) + 1))
             time += 1
-    path.write_text("\n".join(lines) + "\n")
-    return path
+    return csv(path, [column, "t", "speed", "command"], rows)
 
 
 def test_a_servo_whose_command_comes_in_the_row_of_its_answer_is_a_state(tmp_path):
@@ -829,13 +810,12 @@ def test_a_servo_whose_command_comes_in_the_row_of_its_answer_is_a_state(tmp_pat
 @pytest.mark.parametrize("moves", [True, False])
 def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, moves):
     rng = np.random.default_rng(4)
-    valve, level, lines = 0.0, 0.0, ["time,valve,level"]
+    valve, level, rows = 0.0, 0.0, []
     for k in range(600):
         valve = float(rng.choice([0.0, 0.4, 1.0])) if k % 25 == 0 else valve
-        lines.append(f"{0.1 * k:.1f},{valve},{level:.6f}")
+        rows.append((f"{0.1 * k:.1f}", valve, f"{level:.6f}"))
         level += 0.1 * ((valve if moves else 0.0) - 0.5 * level) + 1e-3 * rng.standard_normal()
-    path = tmp_path / "tank.csv"
-    path.write_text("\n".join(lines) + "\n")
+    path = csv(tmp_path / "tank.csv", ["time", "valve", "level"], rows)
     proposal = propose([path])
     commands = [c.path for c in proposal.controls]
     assert commands == (["valve"] if moves else []), proposal.text
@@ -860,7 +840,7 @@ def test_a_column_that_says_which_run_a_row_is_of_is_named(tmp_path, column, ids
 
 @pytest.mark.parametrize("ids", [[1, 2, 1], range(12)])
 def test_a_mode_or_a_counter_tells_no_runs_apart(tmp_path, ids):
-    path = trials(tmp_path / "modes.csv", "test", ids, restart=False, rows=60 if len(ids) == 3 else 10)
+    path = trials(tmp_path / "modes.csv", "test", ids, restart=False, per_run=60 if len(ids) == 3 else 10)
     assert "table:" not in propose([path]).text
 
 
@@ -876,8 +856,7 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         rows.append([60 * k, level, rng.normal(), pressure, on[k], flow, 0, valve, analyser, level, int(k == 700)])
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
-    path = tmp_path / "plant.csv"
-    path.write_text(",".join(names) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    path = csv(tmp_path / "plant.csv", names, rows)
     proposal = propose([path])
     assert [c.name for c in proposal.states] == ["Level1", "Temp"], proposal.text
     why = {c.name: c.why for c in proposal.controls}
@@ -908,8 +887,7 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
         load += 0.1 * (target - load) + 0.05 * brake + 0.01 * rng.normal()
     names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Angle_of_Attack", "Brake_IN", "Released", "Idle", "Label"]
     names, rows = [*names, "class"], [[*row, "leak" if k % 500 == 9 else "normal"] for k, row in enumerate(rows)]
-    path = tmp_path / "drive.csv"
-    path.write_text(",".join(names) + "\n" + "".join(",".join(map(str, row)) + "\n" for row in rows))
+    path = csv(tmp_path / "drive.csv", names, rows)
     proposal = propose([path])
     assert [c.path for c in proposal.states] == ["Axis_ActSpeed", "Angle_of_Attack"], proposal.text
     assert [c.path for c in proposal.controls] == ["Axis_SetSpeed", "Brake_IN"], proposal.text
