@@ -9,8 +9,6 @@
 
 """A recording read message by message: the naive reference for what `read_stream` takes from blocks of messages."""
 
-from __future__ import annotations
-
 from array import array
 
 import numpy as np

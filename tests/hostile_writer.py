@@ -9,8 +9,6 @@
 
 """MCAP files that are made to hurt, seeded: well formed in parts, and wrong where parts meet."""
 
-from __future__ import annotations
-
 import random
 import struct
 from collections.abc import Callable, Sequence
@@ -62,16 +60,8 @@ def odd_name(rng: random.Random) -> str:
 
 def repeated(rng: random.Random) -> bytes:
     """One small record again and again."""
-    one = rng.choice(
-        (
-            bytes(9),
-            record(0x80),
-            record(rng.randrange(1, 256)),
-            message_record(1, 5, b""),
-            record(5, bytes(21)),
-            b"\xff" * 9,
-        )
-    )
+    kinds = [bytes(9), record(0x80), record(rng.randrange(1, 256)), message_record(1, 5, b"")]
+    one = rng.choice([*kinds, record(5, bytes(21)), b"\xff" * 9])
     return one * (rng.choice((100, 10_000, LARGEST_RUN)) // len(one))
 
 
@@ -103,9 +93,7 @@ def hostile_file(rng: random.Random, topics: Sequence[Topic], messages: Sequence
         time = rng.choice(EXTREME_TIMES) if rng.random() < 0.005 else m.log_time
         data = m.data
         if rng.random() < 0.02:
-            data = rng.choice(
-                (b"", data[:-4], data + bytes(8), zstandard.compress(data), zstandard.compress(bytes(1 << 24)))
-            )
+            data = rng.choice((b"", data[:-4], data + bytes(8), *map(zstandard.compress, (data, bytes(1 << 24)))))
         number = channels[m.topic] if rng.random() < 0.99 else rng.randrange(len(topics) + len(extra) + 2)
         every.append(message_record(number, time, data))
     size = rng.choice((7, 30, len(every)))
@@ -124,15 +112,10 @@ def hostile_file(rng: random.Random, topics: Sequence[Topic], messages: Sequence
         part = content if rng.random() < 0.1 else chunk_record(content, kind, stated=stated)
         parts.append(part)
     for _ in range(rng.choice((0, 1, 3))):
-        odd = rng.choice(
-            (
-                repeated(rng),
-                record(9, struct.pack("<QQ", 1, 2) + bytes(rng.randrange(60))),
-                record(12, struct.pack("<I", rng.choice((0, 5, 2**32 - 1))) + bytes(rng.randrange(40))),
-                record(rng.choice((2, 15, 0x80, 0xFF, 3, 4, 7, 8, 11)), bytes(rng.randrange(50))),
-                chunk_record(bytes(LARGEST_RUN)),
-            )
-        )
+        kinds = [repeated(rng), record(9, struct.pack("<QQ", 1, 2) + bytes(rng.randrange(60)))]
+        kinds.append(record(12, struct.pack("<I", rng.choice((0, 5, 2**32 - 1))) + bytes(rng.randrange(40))))
+        kinds.append(record(rng.choice((2, 15, 0x80, 0xFF, 3, 4, 7, 8, 11)), bytes(rng.randrange(50))))
+        odd = rng.choice([*kinds, chunk_record(bytes(LARGEST_RUN))])
         parts.insert(rng.randrange(len(parts) + 1), odd)
     if rng.random() < 0.4:
         at = rng.randrange(len(parts))
@@ -148,7 +131,6 @@ def hostile_file(rng: random.Random, topics: Sequence[Topic], messages: Sequence
     rng.shuffle(indexes)
     counts = {number: rng.choice((40, 40, 0, 2**62)) for number in channels.values()}
     statistics = statistics_record(counts, rng.choice((len(indexes), len(indexes), 0, 2**31)))
-    summary = b"".join(
-        rng.sample([statistics, *indexes], len(indexes) + 1) if rng.random() < 0.5 else [statistics, *indexes]
-    )
+    listed = [statistics, *indexes]
+    summary = b"".join(rng.sample(listed, len(listed)) if rng.random() < 0.5 else listed)
     return raw_file(*parts, summary=rng.choice((b"", summary, b"".join(definitions) + summary)))

@@ -14,8 +14,6 @@ topic of its own, a constant step. A stream drops, delays, repeats and damages m
 and loops. `live` takes its messages as the node does; `offline` writes them to a file and checks that as `check` does.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -70,9 +68,8 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
         Signal("q", CONTROL, "vector.y", 0.0, 1.2, type=VECTOR, delay=int(rng.integers(0, 3))),
     ]
     if may(0.5):  # only signals that remember belong to the controls
-        controls.append(
-            Signal("a_before", STATE, f"lag(position[a], {rng.integers(1, 4)})", 0.3, 1.7, type=JOINT_STATE)
-        )
+        lag = f"lag(position[a], {rng.integers(1, 4)})"
+        controls.append(Signal("a_before", STATE, lag, 0.3, 1.7, type=JOINT_STATE))
     if may(0.4):
         controls.append(Signal("b_rate", STATE, "rate(position[b])", 0.0, 9.0, type=JOINT_STATE))
     if may(0.4):
@@ -112,9 +109,8 @@ def armed_model(rng: np.random.Generator, everything: bool = False) -> Uncertain
 
     def residuals() -> Residuals:
         spread = rng.normal(size=(n, n))
-        size = (
-            1e-2 if len(lengths) == 1 else 0.3
-        )  # of the residual itself, as in files of before, or of the utilisation
+        # of the residual itself, as in files of before, or of the utilisation
+        size = 1e-2 if len(lengths) == 1 else 0.3
         return Residuals(0.1 * size * rng.normal(size=n), size**2 * (spread @ spread.T + np.eye(n)), size == 0.3)
 
     horizons = [Horizon(h, **elements(0.4), residuals=residuals()) for h in lengths]
@@ -248,9 +244,8 @@ def stream(model: UncertainLTI, rng: np.random.Generator, steps: int, disorder: 
         t += STEP_NS + int(rng.integers(-1_000_000, 1_000_000))
         if disorder.time:
             if now_and_then():  # a single stamp of another year
-                send(
-                    STATE, state_log + 400_000, joint_state(t + 365 * 86400 * 10**9 * int(rng.choice([-1, 1])), values)
-                )
+                year = 365 * 86400 * 10**9 * int(rng.choice([-1, 1]))
+                send(STATE, state_log + 400_000, joint_state(t + year, values))
             jump = 0
             if now_and_then():
                 jump = int(rng.choice([1.6, 5, 30])) * STEP_NS  # a step out of range, or a gap
@@ -268,17 +263,12 @@ def stream(model: UncertainLTI, rng: np.random.Generator, steps: int, disorder: 
 
 def deployment(model: UncertainLTI, rng: np.random.Generator) -> Rule:
     """A rule as parameters give it."""
-    return Rule(
-        masked=str(rng.choice(["", "", "b"])),
-        enable=str(
-            rng.choice(["", "", f"{GEAR} data == 1", f"{STATE} position[b] > -0.4", f"{CONTROL} vector.x < 0.5"])
-        ),
-        grace=float(rng.choice([0.0, 0.0, 0.05, 0.4])),
-        latch=bool(rng.random() < 0.2),
-        violations=int(given := rng.choice([0, 0, 2])),
-        window=3 if given else 0,
-        margin=float(rng.choice([0.0, 0.0, 1.2])),
-    )
+    conditions = ["", "", f"{GEAR} data == 1", f"{STATE} position[b] > -0.4", f"{CONTROL} vector.x < 0.5"]
+    masked, enable = str(rng.choice(["", "", "b"])), str(rng.choice(conditions))
+    grace, latch = float(rng.choice([0.0, 0.0, 0.05, 0.4])), bool(rng.random() < 0.2)
+    violations, margin = int(rng.choice([0, 0, 2])), float(rng.choice([0.0, 0.0, 1.2]))
+    counted = {"violations": violations, "window": 3 if violations else 0, "margin": margin}
+    return Rule(masked=masked, enable=enable, grace=grace, latch=latch, **counted)
 
 
 Row = dict[str, Any]
@@ -345,9 +335,8 @@ def offline(model: UncertainLTI, rule: Rule, messages: Sequence[Message], path: 
     """What `check` says of a recording of the messages in this order."""
     topics = [Topic(topic, kind) for topic, kind in KIND.items()]
     write(topics, messages, Layout("none", chunk_size=1 << 16)).save(path)
-    monitor = EnvelopeMonitor(
-        model, rule.violations or None, rule.window or None, rule.margin or None, listed_states(rule.masked)
-    )
+    given, masked = (rule.violations or None, rule.window or None, rule.margin or None), listed_states(rule.masked)
+    monitor = EnvelopeMonitor(model, *given, masked)
     deployed = DeployedMonitor(monitor, Condition.parse(rule.enable), rule.grace, rule.latch)
     verdicts, _ = check_recording(deployed, Bag(path))
     rows = []

@@ -9,8 +9,6 @@
 
 """What keeps tests apart: the processes of one are ended with it, and its ROS domain is its own meanwhile; limits."""
 
-from __future__ import annotations
-
 import ctypes
 import fcntl
 import os

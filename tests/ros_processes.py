@@ -132,9 +132,8 @@ class Process:
             self._process: Any = _Forked(code, arguments, env, log)
             return
         with open(log, "wb") as stream:
-            self._process = subprocess.Popen(
-                command, env=env, stdout=stream, stderr=stream, stdin=subprocess.DEVNULL, start_new_session=True
-            )
+            streams = {"stdout": stream, "stderr": stream, "stdin": subprocess.DEVNULL}
+            self._process = subprocess.Popen(command, env=env, start_new_session=True, **streams)
 
     @property
     def output(self) -> str:
@@ -324,9 +323,8 @@ class World:
 
     def set(self, name: str = MONITOR, **values: Any) -> tuple[bool, str]:
         """Set parameters together; whether they were accepted, and the reason."""
-        request = SetParametersAtomically.Request(
-            parameters=[Parameter(key, value=value).to_parameter_msg() for key, value in values.items()]
-        )
+        wanted = [Parameter(key, value=value).to_parameter_msg() for key, value in values.items()]
+        request = SetParametersAtomically.Request(parameters=wanted)
         result = self.call(SetParametersAtomically, f"{name}/set_parameters_atomically", request, again=20.0).result
         return result.successful, result.reason
 

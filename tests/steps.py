@@ -9,8 +9,6 @@
 
 """Transients and the steps that a sampler gives: the one as the other, and the one held against the other."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

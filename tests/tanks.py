@@ -9,8 +9,6 @@
 
 """Three tanks in a row: a small nonlinear plant for tests and benchmarks, simulated for many transients at once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -38,16 +38,10 @@ RULES = (
 
 
 def two_states(**options: Any) -> UncertainLTI:
-    return UncertainLTI(
-        -np.eye(2), np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.1, 0.2],
-        horizons=[
-            Horizon(
-                4, ZEROS, np.zeros((2, 0)), ZEROS, np.zeros((2, 0)), v=[0.3, 0.3], widths="constant",
-                residuals=Residuals([0.0, 0.2], [[3.0, 0.5], [0.5, 2.0]]),
-            )
-        ],
-        residuals=Residuals([0.0, 0.1], [[1.0, 0.5], [0.5, 2.0]]), **options,
-    )  # fmt: skip
+    none, of_four = np.zeros((2, 0)), Residuals([0.0, 0.2], [[3.0, 0.5], [0.5, 2.0]])
+    four = Horizon(4, ZEROS, none, ZEROS, none, v=[0.3, 0.3], widths="constant", residuals=of_four)
+    known = Residuals([0.0, 0.1], [[1.0, 0.5], [0.5, 2.0]])
+    return UncertainLTI(-np.eye(2), none, ZEROS, none, v=[0.1, 0.2], horizons=[four], residuals=known, **options)
 
 
 def test_rules_and_residuals_go_through_the_file(tmp_path: Path) -> None:
@@ -93,9 +87,8 @@ def test_chi2_needs_the_covariance() -> None:
     with pytest.raises(ModelError, match="chi2 needs the covariance"):
         two_states().replace(residuals=None, alarm=[StatisticRule("chi2", 1.0, 1.0)])
     without = [two_states().horizons[0].with_residuals(None)]
-    with pytest.raises(
-        ModelError, match="mewma needs the covariance of the utilisation over 4 steps; fit the model again"
-    ):
+    words = "mewma needs the covariance of the utilisation over 4 steps; fit the model again"
+    with pytest.raises(ModelError, match=words):
         two_states().replace(horizons=without, alarm=[StatisticRule("mewma", 1.0, 1.0, horizon=4)])
     learnt = two_states().replace(horizons=without, residuals=None).with_residuals_of(two_states())
     assert learnt.replace(alarm=RULES).to_dict() == two_states(alarm=RULES).to_dict()
@@ -215,9 +208,10 @@ def test_each_rule_names_the_states_that_it_blames() -> None:
     assert joint.words == "chi2 of all states (nearest: x1) at 7 times its threshold"
 
 
-@pytest.mark.parametrize(
-    ("field", "what"), [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)", "rate")]
-)
+PATHS = [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)", "rate")]
+
+
+@pytest.mark.parametrize(("field", "what"), PATHS)
 def test_a_condition_on_what_needs_a_history_is_refused(field: str, what: str) -> None:
     with pytest.raises(ModelError, match=f"cannot be compared, as {what} needs a history"):
         Condition.parse(f"/machine/mode {field} > 1")

@@ -205,12 +205,9 @@ def test_everything_recorded_is_in_the_copy(engine, tmp_path, compression, chunk
     with open(tmp_path / "out.mcap", "rb") as stream:  # by the index as well, in order of log time
         reader = make_reader(stream, validate_crcs=True)
         summary = reader.get_summary()
-        assert summary.statistics.message_count == (
-            made.messages
-            + 2 * made.verdicts
-            + len(JUDGED) * int(verdicts.judged.sum())
-            + len(list(over_recording(verdicts, model)))
-        )
+        judged, reasons = int(verdicts.judged.sum()), len(list(over_recording(verdicts, model)))
+        expected = made.messages + 2 * made.verdicts + len(JUDGED) * judged + reasons
+        assert summary.statistics.message_count == expected
         assert len(summary.attachment_indexes) == 1 and len(summary.metadata_indexes) == 3
         assert [a.data for a in reader.iter_attachments()] == [b"\x00\x01" * 700_000]
         times = [m.log_time for _, _, m in reader.iter_messages(log_time_order=True)]

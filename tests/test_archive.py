@@ -110,9 +110,8 @@ def test_each_run_of_a_table_is_one_recording(tmp_path):
             rows.append(f"{run},{0.1 * k:.1f},{x},{u}")
             x += 0.1 * (u - x) + 0.01 * rng.normal()
     (tmp_path / "a.csv").write_text("\n".join(rows))
-    entries = (
-        f"{kind}: [{{name: {of}, topic: /table, field: {of}}}]" for kind, of in (("states", "x"), ("controls", "u"))
-    )
+    of = {"states": "x", "controls": "u"}
+    entries = (f"{kind}: [{{name: {one}, topic: /table, field: {one}}}]" for kind, one in of.items())
     (tmp_path / "signals.yaml").write_text("\n".join(["table: {runs: run}", *entries]))
     for name, paths in (("all", [tmp_path / "a.csv"]), ("some", [tmp_path / f"a.csv[{run}]" for run in range(4)])):
         model = uncertain_lti.fit(read_transients(paths, tmp_path / "signals.yaml"))

@@ -9,8 +9,6 @@
 
 """Messages that the middleware delivers late, at the start or after a stall, cost no verdict; without rclpy."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 
@@ -267,9 +265,7 @@ def test_in_a_burst_controls_that_were_late_themselves_stay_late() -> None:
     assert [k for _, k, _ in catch_up.finish(1.0)] == order and catch_up.reordered == 0
 
 
-def test_a_lag_of_more_than_a_step_is_said_live_and_when_a_recording_is_read(
-    engine: tuple[UncertainLTI, Bag], tmp_path: Any
-) -> None:
+def test_a_lag_of_more_than_a_step_is_said_live_and_when_a_recording_is_read(engine, tmp_path):
     model, bag = engine
     kinds = {topic: bag.topics[topic].type for topic in (STATE_TOPIC, CONTROL_TOPIC)}
     for steps, said in ((0.9, 0), (2.4, 1)):

@@ -45,15 +45,9 @@ NUMBERS = {
 }  # fmt: skip
 QUATERNION = [("x", "", None), ("y", "", None), ("z", "", None), ("w", "", None)]
 NAMES = ["fan", "rotor", "läufer", "", "wheel\0s", "rotor\0"]
-LAYOUTS = st.builds(
-    Layout,
-    compression=st.sampled_from(sorted(COMPRESSIONS)),
-    chunked=st.sampled_from([True, True, True, False]),
-    chunk_size=st.sampled_from([1, 300, 3000, 1_000_000]),
-    summary=st.sampled_from([True, True, True, False]),
-    indexes=st.sampled_from([True, True, True, False]),
-    checksums=st.booleans(),
-)
+KINDS, SIZES = st.sampled_from(sorted(COMPRESSIONS)), st.sampled_from([1, 300, 3000, 1_000_000])
+MOSTLY = dict.fromkeys(("chunked", "summary", "indexes"), st.sampled_from([True, True, True, False]))
+LAYOUTS = st.builds(Layout, compression=KINDS, chunk_size=SIZES, checksums=st.booleans(), **MOSTLY)
 
 
 # --- message types ------------------------------------------------------------------------------------------
@@ -89,9 +83,8 @@ class Type:
     def schema(self) -> str:
         first, *rest = self.every()
         text = "".join(f.text() for f in first.fields)
-        return text + "".join(
-            f"{STEPS}\nMSG: {t.name.replace('/msg/', '/')}\n{''.join(f.text() for f in t.fields)}" for t in rest
-        )
+        bodies = ((t.name.replace("/msg/", "/"), "".join(f.text() for f in t.fields)) for t in rest)
+        return text + "".join(f"{STEPS}\nMSG: {name}\n{body}" for name, body in bodies)
 
 
 TIME = Type("builtin_interfaces/msg/Time", (Field("sec", "int32"), Field("nanosec", "uint32")))
@@ -247,18 +240,7 @@ def assert_same(path: Path, signals: SignalMap) -> tuple[Any, ...]:
     parts=st.integers(1, 3),
     stretch=st.sampled_from([0, 3, 10**6]),
 )
-def test_the_same_as_message_by_message(
-    tops: list[Type],
-    seed: int,
-    count: int,
-    layout: Layout,
-    variety: int,
-    little: bool | None,
-    odd: float,
-    parts: int,
-    stretch: int,
-    tmp_path: Path,
-) -> None:
+def test_the_same_as_message_by_message(tops, seed, count, layout, variety, little, odd, parts, stretch, tmp_path):
     dice = random.Random(seed)
     topics: list[Topic] = []
     wanted: dict[str, Sequence[str]] = {}
@@ -299,9 +281,8 @@ def test_a_function_added_to_the_table_is_read_and_offered(tmp_path, monkeypatch
     quaternions = [(math.sin(a / 2), 0.0, 0.0, math.cos(a / 2)) for a in turns] + [(0.0,) * 4]
     quaternions = [message("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q, strict=True))) for q in quaternions]
     kind, place = "geometry_msgs/msg/Pose", message("geometry_msgs/msg/Point", x=1.0, y=2.0, z=3.0)
-    sent = [
-        Message("/pose", i * SECOND, cdr(kind, position=place, orientation=q)) for i, q in enumerate(quaternions, 1)
-    ]
+    data = (cdr(kind, position=place, orientation=q) for q in quaternions)
+    sent = [Message("/pose", i * SECOND, one) for i, one in enumerate(data, 1)]
     path = write([Topic("/pose", kind)], sent).save(tmp_path / "a.mcap")
 
     signals = SignalMap((Signal("tilt", "/pose", "tilt(orientation)"), Signal("x", "/pose", "position.x")))

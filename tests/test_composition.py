@@ -9,8 +9,6 @@
 
 """How monitors are put together: several in a process, inputs under a prefix, numbers as people write them, an end."""
 
-from __future__ import annotations
-
 import re
 import time
 from pathlib import Path
@@ -63,16 +61,13 @@ class Robots:
 def test_two_monitors_in_one_process(world: World, tmp_path: Path) -> None:
     path = str(saved(by_hand(), tmp_path))
     options = {"context": world.node.context, "use_global_arguments": False}
-    nodes = [
-        EnvelopeMonitorNode(
-            name, namespace="/fleet",
-            parameter_overrides=[
-                Parameter("model", value=path), Parameter("topic_prefix", value=prefix), Parameter("margin", value=2),
-            ],
-            **options,
-        )
-        for name, prefix in (("left", "/robot1"), ("right", "/robot2/"))
-    ]  # fmt: skip
+
+    def made(name: str, prefix: str) -> EnvelopeMonitorNode:
+        given = {"model": path, "topic_prefix": prefix, "margin": 2}
+        overrides = [Parameter(key, value=value) for key, value in given.items()]
+        return EnvelopeMonitorNode(name, namespace="/fleet", parameter_overrides=overrides, **options)
+
+    nodes = [made("left", "/robot1"), made("right", "/robot2/")]
     for node in nodes:
         world.host(node)
         node.start()
@@ -134,8 +129,7 @@ def test_the_files_for_operation_name_what_there_is() -> None:
     assert analyzers["monitor"]["timeout"] > DEFAULTS["diagnostics_period"]
     branches = {"monitor": "monitor", "a": "states", "monitor_speed": "states"}
     for name, branch in branches.items():  # `expected` alone matches nothing in Jazzy; a regex has to match as a whole
-        matches = [
-            key for key, an in analyzers.items() for regex in an["regex"] if re.fullmatch(regex, f"{NAME}: {name}")
-        ]
+        said = f"{NAME}: {name}"
+        matches = [key for key, an in analyzers.items() for regex in an["regex"] if re.fullmatch(regex, said)]
         assert matches == [branch]
         assert [f"{NAME}: {name}".removeprefix(prefix) for prefix in analyzers[branch]["remove_prefix"]] == [name]

@@ -93,11 +93,8 @@ def test_the_same_bits_as_in_mcap(converted, kind):
     (read,) = read_transients(converted[kind], converted["signals"])
     assert len(read) == 400 and read.t_ns.tobytes() == expected.t_ns.tobytes()
     assert read.x.tobytes() == expected.x.tobytes() and read.u.tobytes() == expected.u.tobytes()
-    assert [n.partition(": ")[2] for n in read.notes] == (
-        ["the file does not hold the definitions of all its types; those of ROS 2 Humble are used"]
-        if kind == "old db3"
-        else []
-    )
+    note = "the file does not hold the definitions of all its types; those of ROS 2 Humble are used"
+    assert [n.partition(": ")[2] for n in read.notes] == [note] * (kind == "old db3")
     bag, signals = Bag(converted[kind]), SignalMap.load(converted["signals"])
     columns = bag.columns(signals.topics, check_paths(bag, signals))
     assert columns.alone <= 4 < len(columns.topic)  # the rest was read in blocks, by its plan
@@ -215,28 +212,20 @@ MESSAGES = "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, time
 
 def test_databases_that_are_no_recording(tmp_path):
     endless = "CREATE VIEW messages AS WITH RECURSIVE r(id) AS (SELECT 1 UNION ALL SELECT id + 1 FROM r) SELECT id, 1 AS topic_id, 1 AS timestamp, x'00' AS data FROM r"  # noqa: E501
-    for number, statements in enumerate(
-        [["CREATE TABLE cookies(id)"], [TOPICS, endless], [TOPICS, "CREATE TABLE messages(id, payload)"]]
-    ):
+    broken = ["CREATE TABLE cookies(id)"], [TOPICS, endless], [TOPICS, "CREATE TABLE messages(id, payload)"]
+    for number, statements in enumerate(broken):
         path = database_of(tmp_path / f"{number}.db3", *statements)
         with pytest.raises(BagError, match=r"\d\.db3: is cut or damaged or no recording of ROS 2"):
             Bag(path)
 
 
 def test_rows_that_are_no_messages_are_left_out(tmp_path):
-    path = database_of(
-        tmp_path / "odd.db3",
-        TOPICS,
-        MESSAGES,
-        "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/Float64', 'cdr')",
-        "INSERT INTO messages VALUES (1, 1, -5, x'00010000000000000000f03f')",
-        "INSERT INTO messages VALUES (2, 7, 5, x'00010000000000000000f03f')",
-        "INSERT INTO messages VALUES (3, 1, 'soon', x'00010000000000000000f03f')",
-        "INSERT INTO messages VALUES (4, 1, 6, NULL)",
-        "INSERT INTO messages VALUES (5, 1, 7, 'text')",
-        "INSERT INTO messages VALUES (6, 1, 8, x'0001000000000000000000000000f03f')",
-        "INSERT INTO messages VALUES (7, 1, 9, x'000100000000')",
-    )
+    one = "x'00010000000000000000f03f'"
+    odd = [f"1, -5, {one}", f"7, 5, {one}", f"1, 'soon', {one}", "1, 6, NULL", "1, 7, 'text'"]
+    odd += ["1, 8, x'0001000000000000000000000000f03f'", "1, 9, x'000100000000'"]
+    made = [TOPICS, MESSAGES, "INSERT INTO topics VALUES (1, '/a', 'std_msgs/msg/Float64', 'cdr')"]
+    made += [f"INSERT INTO messages VALUES ({number}, {row})" for number, row in enumerate(odd, 1)]
+    path = database_of(tmp_path / "odd.db3", *made)
     bag = Bag(path)
     assert bag.topics["/a"].count == 2
     assert [t for _, t, _ in bag.messages(["/a"])] == []  # cut, and longer than its type

@@ -141,9 +141,8 @@ def test_from_and_to_judge_that_time_alone(machine, cli):
     first = int(np.flatnonzero(inside)[0])
     assert data["verdicts"] == inside.sum() - 1
     assert f"{(~inside).sum()} {Status.UNASKED.value}" in data["no_verdict"]
-    assert all(
-        v["flags"] == [None] * 3 for v, there in zip(data["verdict_per_sample"], inside, strict=True) if not there
-    )
+    rows = zip(data["verdict_per_sample"], inside, strict=True)
+    assert all(v["flags"] == [None] * 3 for v, there in rows if not there)
     k = first + 5
     assert data["verdict_per_sample"][k]["lower"] == whole.lower[k].tolist()  # the time of a row stays its own
     assert data["verdict_per_sample"][k]["t_ns"] == run.t_ns[k]

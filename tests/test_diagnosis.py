@@ -216,9 +216,8 @@ def test_few_samples_that_carry_a_width_are_named_and_discarding_them_does_what_
     assert count == 2 * len(at) - (701 in at)
     wide, narrow = fit([spoiled], additive="noise"), fit([spoiled], additive="noise", discard=count)
     said_factor = float(message.split("'speed' ")[1].split(" times")[0])
-    assert wide.fit_summary["mean_width"][0] / narrow.fit_summary["mean_width"][0] == pytest.approx(
-        said_factor, rel=0.01
-    )
+    factor = wide.fit_summary["mean_width"][0] / narrow.fit_summary["mean_width"][0]
+    assert factor == pytest.approx(said_factor, rel=0.01)
     assert not any(WORDS["few"] in m for m in narrow.fit_summary["messages"])
 
 

@@ -71,9 +71,8 @@ def blocks(page: Path) -> list[Block]:
     position = 0
     while position < len(lines):
         line = lines[position]
-        if mark := re.fullmatch(
-            r"<!-- (not run|needs|status|background|output|said|measured|file|loads|merges):? ?(.*?) -->", line
-        ):
+        marked = r"<!-- (not run|needs|status|background|output|said|measured|file|loads|merges):? ?(.*?) -->"
+        if mark := re.fullmatch(marked, line):
             marks[mark[1]] = mark[2]
         elif fence := re.fullmatch(r"( *)```(\S+)(.*)", line):
             end = next(i for i in range(position + 1, len(lines)) if lines[i].strip() == "```")
@@ -144,9 +143,8 @@ class Reader:
         if "background" in block.marks:
             log = self.folder / f".{len(self.background)}.log"
             with log.open("wb") as stream:
-                process = subprocess.Popen(
-                    command, cwd=self.folder, env=self.env, stdout=stream, stderr=stream, start_new_session=True
-                )
+                here = {"cwd": self.folder, "env": self.env, "stdout": stream, "stderr": stream}
+                process = subprocess.Popen(command, start_new_session=True, **here)
             self.background.append((process, log, []))
             time.sleep(3.0)  # a reader needs longer to get to the next shell
             until_idle(process)
@@ -247,9 +245,8 @@ def _lines_match(shown: list[str], said: list[str]) -> bool:
 
 
 def _same(shown: str, said: str) -> bool:
-    pattern = "(.*)".join(
-        f"({FIGURES})".join(map(re.escape, NUMBER.split(part))) for part in shown.split("...")
-    )  # a number may be said with more or fewer characters, and is compared by its value
+    # a number may be said with more or fewer characters, and is compared by its value
+    pattern = "(.*)".join(f"({FIGURES})".join(map(re.escape, NUMBER.split(part))) for part in shown.split("..."))
     match = re.fullmatch(pattern, said)
     if not match:
         return False

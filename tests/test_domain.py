@@ -9,8 +9,6 @@
 
 """The domain: which combinations of signals a fit saw, the same offline and sample by sample, and in the file."""
 
-from __future__ import annotations
-
 import json
 from itertools import combinations
 from pathlib import Path

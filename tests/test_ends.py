@@ -64,9 +64,8 @@ def test_the_model_has_what_was_chosen_and_says_so(tmp_path: Path) -> None:
     assert any(text.startswith("controls are taken at the arrival") for text in model.fit_summary["messages"])
     assert model.fit_summary["mean_width"][0] < 0.5 * plain.fit_summary["mean_width"][0]
     model.save(tmp_path / "a.model.json")
-    checked, again = (
-        EnvelopeMonitor(m).check(plant(8, 1.0)) for m in (model, UncertainLTI.load(tmp_path / "a.model.json"))
-    )
+    loaded = UncertainLTI.load(tmp_path / "a.model.json")
+    checked, again = (EnvelopeMonitor(m).check(plant(8, 1.0)) for m in (model, loaded))
     assert not checked.alarm.any() and (checked.alarm == again.alarm).all()
     assert [c.at for c in tune(runs).model.signals.controls] == ["arrival"]
 

@@ -59,9 +59,7 @@ class Rig:
         if self.session.alarm != before:
             self.event_log.turned(self.session, verdicts, self.now)
 
-    def send(
-        self, samples: int, off: float = 0.0, control: bool = True, state: bool = True, frozen: int | None = None
-    ) -> None:
+    def send(self, samples: int, off: float = 0, control: bool = True, state: bool = True, frozen: Any = None) -> None:
         point = self.model.operating_point
         held = point.recorded_x(self.x)
         for _ in range(samples):
@@ -149,9 +147,8 @@ def test_a_jump_larger_than_any_of_the_fit_is_logged_and_reported_with_its_limit
     rig.send(1)
     limit = 0.01 * rig.model.operating_point.X[0]
     (line,) = [line for line in rig.lines if line.startswith("alarm")]
-    assert (
-        f"; a jumped by {5.0 * rig.model.operating_point.X[0]:.3g} in one step (at most {limit:.3g} in the fit)" in line
-    )
+    jump = 5.0 * rig.model.operating_point.X[0]
+    assert f"; a jumped by {jump:.3g} in one step (at most {limit:.3g} in the fit)" in line
     assert "b jumped" not in line
     assert "a jumped by " in rig.session.report(rig.now, TIMEOUT)[0].message
     assert "; a jumped by " in rig.session.reasons.text

@@ -54,9 +54,8 @@ def test_a_session_without_ros_gives_the_bits_of_a_check(tmp_path):
 
 def test_a_session_imports_no_ros():
     for path in EXAMPLES.glob("*.py"):
-        imported = {
-            n.name for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import) for n in node.names
-        }
+        nodes = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Import)]
+        imported = {n.name for node in nodes for n in node.names}
         imported |= {node.module for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.ImportFrom)}
         assert not {name.partition(".")[0] for name in imported} & {"rclpy", "uncertain_lti_ros"}, path
 

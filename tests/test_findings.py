@@ -52,9 +52,8 @@ def test_episodes_hold_every_violation(letters):
             assert e["states"].get(name, {"violations": 0})["violations"] == count
     for one, other in zip(episodes, episodes[1:], strict=False):
         between = int(verdicts.judged[one["last"]["k"] + 1 : other["first"]["k"] + 1].sum())
-        assert (
-            between > APART or (np.diff(verdicts.transient.t_ns[one["last"]["k"] : other["first"]["k"] + 1]) < 0).any()
-        )
+        stamps = verdicts.transient.t_ns[one["last"]["k"] : other["first"]["k"] + 1]
+        assert between > APART or (np.diff(stamps) < 0).any()
 
 
 def judged(widths, validation=None, decay=1.0, **more):

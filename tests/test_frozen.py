@@ -9,8 +9,6 @@
 
 """Frozen inputs: what repeats exactly while the nominal model moves it raises an alarm; what rests does not."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -199,9 +197,7 @@ NOISY = [0.0], [0.0], [0.0], [LARGEST]
         ((*NOISY, [999.0]), 0.01, 0.0, None),
     ],
 )
-def test_a_state_that_stops_is_frozen_beyond_what_was_recorded(
-    repeats: Any, dt: float, rate: float, steps: int | None
-) -> None:
+def test_a_state_that_stops_is_frozen_beyond_what_was_recorded(repeats, dt, rate, steps):
     model = UncertainLTI([[0.0]], [[rate]], [[0.0]], [[0.0]], v=[0.5], repeats=Repeats(*repeats))
     x = np.concatenate([np.linspace(5.0, 4.0, 20), np.full(60, 4.0)])[:, None]
     for margin in (1.0, 2.0):  # half-widths are those of the model
@@ -537,9 +533,7 @@ def test_a_quadruped_with_a_held_joint(recordings: Path, signals_folder: Path, t
         ("crazyflie_vicon", ["crazyflie/rollbag_0.mcap"], ["crazyflie/yx3bag_0.mcap", "crazyflie/yx4bag_0.mcap"]),
     ],
 )
-def test_healthy_recordings_raise_none(
-    recordings: Path, signals_folder: Path, signals: str, fitted: list[str], checked: list[str]
-) -> None:
+def test_healthy_recordings_raise_none(recordings, signals_folder, signals, fitted, checked):
     model = fit(read_transients([recordings / name for name in fitted], signals_folder / f"{signals}.yaml"))
     for name in checked:
         assert not EnvelopeMonitor(model).check(read_as_fitted(recordings / name, model.signals)).frozen.any()

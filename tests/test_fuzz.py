@@ -9,8 +9,6 @@
 
 """Damage gives a clear error or a correct reading; `python benchmarks/fuzz.py` tries ten thousand of each kind."""
 
-from __future__ import annotations
-
 import os
 import struct
 import sys

@@ -9,8 +9,6 @@
 
 """Horizons chosen by what is left out: what is asked for, what is tried, and what stays."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import Any
 
@@ -132,9 +130,8 @@ def test_pieces_of_long_recordings_choose_the_same_horizons(monkeypatch: pytest.
 def test_an_empty_list_means_one_step_whatever_the_signals_file_asks_for() -> None:
     states = [{"name": f"x{i}", "topic": "/a", "field": f"x{i}"} for i in (1, 2)]
     controls = [{"name": "u1", "topic": "/a", "field": "u1"}]
-    signals = SignalMap.from_dict(
-        {"states": states, "controls": controls, "horizons": {"steps": [4], "widths": "growing"}}
-    )
+    horizons = {"steps": [4], "widths": "growing"}
+    signals = SignalMap.from_dict({"states": states, "controls": controls, "horizons": horizons})
     asks = [type(run)(run.t_ns, run.x, run.u, signals=signals) for run in RUNS[:2]]
     assert fit(asks, additive="noise").steps == (4,)
     assert fit(asks, additive="noise", horizons=[]).steps == ()

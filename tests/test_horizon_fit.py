@@ -9,8 +9,6 @@
 
 """Fitted envelopes over several steps: every window inside, least width, and which windows count."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -49,9 +47,8 @@ def runs(
             x[k + 1] = x[k] + 0.02 * rate
         x += rng.uniform(-noise, noise, x.shape)
         t = np.arange(length) * 20_000_000
-        found.append(
-            Transient(t, x, u, s=rng.choice([1.0, 2.0], size=8).repeat(length // 8)[:, None] if modes else None)
-        )
+        s = rng.choice([1.0, 2.0], size=8).repeat(length // 8)[:, None] if modes else None
+        found.append(Transient(t, x, u, s=s))
     return found
 
 
@@ -115,9 +112,7 @@ def test_the_largest_width_is_that_of_the_programme_as_written(widths: Any) -> N
 
 @pytest.mark.parametrize(("additive", "drift"), [("noise", False), ("both", True)])
 @pytest.mark.parametrize("knots", [None, (-0.5, 0.5)])
-def test_what_is_run_are_the_least_squares_of_the_elements_that_the_model_has(
-    additive: Any, drift: bool, knots: Any
-) -> None:
+def test_what_is_run_are_the_least_squares_of_the_elements_that_the_model_has(additive, drift, knots):
     transients = runs()
     model = fit(transients, additive=additive, schedule={"x1": knots} if knots else None, horizons=[3])
     steps = [t.transitions() for t in transients]
@@ -163,11 +158,8 @@ def test_recordings_are_never_joined_and_modes_never_mixed() -> None:
     first, other, _ = runs()
     start = int(first.transitions().k[-1]) + 1  # the second recording begins at the number that would follow
     gone = np.full((start, 2), np.nan)
-    second = Transient(
-        np.arange(start + len(other)) * 20_000_000,
-        np.vstack([gone, other.x]),
-        np.vstack([np.zeros((start, 1)), other.u]),
-    )
+    x, u = np.vstack([gone, other.x]), np.vstack([np.zeros((start, 1)), other.u])
+    second = Transient(np.arange(len(x)) * 20_000_000, x, u)
     model = fit([first, second], additive="noise", horizons=[4])
     assert model.fit_summary["horizons"][0]["windows"] == 2 * (len(first) - 4)
     transients = runs(modes=True)
@@ -266,8 +258,7 @@ def test_a_horizon_whose_run_blows_up_is_dropped_and_said() -> None:
     found, facts, messages, _ = fit_horizons(away, problem, [2, 60], "constant")
     assert [h.steps for h in found] == [2] == [f["steps"] for f in facts]
     assert len(messages) == 1
-    assert messages[0].startswith(
-        "no horizon of 60 steps: its envelope is wider than if every state stayed where it was"
-    )
+    words = "no horizon of 60 steps: its envelope is wider than if every state stayed where it was"
+    assert messages[0].startswith(words)
     kept, _, none, _ = fit_horizons(model, problem, [2, 60], "constant")
     assert [h.steps for h in kept] == [2, 60] and not none

@@ -9,8 +9,6 @@
 
 """Envelopes over several steps: the model's elements, its file, and the utilisation per horizon."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +39,9 @@ def horizon(rng: np.random.Generator, steps: int, blocks: int | None = None, n: 
 def with_horizons(rng: np.random.Generator, steps: tuple[int, ...], schedule: Schedule | None = None) -> UncertainLTI:
     blocks = None if schedule is None else schedule.blocks
     one = horizon(rng, 2, blocks)
-    return UncertainLTI(
-        **{name: getattr(one, name) for name in ARRAYS},
-        schedule=schedule,
-        horizons=[horizon(rng, h, blocks) for h in steps],
-        run=Run(*(getattr(horizon(rng, 2, blocks), name) for name in "ABc")) if steps else None,
-    )
+    horizons = [horizon(rng, h, blocks) for h in steps]
+    run = Run(*(getattr(horizon(rng, 2, blocks), name) for name in "ABc")) if steps else None
+    return UncertainLTI(**{name: getattr(one, name) for name in ARRAYS}, schedule=schedule, horizons=horizons, run=run)
 
 
 @pytest.mark.parametrize("schedule", [None, SPEED])
@@ -119,25 +114,20 @@ def streams(draw: st.DrawFn) -> tuple[UncertainLTI, Transient]:
     if gear:
         z[:, -1] = rng.choice([1.0, 2.0, 3.0], size=len(t) // 20 + 1, p=[0.45, 0.45, 0.1]).repeat(20)[: len(t)]
     z[rng.uniform(size=z.shape) < draw(st.sampled_from([0.0, 0.01]))] = np.nan
-    signals = SignalMap(
-        tuple(Signal(f"x{i + 1}", "/c", f"x{i}", float(rng.normal()), float(rng.uniform(0.5, 2))) for i in range(n)),
-        tuple(Signal(f"u{j + 1}", "/c", f"u{j}", float(rng.normal()), float(rng.uniform(0.5, 2))) for j in range(m)),
-        (Signal("gear", "/c", "gear"),) * gear,
-        clock="/c",
-        max_gap=0.05,
-        time={"/c": "header"},
-    )
+
+    def named(letter: str, count: int) -> tuple[Signal, ...]:
+        units = [(float(rng.normal()), float(rng.uniform(0.5, 2))) for _ in range(count)]
+        return tuple(Signal(f"{letter}{i + 1}", "/c", f"{letter}{i}", *unit) for i, unit in enumerate(units))
+
+    groups = named("x", n), named("u", m), (Signal("gear", "/c", "gear"),) * gear
+    signals = SignalMap(*groups, clock="/c", max_gap=0.05, time={"/c": "header"})
     blocks = None if schedule is None else schedule.blocks
     one = horizon(rng, 2, blocks, n, m)
     lengths = draw(st.lists(st.sampled_from([2, 3, 5, 12, 70]), min_size=1, max_size=3, unique=True))
-    model = UncertainLTI(
-        **{name: getattr(one, name) for name in ARRAYS},
-        schedule=schedule,
-        signals=signals,
-        sampling=Sampling(dt_min=0.01, dt_max=0.015),
-        horizons=[horizon(rng, h, blocks, n, m) for h in lengths],
-        run=draw(st.sampled_from([None, Run(*(getattr(horizon(rng, 2, blocks, n, m), name) for name in "ABc"))])),
-    )
+    horizons = [horizon(rng, h, blocks, n, m) for h in lengths]
+    run = draw(st.sampled_from([None, Run(*(getattr(horizon(rng, 2, blocks, n, m), name) for name in "ABc"))]))
+    known = {"schedule": schedule, "signals": signals, "sampling": Sampling(dt_min=0.01, dt_max=0.015)}
+    model = UncertainLTI(**{name: getattr(one, name) for name in ARRAYS}, **known, horizons=horizons, run=run)
     return model, Transient(t, z[:, :n], z[:, n : n + m], s=z[:, n + m :], signals=signals, max_gap=0.05)
 
 

@@ -77,9 +77,8 @@ resource.setrlimit(resource.RLIMIT_AS, (size + {memory}, resource.RLIM_INFINITY)
 resource.setrlimit(resource.RLIMIT_CPU, ({seconds}, {seconds}))
 sys.exit(main(sys.argv[1:]))
 """
-    return subprocess.run(
-        [sys.executable, "-c", program, *map(str, arguments)], capture_output=True, text=True, timeout=1200
-    )
+    command = [sys.executable, "-c", program, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=1200)
 
 
 @pytest.mark.parametrize("rest", [bytes(9), message_record(1, STEP, b"")])
@@ -160,9 +159,8 @@ def test_chunks_that_lie_in_each_other_are_walked(tmp_path):
         listed = chunk_index(start, outer, channels=[1], compression="")
         listed += chunk_index(second, inner, channels=[2], compression="")
         summary = top + statistics_record({1: 1, 2: 1}, 2) + listed
-        path = save(
-            tmp_path / f"{second}.mcap", raw_file(outer, *([inner] if second != within else []), summary=summary)
-        )
+        data = raw_file(outer, *([inner] if second != within else []), summary=summary)
+        path = save(tmp_path / f"{second}.mcap", data)
         assert (outline(path) is None) == (second == within)
         signals = SignalMap.from_dict({"states": [{"name": "x", "topic": "/b", "field": "data"}]})
         assert read_stream(Bag(path, indexed=True), signals).values[0].tolist() == [[1.0]]
@@ -250,9 +248,8 @@ def test_a_file_of_nothing_but_schemas_ends(tmp_path, monkeypatch):
         for k in range(500)
     ]
     records = b"".join(schema_record(k + 1, t) + channel_record(k + 1, t, k + 1) for k, t in enumerate(topics))
-    path = save(
-        tmp_path / "schemas.mcap", raw_file(chunk_record(records + message_record(1, 5, bytes(8))), summary=b"")
-    )
+    data = raw_file(chunk_record(records + message_record(1, 5, bytes(8))), summary=b"")
+    path = save(tmp_path / "schemas.mcap", data)
     with bounded(seconds=3):
         bag = Bag(path)
     assert not bag.topics["/t0"].reason and "too long together" in bag.topics["/t499"].reason

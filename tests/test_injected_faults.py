@@ -43,9 +43,8 @@ def simulated(act=lambda u: u, row=None):
     for k in range(119):
         rate = model.A @ x[k] + model.B @ done[k]
         x[k + 1] = x[k] + 0.025 * (rate if row is None or k < ONSET else row(rate, model.B @ done[k]))
-    return Transient(
-        0.025 * np.arange(120), x, u, state_names=model.state_names, control_names=model.control_names, max_gap=0.1
-    )
+    names = {"state_names": model.state_names, "control_names": model.control_names}
+    return Transient(0.025 * np.arange(120), x, u, max_gap=0.1, **names)
 
 
 @pytest.fixture(scope="module")
@@ -162,13 +161,8 @@ def test_the_response_goes_on_over_missing_samples_which_stay_missing():
 def test_a_memory_of_a_state_follows_the_fault():
     """lag(x), diff(x) and rate(x) among the controls are those of the faulty readings, and of the response."""
     topic = {"topic": "/m", "type": "std_msgs/msg/Float64MultiArray"}
-    fields = {
-        "x": "data[0]",
-        "was": "lag(data[0], 2)",
-        "step": "diff(data[0])",
-        "rate": "rate(data[0])",
-        "u": "data[1]",
-    }
+    fields = {"x": "data[0]", "was": "lag(data[0], 2)", "step": "diff(data[0])", "rate": "rate(data[0])"}
+    fields["u"] = "data[1]"
     of = {name: Signal(name, field=field, scale=2.0, **topic) for name, field in fields.items()}
     signals = SignalMap((of["x"],), (of["u"], of["was"], of["step"], of["rate"]), clock="/m", max_gap=1.0)
     model = UncertainLTI([[-1.0]], [[1.0, 0.3, -0.2, 0.1]], [[0.1]], [[0.1] * 4], signals=signals)

@@ -86,9 +86,8 @@ def test_its_simulation_is_eq_3():
     # in recorded units the same run, scaled
     recorded = model.to_control(dt, recorded=True)
     X, U = model.operating_point.X, model.operating_point.U
-    scaled = control.forced_response(
-        recorded, np.arange(50) * dt, np.vstack([(u * U).T, drift]), X * np.array([0.1, 0.2, 0.3])
-    )
+    inputs, begin = np.vstack([(u * U).T, drift]), X * np.array([0.1, 0.2, 0.3])
+    scaled = control.forced_response(recorded, np.arange(50) * dt, inputs, begin)
     assert np.allclose(scaled.states.T, response.states.T * X)
 
 

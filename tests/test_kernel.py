@@ -9,8 +9,6 @@
 
 """The kernel against the equations written naively: one number after another, for one sample, many, and runs."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -47,9 +45,8 @@ def some_model(n: int, m: int, schedule: Schedule | None, rng: np.random.Generat
     if "gear" in further:
         steady[n + m + further.index("gear")], scale[n + m + further.index("gear")] = 0.0, 1.0
     names = [f"x{i}" for i in range(n)], [f"u{j}" for j in range(m)], further
-    every = [
-        Signal(name, "", "a", steady=float(steady[k]), scale=float(scale[k])) for k, name in enumerate(sum(names, []))
-    ]
+    units = zip(sum(names, []), steady.tolist(), scale.tolist(), strict=True)
+    every = [Signal(name, "", "a", steady=at, scale=unit) for name, at, unit in units]
     return UncertainLTI(
         theta[..., :n], theta[..., n : n + m], np.abs(delta[..., :n]), np.abs(delta[..., n : n + m]),
         theta[..., n + m], np.abs(delta[..., n + m]), rng.uniform(0, 6, (*lead, n)),
@@ -127,9 +124,7 @@ def same(one: Any, other: Any) -> bool:
 
 @pytest.mark.parametrize("n, m, margin", [(1, 0, 1.0), (1, 9, 0.3), (5, 4, 0.3), (20, 6, 1.0)])
 @pytest.mark.parametrize("schedule", SCHEDULES.values(), ids=SCHEDULES)
-def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(
-    n: int, m: int, margin: float, schedule: Schedule | None
-) -> None:
+def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(n, m, margin, schedule):
     rng = np.random.default_rng([n, m])
     model = some_model(n, m, schedule, rng)
     counted = rng.random(n) < 0.7
@@ -293,13 +288,8 @@ def test_boxes_hold_what_their_transitions_have(each: int, limited: bool) -> Non
     """Ranges and least room of transitions that follow one another, some of which are in none."""
     rng = np.random.default_rng(each)
     n, p, count = 2, 3, 1500
-    model = UncertainLTI(
-        rng.normal(size=(n, n)),
-        rng.normal(size=(n, p - n)),
-        rng.uniform(size=(n, n)),
-        rng.uniform(size=(n, p - n)),
-        v=[0.1, 0.2],
-    )
+    elements = (draw(size=(n, k)) for draw in (rng.normal, rng.uniform) for k in (n, p - n))
+    model = UncertainLTI(*elements, v=[0.1, 0.2])
     z, dt, after = rng.normal(size=(p, count)), rng.uniform(0.1, 0.2, count), rng.normal(size=(n, count))
     numbers = np.where(rng.uniform(size=count) < 0.9, np.arange(count) // each, -1)
     numbers[numbers >= 0] = np.unique(numbers[numbers >= 0], return_inverse=True)[1]

@@ -129,9 +129,8 @@ def test_structure_is_whole(count):
     drawn = [output.name for output in OUTPUTS if output.position and output.view]
     assert len(drawn) >= 5
     for topic in drawn:
-        assert [p for p in named if p.startswith(f"/envelope_monitor/{topic}.")] == [
-            f"/envelope_monitor/{topic}.position[{i}]" for i in range(count)
-        ]
+        expected = [f"/envelope_monitor/{topic}.position[{i}]" for i in range(count)]
+        assert [p for p in named if p.startswith(f"/envelope_monitor/{topic}.")] == expected
     curves = [c.get("name") for c in ElementTree.fromstring(plotjuggler_layout(states).encode()).iter("curve")]
     assert len(set(curves)) == len(drawn) * count + 1
     assert f"/envelope_monitor/lower/{states[-1].name}/position" in curves

@@ -9,8 +9,6 @@
 
 """Which fault: patterns of labelled recordings are named again, unknown ones are not, and parts are pointed to."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -55,9 +53,8 @@ def run(seed: int, fault: str = "", size: float = 1.0) -> Transient:
     x = x + rng.uniform(-1e-3, 1e-3, x.shape)
     if fault == "b bias":
         x[ONSET:, 1] += 0.1 * size
-    return Transient(
-        DT * np.arange(count), x, u, state_names=("a", "b", "c"), control_names=("p", "q"), name=f"{fault} {seed}"
-    )
+    names = {"state_names": ("a", "b", "c"), "control_names": ("p", "q"), "name": f"{fault} {seed}"}
+    return Transient(DT * np.arange(count), x, u, **names)
 
 
 @pytest.fixture(scope="module")

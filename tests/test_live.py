@@ -62,37 +62,24 @@ from std_srvs.srv import Trigger
 def by_hand(time: str = "header", max_hold: float | None = 0.5, **options: Any) -> UncertainLTI:
     """Two states on a JointState, controls on a Vector3Stamped (header time) or a Float64 (log time)."""
     if time == "header":
-        state = [(STATE, JOINT_STATE, "position[a]"), (STATE, JOINT_STATE, "position[b]")]
-        control = [(CONTROL, VECTOR, "vector.x"), (CONTROL, VECTOR, "vector.y")]
+        state = [(JOINT_STATE, STATE, "position[a]"), (JOINT_STATE, STATE, "position[b]")]
+        control = [(VECTOR, CONTROL, "vector.x"), (VECTOR, CONTROL, "vector.y")]
     else:
-        state = [("/power", "std_msgs/msg/Float64", "data")]
-        control = [("/voltage", "std_msgs/msg/Float64", "data")]
-    names = ("a", "b"), ("p", "q")
-    signals = SignalMap(
-        tuple(
-            Signal(name, topic, path, steady=0.3, scale=1.7, type=kind)
-            for name, (topic, kind, path) in zip(names[0], state, strict=False)
-        ),
-        tuple(
-            Signal(name, topic, path, steady=0.1, scale=0.9, type=kind, max_hold=max_hold)
-            for name, (topic, kind, path) in zip(names[1], control, strict=False)
-        ),
-    )
+        state = [("std_msgs/msg/Float64", "/power", "data")]
+        control = [("std_msgs/msg/Float64", "/voltage", "data")]
+    units, held = {"steady": 0.3, "scale": 1.7}, {"steady": 0.1, "scale": 0.9, "max_hold": max_hold}
+    states = (Signal(name, *of, type=kind, **units) for name, (kind, *of) in zip("ab", state, strict=False))
+    controls = (Signal(name, *of, type=kind, **held) for name, (kind, *of) in zip("pq", control, strict=False))
+    signals = SignalMap(tuple(states), tuple(controls))
     signals = options.pop("signals", signals)
     n, m = len(signals.states), len(signals.controls)
     rng = np.random.default_rng(7)
     clock = signals.states[0].topic
-    model = UncertainLTI(
-        rng.normal(size=(n, n)) - 2.0 * np.eye(n),
-        rng.normal(size=(n, m)),
-        rng.uniform(0.1, 0.6, (n, n)),
-        rng.uniform(0.1, 0.6, (n, m)),
-        v=np.full(n, 1e-4),
-        signals=replace(signals, clock=clock, max_gap=2.5 * STEP_NS * 1e-9, time=dict.fromkeys(signals.topics, time)),
-        sampling=Sampling(STEP_NS * 1e-9),
-        **options,
-    )
-    return model
+    nominal = rng.normal(size=(n, n)) - 2.0 * np.eye(n), rng.normal(size=(n, m))
+    widths = rng.uniform(0.1, 0.6, (n, n)), rng.uniform(0.1, 0.6, (n, m))
+    limits = {"clock": clock, "max_gap": 2.5 * STEP_NS * 1e-9, "time": dict.fromkeys(signals.topics, time)}
+    known = {"signals": replace(signals, **limits), "sampling": Sampling(STEP_NS * 1e-9)}
+    return UncertainLTI(*nominal, *widths, v=np.full(n, 1e-4), **known, **options)
 
 
 def everything_armed() -> UncertainLTI:
@@ -496,9 +483,7 @@ def test_diagnostics_tell_well_outside_alarm_and_silence_apart(world: World, tmp
     assert (values["gaps"], values["dropped"], values["alarms"]) == ("1", "1", "1")
 
 
-def test_a_model_that_cannot_be_is_refused_by_name_and_the_one_at_work_goes_on(
-    bench: StartBench, tmp_path: Path
-) -> None:
+def test_a_model_that_cannot_be_is_refused_by_name_and_the_one_at_work_goes_on(bench, tmp_path):
     """Set or read again; and the process ends in time, whatever it was given to read."""
     on = bench()
     on.plant.send(1)
@@ -599,9 +584,8 @@ def test_the_reason_stays_while_every_message_is_dropped(world: World, tmp_path:
 
 def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Path) -> None:
     model = by_hand()
-    process = world.run_node(
-        "envelope_monitor", {"model": str(saved(model, tmp_path)), "autostart": False, "diagnostics_period": 0.1}
-    )
+    parameters = {"model": str(saved(model, tmp_path)), "autostart": False, "diagnostics_period": 0.1}
+    process = world.run_node("envelope_monitor", parameters)
     diagnostics = world.diagnostics()
     assert world.state() == "unconfigured"
     diagnostics.reaches(STALE, saying="unconfigured: no verdicts")
@@ -635,9 +619,8 @@ def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Pa
 
 
 def test_a_rule_that_kept_the_node_from_starting_can_be_mended(world: World, tmp_path: Path) -> None:
-    process = world.run_node(
-        "envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), "violations": 3, "window": 1}
-    )
+    wrong = {"model": str(saved(by_hand(), tmp_path)), "violations": 3, "window": 1}
+    process = world.run_node("envelope_monitor", wrong)
     process.says("the node starts as soon as its parameters are set right")
     assert world.state() == "unconfigured"
     assert world.set(window=5) == (True, "") and world.state() == "active"
@@ -646,13 +629,11 @@ def test_a_rule_that_kept_the_node_from_starting_can_be_mended(world: World, tmp
 
 def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_path: Path) -> None:
     model, signals = by_hand(), by_hand().signals
-    foreign = replace(
-        signals, controls=tuple(replace(c, type="frost_interfaces/msg/UCommand") for c in signals.controls)
-    )
+    unknown = tuple(replace(c, type="frost_interfaces/msg/UCommand") for c in signals.controls)
+    foreign = replace(signals, controls=unknown)
     wrong = replace(signals, states=tuple(replace(s, field="positions[0]") for s in signals.states))
-    missing, unknown_field = (
-        saved(model.replace(signals=s), tmp_path, name) for name, s in (("missing", foreign), ("field", wrong))
-    )
+    named = {"missing": foreign, "field": wrong}
+    missing, unknown_field = (saved(model.replace(signals=s), tmp_path, name) for name, s in named.items())
     arrays = saved(UncertainLTI([[-1.0]], [[1.0]], [[0.1]], [[0.1]]), tmp_path, "arrays")
     process = world.run_node("envelope_monitor", {"model": str(missing), "diagnostics_period": 0.1})
     diagnostics = world.diagnostics()
@@ -682,9 +663,7 @@ def test_a_signal_ends_the_node_with_status_0(world: World, tmp_path: Path, end:
     until(lambda: diagnostics.latest("envelope_monitor: monitor").message.startswith("finalized"), "its last words")
 
 
-def test_what_was_published_before_is_heard_and_quality_of_service_that_cannot_be_had_is_told(
-    world: World, tmp_path: Path
-) -> None:
+def test_what_was_published_before_is_heard_and_quality_of_service_that_cannot_be_had_is_told(world, tmp_path):
     lasting = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
     control = world.publisher(Vector3Stamped, CONTROL, lasting)
     command = Vector3Stamped()

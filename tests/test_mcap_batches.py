@@ -9,8 +9,6 @@
 
 """Blocks read ahead and many at once: whole or damaged, a file reads as it does message by message."""
 
-from __future__ import annotations
-
 import random
 import subprocess
 import sys

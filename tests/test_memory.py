@@ -9,8 +9,6 @@
 
 """Memory: lag, diff and rate of a field, from the signals file to the free run of a model."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -81,11 +79,8 @@ def test_memories_among_the_states_have_no_row_and_take_over_what_is_known_of_th
         (6.0, 2.0, "rad"), (0.0, 2.0, "rad"), (0.0, 2.0, "rad/s"),
     ]  # fmt: skip
     assert {(s.valid, s.ignore) for s in (lag, diff, rate)} == {((-9.0, math.inf), (0.1,))}
-    assert [(r.position, r.of, r.memory.kind) for r in signals.recalled] == [
-        (2, 0, "lag"),
-        (3, 0, "diff"),
-        (4, 0, "rate"),
-    ]
+    found = [(r.position, r.of, r.memory.kind) for r in signals.recalled]
+    assert found == [(2, 0, "lag"), (3, 0, "diff"), (4, 0, "rate")]
     assert [signals.branch(i) for i in range(5)] == [6.0, 0.0, 6.0, 6.0, 6.0]
 
 
@@ -148,9 +143,8 @@ def test_a_model_that_remembers_has_a_newer_format_and_an_older_one_may_not_say_
 def test_a_check_takes_the_step_of_the_model() -> None:
     t = np.array([0.0, 0.1, 0.25, 0.3])
     model = remembering({"A": [[1.0]], "B": np.zeros((1, 0))}, SignalMap((Signal("x", "", "x"),)))
-    model = model.replace(
-        sampling=Sampling(0.1), signals=SignalMap((Signal("x", "", "x"),), step=0.1), v=np.array([0.5])
-    )
+    signals = SignalMap((Signal("x", "", "x"),), step=0.1)
+    model = model.replace(sampling=Sampling(0.1), signals=signals, v=np.array([0.5]))
     verdicts = EnvelopeMonitor(model).check(Transient(t, np.ones((4, 1)), np.empty((4, 0)), max_gap=1.0))
     assert verdicts.upper[1:, 0].tolist() == [1.6] * 3
 

@@ -9,8 +9,6 @@
 
 """The model: bounds (6)(7) to the bit, discrepancies (4)(5), and a file that is either whole or refused."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -59,9 +57,8 @@ def random_model(rng: np.random.Generator, n: int, m: int, additive: bool = True
         max_gap=0.1,
         time={"/x": "header"} | ({"/u": "log"} if m else {}),
     )
-    return UncertainLTI(
-        elements(n, n), elements(n, m), np.abs(elements(n, n)), np.abs(elements(n, m)), *vectors, signals=signals
-    )
+    matrices = elements(n, n), elements(n, m), np.abs(elements(n, n)), np.abs(elements(n, m))
+    return UncertainLTI(*matrices, *vectors, signals=signals)
 
 
 seeds = st.integers(0, 2**32 - 1)
@@ -77,9 +74,7 @@ def bits(array: np.ndarray) -> bytes:
 
 
 @given(seeds, sizes, leads, st.sampled_from(["C", "F", "strided", "reversed"]), st.booleans())
-def test_one_sample_and_many_give_the_same_bits(
-    seed: int, size: tuple[int, int], lead: tuple[int, ...], layout: str, one_dt: bool
-) -> None:
+def test_one_sample_and_many_give_the_same_bits(seed, size, lead, layout, one_dt):
     rng = np.random.default_rng(seed)
     n, m = size
     model = random_model(rng, n, m)
@@ -146,9 +141,8 @@ def naive_run(model: UncertainLTI, transient: Transient) -> np.ndarray:
     free = (transient.x - point.x_s) / point.X
     for k, dt in enumerate(transient.dt):
         if transient.usable[k]:
-            free[k + 1] = free[k] + dt * (
-                model.A @ free[k] + model.B @ ((transient.u[k] - point.u_s) / point.U) + model.c
-            )
+            u = (transient.u[k] - point.u_s) / point.U
+            free[k + 1] = free[k] + dt * (model.A @ free[k] + model.B @ u + model.c)
     return free
 
 
@@ -273,54 +267,34 @@ def models(draw: st.DrawFn) -> UncertainLTI:
     number = st.floats(-LARGEST, LARGEST)
     positive = st.floats(1 / LARGEST, LARGEST)
     seconds = st.floats(1e-300, LONGEST_S)
-    given = [
-        Signal(
-            names[i],
-            "/x" if i < n else "/u",
-            f"d[{i}]",
-            draw(number),
-            draw(positive),
-            draw(name),
-            "pkg/msg/Type",
-            None if i < n else draw(st.none() | st.floats(0, 1e9)),
-            0 if i < n else draw(st.integers(0, 5)),
-            draw(st.sampled_from([None, (-1.5, 2.0), (0.0, INF), (-INF, 1e9)])),
-            draw(st.sampled_from([(), (2.146e9,), (-1.0, 0.1)])),
-        )
-        for i in range(n + m)
-    ]
+
+    def listed(i: int) -> Signal:
+        told = names[i], "/x" if i < n else "/u", f"d[{i}]", draw(number), draw(positive), draw(name), "pkg/msg/Type"
+        of_control = (None, 0) if i < n else (draw(st.none() | st.floats(0, 1e9)), draw(st.integers(0, 5)))
+        limits = draw(st.sampled_from([None, (-1.5, 2.0), (0.0, INF), (-INF, 1e9)]))
+        return Signal(*told, *of_control, limits, draw(st.sampled_from([(), (2.146e9,), (-1.0, 0.1)])))
+
+    given = [listed(i) for i in range(n + m)]
     memories = draw(st.lists(st.sampled_from(["lag(d[0], 2)", "diff(d[0])", "rate(u)"]), max_size=m, unique=True))
     for i, field in enumerate(memories, start=n):
         given[i] = replace(given[i], topic="/x", field=field, delay=0)
-    signals = SignalMap(
-        tuple(given[:n]),
-        tuple(given[n:]),
-        clock="/x",
-        max_gap=draw(seconds),
-        min_step=draw(st.floats(0, 1)),
-        max_skew=draw(st.none() | seconds),
-        step=draw(st.sampled_from(["recorded", 0.002])),
-        time={"/x": "header"} | ({"/u": "log"} if m > len(memories) else {}),
-    )
+    limits = {"max_gap": draw(seconds), "min_step": draw(st.floats(0, 1)), "max_skew": draw(st.none() | seconds)}
+    limits |= {"step": draw(st.sampled_from(["recorded", 0.002]))}
+    time = {"/x": "header"} | ({"/u": "log"} if m > len(memories) else {})
+    signals = SignalMap(tuple(given[:n]), tuple(given[n:]), clock="/x", time=time, **limits)
     box = [draw(hnp.arrays(float, k, elements=number)) for k in (n, n, m, m)]
     if draw(st.booleans()):
         box[0][0] = -INF
-    return model.replace(
-        A=draw(hnp.arrays(float, (n, n), elements=number)),
-        signals=signals,
-        sampling=Sampling(0.1, 0.05, 0.2),
-        domain=draw(st.sampled_from([Domain(*box), None])),
-        alarm_rule=AlarmRule(2, draw(st.integers(2, 9)), draw(positive)),
-        fit_summary={"criterion": "qp", "numbers": [1, 2.5, None], "inner": {"a": "ä"}},
-        validation={"inside": draw(number)},
-    )
+    known = {"sampling": Sampling(0.1, 0.05, 0.2), "domain": draw(st.sampled_from([Domain(*box), None]))}
+    facts = {"criterion": "qp", "numbers": [1, 2.5, None], "inner": {"a": "ä"}}
+    said = {"fit_summary": facts, "validation": {"inside": draw(number)}}
+    A, rule = draw(hnp.arrays(float, (n, n), elements=number)), AlarmRule(2, draw(st.integers(2, 9)), draw(positive))
+    return model.replace(A=A, signals=signals, alarm_rule=rule, **known, **said)
 
 
 @settings(max_examples=40)
 @given(models())
-def test_a_saved_model_is_the_same_to_the_last_bit(
-    tmp_path_factory: pytest.TempPathFactory, model: UncertainLTI
-) -> None:
+def test_a_saved_model_is_the_same_to_the_last_bit(tmp_path_factory, model):
     path = tmp_path_factory.getbasetemp() / "any.model.json"
     model.save(path)
     loaded = UncertainLTI.load(path)
@@ -342,9 +316,8 @@ def test_a_model_fitted_to_arrays_has_a_file_too(tmp_path: Path) -> None:
 
 def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "m.json"
-    model = UncertainLTI(
-        ONE, ONE, ONE, ONE, fit_summary={"a": NAN, "b": np.arange(2), "c": np.float64(INF), "d": np.bool_(1)}
-    )
+    odd = {"a": NAN, "b": np.arange(2), "c": np.float64(INF), "d": np.bool_(1)}
+    model = UncertainLTI(ONE, ONE, ONE, ONE, fit_summary=odd)
     model.save(path)
     assert UncertainLTI.load(path).fit_summary == {"a": None, "b": [0, 1], "c": None, "d": True}
     whole = path.read_bytes()
@@ -579,9 +552,7 @@ RESIDUALS: list[tuple[str, Any, str]] = [
         *((f"horizons.0.residuals{place}", value, f"(?=.*horizon).*{words}") for place, value, words in RESIDUALS),
     ],
 )
-def test_a_damaged_file_with_everything_armed_is_refused_by_file_and_field(
-    place: str, value: Any, words: str, tmp_path: Path
-) -> None:
+def test_a_damaged_file_with_everything_armed_is_refused_by_file_and_field(place, value, words, tmp_path):
     refused(write(tmp_path, put(armed(), place, value)), words)
 
 

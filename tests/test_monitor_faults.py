@@ -9,8 +9,6 @@
 
 """What befalls a monitor on a robot, with real publishers in other processes: it survives, tells, and never lies."""
 
-from __future__ import annotations
-
 import random
 import signal
 import subprocess
@@ -285,9 +283,8 @@ class Sends:
         self.now, self.used = 100.0, 0.0
         self.sending = dict.fromkeys(("flags", "lower", "violation"), (5e-6, 5e-6))  # processor time and time, s
         its_module = sys.modules[Sender.__module__]
-        clock = SimpleNamespace(
-            monotonic=lambda: self.now, thread_time=lambda: self.used, time_ns=time.time_ns, sleep=time.sleep
-        )
+        moved = {"monotonic": lambda: self.now, "thread_time": lambda: self.used}
+        clock = SimpleNamespace(**moved, time_ns=time.time_ns, sleep=time.sleep)
         monkeypatch.setattr(its_module, "time", clock)
         self.model = by_hand(alarm_rule=AlarmRule(3, 20))
         self.node = stream_cases.Node(saved(self.model, tmp_path))
@@ -591,9 +588,7 @@ rclpy.shutdown()
 """
 
 
-def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_is_told(
-    world: World, tmp_path: Path
-) -> None:
+def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_is_told(world, tmp_path):
     model = by_hand()
     process = world.monitor(saved(model, tmp_path), diagnostics_period=0.1)
     diagnostics = world.diagnostics()

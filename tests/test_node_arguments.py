@@ -9,8 +9,6 @@
 
 """Arguments that a node cannot use: one sentence with the remedy and status 2, never a traceback; and `--help`."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -190,9 +188,8 @@ def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path:
     with open_world(tmp_path) as world:
         starts(world, shared, "parameter robot_description is ignored")
         for file in (others, empty):
-            starts(
-                world, file, f"{file.name}: nothing in it is for this node; name the section envelope_monitor or /**"
-            )
+            nothing = f"{file.name}: nothing in it is for this node; name the section envelope_monitor or /**"
+            starts(world, file, nothing)
 
 
 _STUCK = """

@@ -9,8 +9,6 @@
 
 """What ROS 2 people expect of a node: parameters that describe themselves, QoS that is followed, executors, clocks."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
@@ -50,9 +48,7 @@ NODE = "/envelope_monitor"
 
 
 @pytest.mark.parametrize("own", ["", "FASTRTPS_DEFAULT_PROFILES_FILE", "DEFAULT_FASTRTPS_PROFILES.xml"])
-def test_writers_wake_the_middleware_seldom_unless_the_user_says_otherwise(
-    own: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_writers_wake_the_middleware_seldom_unless_the_user_says_otherwise(own, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", "")
     monkeypatch.delenv("FASTDDS_DEFAULT_PROFILES_FILE", raising=False)
@@ -83,9 +79,8 @@ def test_every_parameter_tells_its_meaning_range_and_whether_it_can_be_set(world
     file = str(ROOT / "config" / "envelope_monitor.yaml")
     world.run_node("envelope_monitor", {}, "--params-file", file, "-p", "autostart:=false")
     names = [p.name for p in PARAMETERS]
-    described = world.call(
-        DescribeParameters, f"{NODE}/describe_parameters", DescribeParameters.Request(names=names)
-    ).descriptors
+    request = DescribeParameters.Request(names=names)
+    described = world.call(DescribeParameters, f"{NODE}/describe_parameters", request).descriptors
     assert [d.name for d in described] == names
     for parameter, descriptor in zip(PARAMETERS, described, strict=True):
         assert descriptor.description == parameter.text and len(parameter.text) > 20
@@ -281,9 +276,8 @@ def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_pat
     point = model.operating_point
     now = 10**12
     got: list[float] = []
-    for step in (
-        [STEP_NS] * 5 + [100 * STEP_NS] + [STEP_NS] * 3 + [-1000 * STEP_NS] + [STEP_NS] * 3 + [0, 0] + [STEP_NS]
-    ):
+    steps = [*[1] * 5, 100, *[1] * 3, -1000, *[1] * 3, 0, 0, 1]
+    for step in (STEP_NS * k for k in steps):
         now += step
         message = Clock()
         message.clock.sec, message.clock.nanosec = divmod(now, 10**9)

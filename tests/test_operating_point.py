@@ -9,8 +9,6 @@
 
 """Normalisation, and what `auto` resolves to."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -39,9 +37,8 @@ number = st.floats(-1e6, 1e6)
 def test_normalisation_is_as_method_section_1_states_it(data: st.DataObject) -> None:
     n, m = data.draw(st.integers(1, 4)), data.draw(st.integers(0, 3))
     vector = lambda size, elements: data.draw(hnp.arrays(float, size, elements=elements))  # noqa: E731
-    point = OperatingPoint(
-        vector(n, number), vector(m, number), vector(n, st.floats(1e-3, 1e3)), vector(m, st.floats(1e-3, 1e3))
-    )
+    units = (vector(size, st.floats(1e-3, 1e3)) for size in (n, m))
+    point = OperatingPoint(vector(n, number), vector(m, number), *units)
     lead = data.draw(hnp.array_shapes(max_dims=2, max_side=3) | st.just(()))
     x, u = vector((*lead, n), number), vector((*lead, m), number)
     deviation = point.normalise_x(x)
@@ -171,10 +168,7 @@ def test_a_signal_that_never_comes_stays_at_zero_and_one() -> None:
 
 @given(st.lists(recorded(), min_size=1, max_size=2).filter(lambda r: len({x.shape[1] for x in r}) == 1), st.data())
 def test_what_is_said_stays_and_what_is_resolved_can_be_used(recordings: list[np.ndarray], data: st.DataObject) -> None:
-    said = [
-        (data.draw(st.sampled_from(["auto", 3.5])), data.draw(st.sampled_from(["auto", 2.5])))
-        for _ in range(recordings[0].shape[1])
-    ]
+    said = [tuple(data.draw(st.sampled_from(["auto", one])) for one in (3.5, 2.5)) for _ in recordings[0].T]
     steady, scale, words = resolve_auto(signals(*said), recordings)
     assert words
     for (said_steady, said_scale), s, c in zip(said, steady, scale, strict=True):
@@ -218,9 +212,8 @@ def test_what_settles_by_itself_at_its_least_value_is_steady() -> None:
 
 
 def test_a_machine_at_rest_is_no_end_stop() -> None:
-    throttle = np.concatenate(
-        [np.zeros(300), np.linspace(0, 1, 40), np.full(60, 0.7), np.linspace(1, 0, 40), np.zeros(300)]
-    )
+    up, down = np.linspace(0, 1, 40), np.linspace(1, 0, 40)
+    throttle = np.concatenate([np.zeros(300), up, np.full(60, 0.7), down, np.zeros(300)])
     steady, _, words = resolve_auto(signals(AUTO), [throttle[:, None]])
     assert steady == [0.0] and "end stop" not in words
 

@@ -9,8 +9,6 @@
 
 """A subscriber of another DDS vendor gets every flag with the right content: the wire seen from outside rclpy."""
 
-from __future__ import annotations
-
 import json
 from itertools import groupby
 from pathlib import Path

@@ -102,13 +102,8 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     numbers |= {o.velocity: np.array([getattr(v, o.velocity) for v in verdicts]) for o in RECORDED if o.velocity}
     records = VerdictRecords(every, {output.name: i for i, output in enumerate(outputs)})
     times = np.arange(3)
-    data, _ = records.encode(
-        times,
-        np.array([v.t_ns for v in verdicts]),
-        np.array([v.judged for v in verdicts]),
-        np.array([v.alarm for v in verdicts]),
-        numbers,
-    )
+    said = (np.array([getattr(v, name) for v in verdicts]) for name in ("t_ns", "judged", "alarm"))
+    data, _ = records.encode(times, *said, numbers)
     for output in outputs:
         for verdict in verdicts:
             if output.position:

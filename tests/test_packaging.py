@@ -41,22 +41,10 @@ LIVE = [
 
 # Where the name to import is not the name to install.
 PIP_NAME = {"yaml": "pyyaml"}
-ROSDEP_KEY = {
-    "cvxpy": "python3-cvxpy-pip",
-    "highspy": "python3-cvxpy-pip",
-    "jinja2": "python3-jinja2",
-    "lz4": "mcap-ros2-support",
-    "markupsafe": "python3-jinja2",
-    "matplotlib": "python3-matplotlib",
-    "mcap": "mcap-ros2-support",
-    "numpy": "python3-numpy",
-    "osqp": "python3-cvxpy-pip",
-    "rosbags": "python3-rosbags-pip",
-    "scipy": "python3-scipy",
-    "tqdm": "python3-tqdm",
-    "yaml": "python3-yaml",
-    "zstandard": "mcap-ros2-support",
-}
+ROSDEP_KEY = {name: f"python3-{name}" for name in ("jinja2", "matplotlib", "numpy", "scipy", "tqdm", "yaml")}
+ROSDEP_KEY |= {"markupsafe": "python3-jinja2", "rosbags": "python3-rosbags-pip"}
+ROSDEP_KEY |= dict.fromkeys(("cvxpy", "highspy", "osqp"), "python3-cvxpy-pip")
+ROSDEP_KEY |= dict.fromkeys(("lz4", "mcap", "zstandard"), "mcap-ros2-support")
 WITHOUT_ROSDEP_KEY = {"control", "daqp", "distributed", "piqp", "threadpoolctl"}
 
 
@@ -164,9 +152,8 @@ def test_every_package_and_file_of_the_source_is_installed(distribution):
             made = path.suffix == ".so"  # by an installation that is edited in place
             if path.is_dir() or made or "__pycache__" in path.parts or path.name.startswith("."):
                 continue
-            folder = (
-                path.parent if path.suffix == ".py" else next(f for f in path.parents if (f / "__init__.py").exists())
-            )
+            above = (f for f in path.parents if (f / "__init__.py").exists())
+            folder = path.parent if path.suffix == ".py" else next(above)
             home = str(folder.relative_to(ROOT))
             assert home in homes, f"{home} holds {path.name} and is no package"
             patterns = distribution.package_data.get(homes[home], [])

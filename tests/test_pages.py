@@ -167,10 +167,8 @@ def test_what_was_fitted_proves_nothing(engine, cli, tmp_path):
 def test_names_from_files_are_text(engine):
     """In names, units, notes, messages, sections of the model file and paths."""
     model = UncertainLTI.load(engine / "m.model.json")
-    signals = replace(
-        model.signals,
-        states=tuple(replace(s, name=f"{HOSTILE}{i}", unit=HOSTILE) for i, s in enumerate(model.signals.states)),
-    )
+    states = tuple(replace(s, name=f"{HOSTILE}{i}", unit=HOSTILE) for i, s in enumerate(model.signals.states))
+    signals = replace(model.signals, states=states)
     nasty = {
         **model.fit_summary,
         "criterion": HOSTILE,
@@ -209,9 +207,8 @@ def test_a_report_of_very_much_stays_one_page():
     text = html_report(model, verdicts, findings(model, "m", verdicts))
     assert len(text) < 3_000_000 and text.count("<tr>") < 200
     rng, n = np.random.default_rng(0), 50
-    model = UncertainLTI(
-        -np.eye(n), rng.normal(size=(n, 3)), 0.1 * np.ones((n, n)), np.zeros((n, 3)), v=np.full(n, 0.05)
-    )
+    B, widths = rng.normal(size=(n, 3)), (0.1 * np.ones((n, n)), np.zeros((n, 3)))
+    model = UncertainLTI(-np.eye(n), B, *widths, v=np.full(n, 0.05))
     runs = [0.01 * rng.normal(size=(800, n)) + (k == 7) * rng.normal(size=(800, n)) for k in range(40)]
     verdicts = [
         EnvelopeMonitor(model).check(Transient(np.arange(800) * 0.01, x, np.zeros((800, 3)), name=f"run {k}"))
@@ -251,9 +248,8 @@ def test_a_short_recording_is_drawn_sample_by_sample():
     assert top["title"] not in page["note"] and top["note"] not in page["note"], "it is said above the panel"
     assert top["levels"] == [1.0] and np.nanmax(array(top["values"]["least"])) > 1 and "x1" in top["note"]
     shown, drawn = times(page["times"][0]), array(panel["values"]["least"])
-    assert (
-        np.isnan(drawn).sum() == 1 and np.isnan(drawn[200]) and shown[200] == shown[201] == 7.0
-    )  # a gap parts the line
+    # a gap parts the line
+    assert np.isnan(drawn).sum() == 1 and np.isnan(drawn[200]) and shown[200] == shown[201] == 7.0
     keep = ~np.isnan(drawn)
     assert np.array_equal(shown[keep], verdicts.transient.t)
     assert np.allclose(drawn[keep], x[:, 0], rtol=0, atol=1e-5)

@@ -39,15 +39,9 @@ def by_hand(n, m, name="x", width=1.0):
     rng = np.random.default_rng(n)
     states = tuple(Signal(name=f"{name}{i}", topic="/s", field=f"data[{i}]", unit="$kPa$", scale=2.0) for i in range(n))
     controls = tuple(Signal(name=f"u{i}", topic="/c", field=f"data[{i}]") for i in range(m))
-    return UncertainLTI(
-        -np.eye(n),
-        rng.normal(size=(n, m)),
-        width * np.abs(rng.normal(size=(n, n))),
-        width * np.abs(rng.normal(size=(n, m))),
-        dc=np.full(n, 0.1 * width),
-        v=np.full(n, 0.01 * width),
-        signals=SignalMap(states=states, controls=controls),
-    )
+    matrices = -np.eye(n), rng.normal(size=(n, m)), *(width * np.abs(rng.normal(size=(n, k))) for k in (n, m))
+    signals = SignalMap(states=states, controls=controls)
+    return UncertainLTI(*matrices, dc=np.full(n, 0.1 * width), v=np.full(n, 0.01 * width), signals=signals)
 
 
 def checked(model, count, jumps=(), gaps=(), back=(), unknown=()):

@@ -9,8 +9,6 @@
 
 """Recordings into transients: synthetic ones against the rules worked out naively, real ones against a plain reader."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -36,7 +34,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 from steps import holds
-from test_sampler import Reference, Sent, cases
+from test_sampler import Reference, cases
 
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -58,9 +56,8 @@ def save(
 ) -> Path:
     """A recording of (topic, log time, data)."""
     channels = [Topic(topic, type_name) for topic, type_name in topics.items()]
-    return write(channels, [Message(t, at, data, at) for t, at, data in messages], layout or Layout()).save(
-        folder / name
-    )
+    sent = [Message(t, at, data, at) for t, at, data in messages]
+    return write(channels, sent, layout or Layout()).save(folder / name)
 
 
 # --- synthetic recordings against the naive reference ---------------------------------------------------------
@@ -85,20 +82,14 @@ def same(transient: Transient, reference: Reference) -> None:
 
 @settings(max_examples=50)
 @given(cases() | cases(tame=True), st.sampled_from(["none", "lz4", "zstd"]))
-def test_recordings_become_what_the_rules_say(
-    tmp_path_factory: pytest.TempPathFactory, case: tuple[SignalMap, list[Sent]], compression: str
-) -> None:
+def test_recordings_become_what_the_rules_say(tmp_path_factory, case, compression):
     signals, messages = case
     signals = by_position(signals)
     if len({s.topic for s in signals.states}) == 1:
         signals = replace(signals, max_skew=None)  # else an error: it would limit nothing
-    path = save(
-        tmp_path_factory.getbasetemp(),
-        dict.fromkeys(signals.topics, JOINT_STATE),
-        [(m.topic, m.arrival, joint_state(max(m.stamp or 0, 0), m.values)) for m in messages],
-        "any.mcap",
-        Layout(compression, chunk_size=300),
-    )
+    sent = [(m.topic, m.arrival, joint_state(max(m.stamp or 0, 0), m.values)) for m in messages]
+    types, layout = dict.fromkeys(signals.topics, JOINT_STATE), Layout(compression, chunk_size=300)
+    path = save(tmp_path_factory.getbasetemp(), types, sent, "any.mcap", layout)
     arrived = sorted(messages, key=lambda m: m.arrival)  # log time, then file order
     reference = Reference(signals, arrived, forgets=True)
     silent = [t for t in signals.topics if not any(m.topic == t for m in messages)]
@@ -131,9 +122,8 @@ VICON = "/vicon/Group466CF/Group466CF/pose"
 
 
 def roll(q: Any) -> float:
-    return math.atan2(
-        2.0 * (q.w * q.x + q.y * q.z), q.x * q.x + q.y * q.y + q.z * q.z + q.w * q.w - 2.0 * (q.x * q.x + q.y * q.y)
-    )
+    w, x, y, z = q.w, q.x, q.y, q.z
+    return math.atan2(2.0 * (w * x + y * z), x * x + y * y + z * z + w * w - 2.0 * (x * x + y * y))
 
 
 READ: dict[str, tuple[str, str, Any, str, Any, float | None]] = {
@@ -482,7 +472,8 @@ def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:
 
 def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path: Path) -> None:
     """A model that goes by stamps, and a recording without; or whose clock never speaks."""
-    good = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, joint_state((k + 1) * MS, [k])) for k in range(9)])
+    stamped = [("/x", k * MS, joint_state((k + 1) * MS, [k])) for k in range(9)]
+    good = save(tmp_path, {"/x": JOINT_STATE}, stamped)
     (fitted,) = read_transients(good, SignalMap((Signal("x", "/x", "position[0]"),)))
     assert fitted.signals is not None
     model = model_of(fitted.signals)
@@ -493,12 +484,7 @@ def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path
     with pytest.raises(BagError, match="silent.mcap: /x has no message; record it"):
         read_as_fitted(silent, model.signals)
     driven = replace(fitted.signals, controls=(Signal("y", "/y", "data"),), time={**fitted.signals.time, "/y": "log"})
-    quiet = save(
-        tmp_path,
-        {"/x": JOINT_STATE, "/y": FLOAT64},
-        [("/x", k * MS, joint_state((k + 1) * MS, [k])) for k in range(9)],
-        "quiet.mcap",
-    )
+    quiet = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, stamped, "quiet.mcap")
     with pytest.raises(BagError, match="quiet.mcap: /y has no message; record it"):
         read_as_fitted(quiet, model_of(driven).signals)
     vague = model_of(SignalMap((Signal("x", "/x", "position[0]"),)))

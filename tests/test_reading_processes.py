@@ -9,8 +9,6 @@
 
 """Recordings read in processes side by side: as one after the other, in what is read, said and refused."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -98,14 +96,9 @@ def test_a_process_that_is_killed_is_an_error_and_not_a_hang(tmp_path: Path) -> 
 @pytest.mark.slow
 def test_interrupted_it_leaves_no_process_and_no_traceback_of_theirs(tmp_path: Path) -> None:
     script = SCRIPT.format(paths=[str(p) for p in runs(tmp_path)])
-    reader = subprocess.Popen(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    command, pipes = [sys.executable, "-c", textwrap.dedent(script)], ("stdin", "stdout", "stderr")
+    streams = dict.fromkeys(pipes, subprocess.PIPE)
+    reader = subprocess.Popen(command, text=True, start_new_session=True, **streams)
     with reader:
         assert reader.stdout is not None
         assert reader.stdout.readline() == "reading\n"

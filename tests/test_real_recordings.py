@@ -94,10 +94,8 @@ def test_commands_from_bag_to_verdict(recordings, signals_folder, tmp_path, cli)
 
 def test_other_run_of_the_same_machine(recordings, signals_folder):
     """Hunter SE: a repeat stays inside, another throttle level is said to leave the fitted domain."""
-    runs = {
-        n: recordings / f"hunter_se/straight_{n}.mcap"
-        for n in ("odd_t_0_5_run_01", "odd_t_0_5_run_02", "even_t_0_2_run_01")
-    }
+    names = "odd_t_0_5_run_01", "odd_t_0_5_run_02", "even_t_0_2_run_01"
+    runs = {name: recordings / f"hunter_se/straight_{name}.mcap" for name in names}
     model = fit(read_transients(runs["odd_t_0_5_run_01"], signals_folder / "hunter_se.yaml"), additive="disturbance")
     same = EnvelopeMonitor(model).check(read_as_fitted(runs["odd_t_0_5_run_02"], model.signals))
     assert same.violated.sum() < 0.005 * same.judged.sum()
@@ -115,9 +113,8 @@ def test_gas_turbine_recordings_differ_and_the_check_says_so(recordings, signals
     assert strange.violated.sum() > 0.9 * strange.judged.sum()
     both = fit(read_transients([folder / "ex_1.mcap", folder / "ex_20.mcap"], signals), additive="noise")
     both.save(tmp_path / "m.model.json")
-    ramps = EnvelopeMonitor(UncertainLTI.load(tmp_path / "m.model.json")).check(
-        read_as_fitted(folder / "ex_24.mcap", both.signals)
-    )
+    model = UncertainLTI.load(tmp_path / "m.model.json")
+    ramps = EnvelopeMonitor(model).check(read_as_fitted(folder / "ex_24.mcap", both.signals))
     assert ramps.violated.sum() < 0.01 * ramps.judged.sum()
 
 
@@ -125,9 +122,8 @@ def test_rlc_circuit_with_known_truth(recordings):
     """The circuit is linear and the record noisy: the fit finds the true one-step matrices, with a narrow envelope."""
     from uncertain_lti import OperatingPoint, Transient
 
-    t = Transient.from_csv(
-        recordings / "rlc/RLC_data_id_lin.csv", time="time", states=["V_C", "I_L"], controls=["V_IN"]
-    )
+    path = recordings / "rlc/RLC_data_id_lin.csv"
+    t = Transient.from_csv(path, time="time", states=["V_C", "I_L"], controls=["V_IN"])
     R, C, L, dt = 3.0, 270e-9, 50e-6, 5e-7
     model = fit(t, additive="noise", operating_point=OperatingPoint([0, 0], [0], [100.0, 10.0], [100.0]))
     continuous = np.array([[0.0, 0.1 / C], [-10 / L, -R / L]])

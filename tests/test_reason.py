@@ -10,7 +10,6 @@
 """Reasons in words: what holds the alarm and why there is no verdict, live as over a recording."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -84,9 +83,8 @@ def test_live_and_over_a_recording_the_words_are_the_same(rules: tuple[Rule, ...
 
 def test_a_mode_that_is_not_listed_is_named_live_and_over_a_recording() -> None:
     gear = Schedule((Axis("gear", modes=(1.0, 2.0)),))
-    states, controls, further = (
-        tuple(Signal(n, f"/{n}", "data") for n in names) for names in (["x1", "x2"], ["u1"], ["gear"])
-    )
+    named = ["x1", "x2"], ["u1"], ["gear"]
+    states, controls, further = (tuple(Signal(n, f"/{n}", "data") for n in names) for names in named)
     plain = model_with(RULES["containment"])
     model = UncertainLTI(
         **{name: np.stack([getattr(plain, name)] * 2) for name in ("A", "B", "dA", "dB", "v")},
@@ -156,9 +154,7 @@ def test_a_jump_larger_than_any_of_the_fit_is_named_with_its_limit() -> None:
         (50, {"t": round(3e9) * np.arange(50)}, "check a recording at the rate of the fit"),
     ],
 )
-def test_where_no_verdict_was_possible_the_reason_comes_with_a_remedy(
-    steps: int, change: dict[str, Any], remedy: str
-) -> None:
+def test_where_no_verdict_was_possible_the_reason_comes_with_a_remedy(steps, change, remedy):
     rng = np.random.default_rng(6)
     t, x, u = round(1e8) * np.arange(400), np.cumsum(rng.normal(size=(400, 1)), axis=0), rng.normal(size=(400, 1))
     model = fit([Transient(t, x, u)], additive="noise")

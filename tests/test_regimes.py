@@ -9,8 +9,6 @@
 
 """Scheduled models: every command and report works with them, says what each regime rests on, and draws it."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -43,18 +41,13 @@ CASES = {"knots": Schedule((SPEED,)), "modes": Schedule((GEAR,)), "two axes": Sc
 def signal_map(schedule: Schedule) -> SignalMap:
     """Two states and a control on two topics, and the gear on a third."""
     further = [axis.signal for axis in schedule.axes if axis.signal == "gear"]
-    return SignalMap(
-        (
-            Signal("speed", "/state", "position[speed]", 3.0, 2.0, "m/s", "sensor_msgs/msg/JointState"),
-            Signal("b", "/state", "position[b]", unit="K", type="sensor_msgs/msg/JointState"),
-        ),
-        (Signal("c", "/control", "position[c]", type="sensor_msgs/msg/JointState"),),
-        tuple(Signal(name, "/gear", "data", type="std_msgs/msg/Float64") for name in further),
-        clock="/state",
-        max_gap=0.2,
-        max_skew=0.2,
-        time={"/state": "header", "/control": "header"} | ({"/gear": "log"} if further else {}),
-    )
+    kind = "sensor_msgs/msg/JointState"
+    speed = Signal("speed", "/state", "position[speed]", 3.0, 2.0, "m/s", kind)
+    states = speed, Signal("b", "/state", "position[b]", unit="K", type=kind)
+    controls = (Signal("c", "/control", "position[c]", type=kind),)
+    gear = tuple(Signal(name, "/gear", "data", type="std_msgs/msg/Float64") for name in further)
+    time = {"/state": "header", "/control": "header"} | ({"/gear": "log"} if further else {})
+    return SignalMap(states, controls, gear, clock="/state", max_gap=0.2, max_skew=0.2, time=time)
 
 
 def model_of(case: str, **changes: Any) -> UncertainLTI:
@@ -70,14 +63,9 @@ def model_of(case: str, **changes: Any) -> UncertainLTI:
         "max_width_recorded": [0.3, 0.2],
         "blocks": [{"mean_width": [0.1 + r, 0.2], "max_width": [0.2 + r, 0.3]} if r else {} for r in range(R)],
     }
-    return model.replace(
-        **small,
-        signals=signals,
-        sampling=Sampling(0.05, 0.05, 0.05),
-        block_data=[BlockData(100 * r, 1 if r in (0, R - 1) else None) for r in range(R)],
-        fit_summary=facts,
-        **changes,
-    )
+    data = [BlockData(100 * r, 1 if r in (0, R - 1) else None) for r in range(R)]
+    known = {"signals": signals, "sampling": Sampling(0.05, 0.05, 0.05), "block_data": data, "fit_summary": facts}
+    return model.replace(**small, **known, **changes)
 
 
 def arrays(strange: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -81,9 +81,8 @@ def experiment(tmp_path_factory):
 
 
 def case(data, name, criterion="qp", additive="none"):
-    (found,) = [
-        c for c in data["cases"] if (c["identified_from"], c["criterion"], c["additive"]) == (name, criterion, additive)
-    ]
+    wanted = name, criterion, additive
+    (found,) = [c for c in data["cases"] if (c["identified_from"], c["criterion"], c["additive"]) == wanted]
     return found
 
 

@@ -29,9 +29,8 @@ from conftest import ROOT
 
 VERSION = "{}.{}".format(*sys.version_info)
 
-pytestmark = pytest.mark.skipif(
-    (platform.system(), platform.machine()) != ("Linux", "x86_64"), reason="the rclpy wheels are for x86_64 Linux"
-)
+here = platform.system(), platform.machine()
+pytestmark = pytest.mark.skipif(here != ("Linux", "x86_64"), reason="the rclpy wheels are for x86_64 Linux")
 
 LISTED = re.findall(r'^    "(\w+)\.(\w+)": "-O', (ROOT / "setup.py").read_text(), re.MULTILINE)
 COMPILED = [
@@ -67,14 +66,9 @@ def run(tmp_path):
         for name, text in (programs or {}).items():
             (bin / name).write_text(f"#!{bin}/bash\n{text}\n")
             (bin / name).chmod(0o755)
-        return subprocess.run(
-            [checkout / "run", *arguments],
-            env={"PATH": str(bin), "HOME": str(tmp_path), "PIP_CONFIG_FILE": os.devnull, **environment},
-            cwd=cwd,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-        )
+        env = {"PATH": str(bin), "HOME": str(tmp_path), "PIP_CONFIG_FILE": os.devnull, **environment}
+        options = {"stdin": subprocess.DEVNULL, "capture_output": True, "text": True}
+        return subprocess.run([checkout / "run", *arguments], env=env, cwd=cwd, **options)
 
     return call
 
@@ -149,9 +143,8 @@ def test_python_without_ensurepip_takes_pip_from_the_index(run, tmp_path):
         index = {"PIP_INDEX_URL": f"http://127.0.0.1:{server.server_address[1]}/simple"}
         programs = {"python3": without("ensurepip", tmp_path)}
         first = run("setup", programs=programs, **index)
-        page[0] = b"".join(
-            f'<a href="../../p/pip-{v}-py3-none-any.whl#sha256={"0" * 64}">'.encode() for v in ("9.0", "25.1")
-        )
+        link = '<a href="../../p/pip-{}-py3-none-any.whl#sha256={}">'
+        page[0] = b"".join(link.format(v, "0" * 64).encode() for v in ("9.0", "25.1"))
         second = run("setup", programs=programs, **index)
         server.shutdown()
     assert first.returncode == second.returncode == 2
@@ -279,14 +272,9 @@ def test_a_start_from_the_environment_itself_does_not_make_it_again(run, slow, t
 def test_ctrl_c_while_installing_is_one_sentence_and_130(run, slow, tmp_path):
     (tmp_path / "bin" / "python3").write_text(f"#!{tmp_path / 'bin'}/bash\n{slow}\n")
     (tmp_path / "bin" / "python3").chmod(0o755)
-    process = subprocess.Popen(
-        [tmp_path / "a checkout" / "run", "setup"],
-        env={"PATH": str(tmp_path / "bin"), "HOME": str(tmp_path)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
+    env = {"PATH": str(tmp_path / "bin"), "HOME": str(tmp_path)}
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "start_new_session": True}
+    process = subprocess.Popen([tmp_path / "a checkout" / "run", "setup"], env=env, **options)
     deadline = time.monotonic() + 300
     while not (tmp_path / "made").exists() and time.monotonic() < deadline:
         time.sleep(0.02)
@@ -303,13 +291,8 @@ def test_a_checkout_of_somebody_else_is_a_sentence(run, tmp_path):
     try:
         shutil.copytree(tmp_path / "a checkout", folder, dirs_exist_ok=True)
         folder.chmod(0o755)
-        done = subprocess.run(
-            [folder / "run", "setup"],
-            env={"PATH": f"{Path(sys.executable).resolve().parent}:/usr/bin:/bin", "HOME": "/"},
-            user=65534,
-            capture_output=True,
-            text=True,
-        )
+        env = {"PATH": f"{Path(sys.executable).resolve().parent}:/usr/bin:/bin", "HOME": "/"}
+        done = subprocess.run([folder / "run", "setup"], env=env, user=65534, capture_output=True, text=True)
     finally:
         shutil.rmtree(folder)
     if "Python 3.11, 3.12 or 3.13 is needed" in done.stderr:
@@ -322,12 +305,9 @@ def test_a_machine_without_loopback_is_a_sentence(run, tmp_path, command):
     unshare = shutil.which("unshare")
     if not unshare or subprocess.run([unshare, "-rn", "true"], capture_output=True).returncode:
         pytest.skip("this user cannot be without a network")
-    done = subprocess.run(
-        [unshare, "-rn", tmp_path / "a checkout" / "run", command],
-        capture_output=True,
-        text=True,
-        env={"PATH": f"{Path(sys.executable).resolve().parent}:{os.environ['PATH']}"},
-    )
+    env = {"PATH": f"{Path(sys.executable).resolve().parent}:{os.environ['PATH']}"}
+    line = [unshare, "-rn", tmp_path / "a checkout" / "run", command]
+    done = subprocess.run(line, capture_output=True, text=True, env=env)
     assert "the loopback interface of this machine is down" in refusal(done) and "ip link set lo up" in done.stderr
 
 

@@ -9,8 +9,6 @@
 
 """The Sampler against its rules, worked out naively with every message in hand."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -134,9 +132,8 @@ class Reference:
         for stamped in (True, False):
             mine = [i for i in self.by_topic[topic] if (self.stamp(i) is not None) == stamped]
             instants = [self.stamp(i) if stamped else self.sent[i].arrival for i in mine]
-            found += [
-                i for i, now, last in zip(mine[1:], instants[1:], instants, strict=False) if last - now > self.max_gap
-            ]
+            pairs = zip(mine[1:], instants[1:], instants, strict=False)
+            found += [i for i, now, last in pairs if last - now > self.max_gap]
         return sorted(found)
 
     def _values(self, topic: str) -> dict[int, list[float]]:
@@ -331,9 +328,8 @@ class Reference:
                 continue
             if one_topic:
                 row = [NAN] * (n + m)
-                for position, value in zip(
-                    self.signals.on(self.signals.clock), self.values[self.signals.clock][sample.index], strict=True
-                ):
+                where, values = self.signals.on(self.signals.clock), self.values[self.signals.clock][sample.index]
+                for position, value in zip(where, values, strict=True):
                     row[position] = value
                 at_end = np.array(row)
             else:
@@ -347,21 +343,15 @@ class Reference:
             if status is Status.OK and not (np.isfinite(z).all() and np.isfinite(x_next).all()):
                 status = Status.MISSING
                 self.counters["missing"] += 1
-            decided[index].append(
-                Step(status, sample.instant, self.sent[sample.index].arrival, sample.dt, z.tolist(), x_next.tolist())
-            )
+            arrival, rows = self.sent[sample.index].arrival, (z.tolist(), x_next.tolist())
+            decided[index].append(Step(status, sample.instant, arrival, sample.dt, *rows))
         return decided
 
 
 def plain(step: Step) -> tuple[object, ...]:
     """A step as something that can be compared: numbers by their bits."""
-    return (
-        step.status,
-        step.t_ns,
-        step.arrival_ns,
-        float(step.dt).hex(),
-        *([float(v).hex() for v in row] for row in (step.x, step.u, step.x_next)),
-    )
+    rows = ([float(v).hex() for v in row] for row in (step.x, step.u, step.x_next))
+    return step.status, step.t_ns, step.arrival_ns, float(step.dt).hex(), *rows
 
 
 def run(signals: SignalMap, messages: Sequence[Sent]) -> tuple[list[list[Step]], Sampler]:
@@ -380,13 +370,10 @@ def only(steps: list[list[Step]]) -> list[Step]:
 def maps(draw: st.DrawFn) -> SignalMap:
     """Clock /c; a second state on /c or on /s; controls on /c, /s, /u, /v."""
     limits = st.sampled_from([None, 0.0, 0.02, 0.05, 1.0])
-    states = [
-        Signal("x1", "/c", draw(st.sampled_from(["data", "unwrap(data)"])), steady=draw(st.sampled_from([0.0, 7.0])))
-    ]
+    fields = st.sampled_from(["data", "unwrap(data)"])
+    states = [Signal("x1", "/c", draw(fields), steady=draw(st.sampled_from([0.0, 7.0])))]
     if draw(st.booleans()):
-        states.append(
-            Signal("x2", draw(st.sampled_from(["/c", "/s"])), draw(st.sampled_from(["data", "unwrap(data)"])))
-        )
+        states.append(Signal("x2", draw(st.sampled_from(["/c", "/s"])), draw(fields)))
     controls = [
         Signal(f"u{j}", topic, "data", max_hold=draw(limits), delay=draw(st.sampled_from([0, 0, 0, 1, 3])))
         for j, topic in enumerate(draw(st.lists(st.sampled_from(["/c", "/s", "/u", "/u", "/v"]), max_size=3)))
@@ -405,16 +392,11 @@ def maps(draw: st.DrawFn) -> SignalMap:
             for group in (states, controls)
         )
     topics = dict.fromkeys(s.topic for s in [*states, *controls])
-    return SignalMap(
-        tuple(states),
-        tuple(controls),
-        clock="/c",
-        max_gap=draw(st.sampled_from([0.02, 0.05])),
-        min_step=draw(st.sampled_from([0.0, 0.0, 0.02])),
-        max_skew=draw(st.sampled_from([None, None, 0.02, 1.0])),
-        step=draw(st.sampled_from(["recorded", "recorded", 0.011])),
-        time={t: draw(st.sampled_from(["header", "header", "log"])) for t in topics},
-    )
+    limits = {"max_gap": draw(st.sampled_from([0.02, 0.05])), "min_step": draw(st.sampled_from([0.0, 0.0, 0.02]))}
+    limits |= {"max_skew": draw(st.sampled_from([None, None, 0.02, 1.0]))}
+    limits |= {"step": draw(st.sampled_from(["recorded", "recorded", 0.011]))}
+    time = {t: draw(st.sampled_from(["header", "header", "log"])) for t in topics}
+    return SignalMap(tuple(states), tuple(controls), clock="/c", time=time, **limits)
 
 
 VALUES = st.sampled_from([0.0, 1.0, -2.5, 3.0, -3.1, 3.1, 6.0, 100.0])
@@ -467,9 +449,8 @@ def hold_against(reference: Reference, signals: SignalMap, messages: list[Sent])
     if any(b.arrival < a.arrival for a, b in zip(messages, messages[1:], strict=False)):
         # The Sampler looks back no further than the first sample that a message is not late for: enough as long as
         # the node's clock does not step back alone.
-        counted, wanted_counts = (
-            {key: count for key, count in c.items() if not key.startswith("late /")} for c in (counted, wanted_counts)
-        )
+        kept = ({key: n for key, n in c.items() if not key.startswith("late /")} for c in (counted, wanted_counts))
+        counted, wanted_counts = kept
     assert counted == wanted_counts
 
 

@@ -9,8 +9,6 @@
 
 """Weights of a schedule: interpolation between knots, modes, two signals, and what is not known."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -217,9 +217,8 @@ def test_a_number_of_knots_is_placed_where_the_residual_is_largest():
     """Most of the data is where the plant is linear; its kink is in the part that is seldom visited."""
     rng = np.random.default_rng(0)
     N = 4000
-    u = np.repeat(
-        np.where(rng.random(N // 5 + 1) < 0.9, rng.uniform(0, 1, N // 5 + 1), rng.uniform(1, 3, N // 5 + 1)), 5
-    )
+    often = rng.random(N // 5 + 1) < 0.9
+    u = np.repeat(np.where(often, rng.uniform(0, 1, N // 5 + 1), rng.uniform(1, 3, N // 5 + 1)), 5)
     u = u[: N + 1, None]
     x = np.zeros((N + 1, 1))
     for k in range(N):
@@ -253,9 +252,8 @@ def test_recordings_beyond_the_end_knots_are_noted_with_their_range():
     given = fit(transient, additive="both", schedule={"u1": (-0.5, 0.5)})
     (said,) = [m for m in given.fit_summary["messages"] if "beyond its knots" in m]
     share = np.mean(np.abs(inside) > 0.5)
-    assert said.startswith(
-        f"u1 goes from {inside.min():.5g} to {inside.max():.5g} in the recordings, and {share:.2%} of"
-    )
+    reached = f"u1 goes from {inside.min():.5g} to {inside.max():.5g} in the recordings"
+    assert said.startswith(f"{reached}, and {share:.2%} of")
     for knots in (3, (-1, 0, 1)):
         said = fit(transient, additive="both", schedule={"u1": knots}).fit_summary["messages"]
         assert not any("beyond its knots" in m for m in said)
@@ -400,9 +398,7 @@ def test_the_signals_file_schedules_a_fit():
     from uncertain_lti.signals.signal_map import ScheduleRule
 
     transient = drawn(THREE, 400, 14, noise=1e-3)
-    signals = SignalMap(
-        tuple(Signal(name, "", name) for name in ("x1", "x2")), tuple(Signal(name, "", name) for name in ("u1", "u2"))
-    )
+    signals = SignalMap(*(tuple(Signal(name, "", name) for name in names) for names in (NAMES[:2], NAMES[2:])))
     rules = (ScheduleRule("u1", (-1.0, 0.0, 1.0)),)
     told = Transient(transient.t_ns, transient.x, transient.u, signals=replace(signals, schedule=rules))
     model, expected = fit(told, additive="both"), fit(transient, additive="both", schedule=THREE)

@@ -144,12 +144,9 @@ def test_groups_are_left_out_together():
 def with_further(transients):
     """The runs with a signal that is neither state nor control: what bends the plant, and one that is nothing to it."""
     rng = np.random.default_rng(3)
-    signals = SignalMap(
-        tuple(Signal(f"x{i}", "/t", f"x{i}", steady=0.0, scale=1.0) for i in (1, 2)),
-        tuple(Signal(f"u{i}", "/t", f"u{i}", steady=0.0, scale=1.0) for i in (1, 2)),
-        tuple(Signal(name, "/t", name, steady=0.0, scale=1.0) for name in ("level", "weather")),
-        schedule=(ScheduleRule("weather", "auto"),),
-    )
+    named = ("x1", "x2"), ("u1", "u2"), ("level", "weather")
+    groups = (tuple(Signal(name, "/t", name, steady=0.0, scale=1.0) for name in names) for names in named)
+    signals = SignalMap(*groups, schedule=(ScheduleRule("weather", "auto"),))
     further = [np.column_stack([t.x[:, 0], np.repeat(rng.uniform(-1, 1, len(t)), 9)[: len(t)]]) for t in transients]
     return [t.replace(s=s, signals=signals) for t, s in zip(transients, further, strict=True)]
 
@@ -164,9 +161,8 @@ def test_a_further_signal_that_is_not_worth_knots_is_no_part_of_the_model():
     np.testing.assert_array_equal(model.dA, plain.dA)
     left = [[part.violated for part in validate(t, full=model, additive="noise").parts] for t in (runs, LINEAR)]
     assert left[0] == left[1]
-    np.testing.assert_array_equal(
-        EnvelopeMonitor(model).check(runs[0]).upper, EnvelopeMonitor(model).check(LINEAR[0]).upper
-    )
+    mine, theirs = (EnvelopeMonitor(model).check(run) for run in (runs[0], LINEAR[0]))
+    np.testing.assert_array_equal(mine.upper, theirs.upper)
     discrepancies = [run_over(model, t) for t in (runs[0], LINEAR[0])]
     np.testing.assert_array_equal(*discrepancies)
 
@@ -196,9 +192,8 @@ def test_what_is_no_choice_is_refused_by_name():
 def test_a_rule_for_one_knot_needs_knots_that_are_given():
     runs = with_further(RUNS)
     rules = [{"state": "x1", "from": "u2", "nominal": 0, "knot": 1}]
-    runs = [
-        t.replace(signals=replace(t.signals, structure=rules, schedule=(ScheduleRule("level", "auto"),))) for t in runs
-    ]
+    changed = {"structure": rules, "schedule": (ScheduleRule("level", "auto"),)}
+    runs = [t.replace(signals=replace(t.signals, **changed)) for t in runs]
     with pytest.raises(FitError, match=r"structure\[0\]: knot is 1, and the knots of 'level' are auto"):
         fit(runs, **options())
     model = fit(runs, schedule={"level": 2}, **options())

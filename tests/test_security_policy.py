@@ -9,8 +9,6 @@
 
 """The policy for SROS2 against the graph: it allows what the node has there, and nothing that it has not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
@@ -33,9 +31,8 @@ def allowed(kind: str, qualifier: str) -> set[str]:
     assert (profile.get("ns"), profile.get("node")) == ("/", NODE)
     found: list[str] = []
     for group in profile.iter(f"{kind}s"):
-        assert set(group.attrib) <= {"publish", "subscribe", "reply", "request"} and {*group.attrib.values()} == {
-            "ALLOW"
-        }
+        assert set(group.attrib) <= {"publish", "subscribe", "reply", "request"}
+        assert {*group.attrib.values()} == {"ALLOW"}
         if qualifier in group.attrib:
             found += [str(entry.text).replace("~", f"/{NODE}") for entry in group.iter(kind)]
     assert len(set(found)) == len(found), "something is allowed twice"

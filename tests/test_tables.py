@@ -88,9 +88,8 @@ def tables(shipped, names, tmp_path_factory):
     made[".mat"] = folder / "run.mat"
     from scipy.io import savemat
 
-    savemat(
-        made[".mat"], {"time_ns": t, "data": dict(zip(names, z.T, strict=True)), "rate": 40.0}, long_field_names=True
-    )
+    content = {"time_ns": t, "data": dict(zip(names, z.T, strict=True)), "rate": 40.0}
+    savemat(made[".mat"], content, long_field_names=True)
     return made
 
 
@@ -330,9 +329,8 @@ def test_what_is_wrong_with_the_layout_is_said(many, tmp_path, table, words):
 
 def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
     signals = SignalMap.from_dict({"states": [{"name": "v", "topic": "/table", "field": "fan_sped"}]})
-    with pytest.raises(
-        SignalError, match=r"run\.csv: field 'fan_sped' of /table .*\(is fan_speed meant\?\).*fields there:"
-    ):
+    words = r"run\.csv: field 'fan_sped' of /table .*\(is fan_speed meant\?\).*fields there:"
+    with pytest.raises(SignalError, match=words):
         read_transients(tables[".csv"], signals)
     with pytest.raises(BagError, match=r"run\.csv: there is no topic /engine/state; topics there: /table"):
         read_transients(tables[".csv"], SIGNALS)
@@ -397,9 +395,8 @@ def test_damage_anywhere_is_read_or_a_sentence(tables, kind, tmp_path):
 
 
 def test_a_folder_of_tables_is_not_one_recording(tables):
-    with pytest.raises(
-        BagError, match=r"a folder of tables, each of which is a recording; name them one by one: run.csv"
-    ):
+    words = "a folder of tables, each of which is a recording; name them one by one: run.csv"
+    with pytest.raises(BagError, match=words):
         group_recordings([tables[".csv"].parent])
 
 
@@ -461,9 +458,8 @@ def test_a_damaged_time_costs_its_row(tmp_path):
 
 
 def test_a_counter_tells_no_runs_where_stamps_repeat(tmp_path):
-    path = write(
-        tmp_path / "a.csv", "time,speed,minutes_on", *(f"{k // 40},{math.sin(k)},{k // 40}" for k in range(400))
-    )
+    rows = (f"{k // 40},{math.sin(k)},{k // 40}" for k in range(400))
+    path = write(tmp_path / "a.csv", "time,speed,minutes_on", *rows)
     assert run_column(group_recordings([path])) == ""
 
 
@@ -586,9 +582,10 @@ def test_times_as_spreadsheets_and_controllers_write_them(form, tmp_path):
     assert set(np.diff(bag.times).tolist()) == {10**9} and list(bag.columns_by_field) == ["x", "Temp"]
 
 
-@pytest.mark.parametrize(
-    ("day", "clock"), [("%d/%m/%Y", "%I:%M:%S %p"), ("%Y-%m-%d", "%H:%M:%S.%f"), ("%d.%m.%y", "%H:%M")]
-)
+WRITTEN_APART = [("%d/%m/%Y", "%I:%M:%S %p"), ("%Y-%m-%d", "%H:%M:%S.%f"), ("%d.%m.%y", "%H:%M")]
+
+
+@pytest.mark.parametrize(("day", "clock"), WRITTEN_APART)
 def test_days_beside_times_of_day_are_theirs(day, clock, tmp_path, capsys):
     """`init` took the day for the name of a run, as the time steps back at midnight, and ended in a traceback."""
     path, start = tmp_path / "a.csv", datetime(2024, 3, 13, 22)

@@ -9,8 +9,6 @@
 
 """Templates: one entry for many alike, and a structure in which each depends on its own."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -9,8 +9,6 @@
 
 """Transients: cut as the Sampler cuts, the same from arrays, data frames and CSV, and clear about what is wrong."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections import Counter
@@ -55,14 +53,9 @@ def runs(draw: st.DrawFn) -> tuple[np.ndarray, np.ndarray, np.ndarray, float, fl
 def test_cut_and_judged_usable_as_the_sampler_does(run: tuple[Any, ...]) -> None:
     t, x, u, max_gap, min_step = run
     n, m = x.shape[1], u.shape[1]
-    signals = SignalMap(
-        tuple(Signal(f"x{i}", "/c", f"x{i}") for i in range(n)),
-        tuple(Signal(f"u{j}", "/c", f"u{j}") for j in range(m)),
-        clock="/c",
-        max_gap=max_gap,
-        min_step=min_step,
-        time={"/c": "log"},
-    )
+    named = (tuple(Signal(f"{a}{i}", "/c", f"{a}{i}") for i in range(k)) for a, k in (("x", n), ("u", m)))
+    limits = {"max_gap": max_gap, "min_step": min_step}
+    signals = SignalMap(*named, clock="/c", time={"/c": "log"}, **limits)
     sampler = Sampler(signals)
     decided = [s for i in range(len(t)) for s in sampler.push("/c", int(t[i]), None, [*x[i], *u[i]])]
     kept = [s for s in decided if not s.status.dropped]
@@ -295,9 +288,7 @@ def read(folder: Path, text: str | bytes, **options: Any) -> Transient:
 
 @settings(max_examples=40)
 @given(runs(), st.sampled_from([",", ";", "\t"]), st.booleans())
-def test_a_csv_file_gives_what_its_arrays_give(
-    tmp_path_factory: pytest.TempPathFactory, run: tuple[Any, ...], delimiter: str, quoted: bool
-) -> None:
+def test_a_csv_file_gives_what_its_arrays_give(tmp_path_factory, run, delimiter, quoted):
     t, x, u, max_gap, min_step = run
     states, controls = [f"s{i}" for i in range(x.shape[1])], [f"c{j}" for j in range(u.shape[1])]
     quote = '"{}"'.format if quoted else str

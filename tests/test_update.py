@@ -114,9 +114,8 @@ def test_an_alarm_that_was_changed_stays():
     model = fit(runs[:3], "qp", additive="noise")
     by_hand = model.replace(alarm=model.alarm[:1])
     updated = by_hand.update(runs[3])
-    assert (
-        updated.alarm == by_hand.alarm and "alarm is that of before the update" in updated.fit_summary["alarm"]["note"]
-    )
+    assert updated.alarm == by_hand.alarm
+    assert "alarm is that of before the update" in updated.fit_summary["alarm"]["note"]
 
 
 def test_a_recording_that_is_given_again_counts_once():

@@ -181,11 +181,9 @@ def test_the_summary_adds_up(validation, runs):
 @pytest.mark.parametrize(("m", "n"), [(1, 1), (2, 3), (5, 10)])
 def test_alarms_are_those_of_the_monitor_at_any_margin(validation, runs, m, n):
     """Also where time jumps back in the middle of a transient, and where verdicts are missing."""
-    looped = Transient(
-        np.concatenate([runs[0].t_ns, runs[1].t_ns]),
-        np.vstack([np.where(np.arange(101)[:, None] == 40, np.nan, runs[0].x), runs[1].x * 1.3]),
-        np.vstack([runs[0].u, runs[1].u]),
-    )
+    first, second = runs[:2]
+    x = np.vstack([np.where(np.arange(101)[:, None] == 40, np.nan, first.x), second.x * 1.3])
+    looped = Transient(np.concatenate([first.t_ns, second.t_ns]), x, np.vstack([first.u, second.u]))
     part = judge(validation.model, validation.model, looped, "looped")
     assert len(part.starts) == 2
     for margin in (0.2, 0.4, 0.77, 1.0, 1.5):
@@ -299,9 +297,8 @@ def test_a_whole_group_is_left_out_at_a_time(days):
             assert parts[runs[i].name].violated == verdicts.violated.sum()
     data = validation.to_dict()
     assert data["parts"] == 12 and data["groups"]["count"] == 3
-    assert sorted(data["groups"]["recordings"]["day 2"]) == sorted(
-        r.name for r, n in zip(runs, names, strict=True) if n == "day 2"
-    )
+    of_day_2 = [r.name for r, n in zip(runs, names, strict=True) if n == "day 2"]
+    assert sorted(data["groups"]["recordings"]["day 2"]) == sorted(of_day_2)
     counts = [sum(p.violated for p in validation.parts if p.group == f"day {g}") for g in range(3)]
     low, high = rate_interval(counts, 1200, 0.9)
     assert data["inside_interval"] == [max(0.0, 1 - high), 1 - low]

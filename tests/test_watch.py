@@ -9,8 +9,6 @@
 
 """`watch`: its page shows what the monitor says, to this machine alone, in a browser too."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
