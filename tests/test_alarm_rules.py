@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from uncertain_lti import Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
@@ -59,8 +60,7 @@ def test_one_rule_for_one_step_stays_in_format_1() -> None:
     model = two_states(alarm_rule=AlarmRule(2, 3)).replace(horizons=(), residuals=None)
     data = model.to_dict()
     assert data["format"] == "uncertain-lti/1" and data["alarm"] == {"violations": 2, "window": 3, "margin": 1.0}
-    with pytest.raises(ModelError, match="unknown field 'alarm.rules'"):
-        UncertainLTI.from_dict({**data, "alarm": {"rules": []}})
+    refuses(ModelError, "unknown field 'alarm.rules'", UncertainLTI.from_dict, {**data, "alarm": {"rules": []}})
 
 
 def test_the_containment_rule_is_replaced_among_the_others() -> None:
@@ -79,8 +79,7 @@ def test_the_containment_rule_is_replaced_among_the_others() -> None:
     ],
 )
 def test_an_alarm_that_cannot_be_is_refused(alarm: list[Any], words: str) -> None:
-    with pytest.raises(ModelError, match=words):
-        two_states(alarm=alarm)
+    refuses(ModelError, words, two_states, alarm=alarm)
 
 
 def test_chi2_needs_the_covariance() -> None:
@@ -213,5 +212,4 @@ PATHS = [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)",
 
 @pytest.mark.parametrize(("field", "what"), PATHS)
 def test_a_condition_on_what_needs_a_history_is_refused(field: str, what: str) -> None:
-    with pytest.raises(ModelError, match=f"cannot be compared, as {what} needs a history"):
-        Condition.parse(f"/machine/mode {field} > 1")
+    refuses(ModelError, f"cannot be compared, as {what} needs a history", Condition.parse, f"/machine/mode {field} > 1")

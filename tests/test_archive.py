@@ -19,6 +19,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
+from refusals import refuses
 
 import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, read_transients
@@ -93,11 +94,9 @@ def test_a_copy_among_the_recordings_is_refused(bags, tmp_path, monkeypatch):
     copy = tmp_path / "copied.mcap"
     copy.write_bytes(paths[5].read_bytes())
     message = f"^{re.escape(str(copy))}: holds the samples of {re.escape(str(paths[5]))}; name each recording once"
-    with pytest.raises(BagError, match=message):
-        public_fit.fit_many([*paths, copy], signals, cache=tmp_path / "cache")
+    refuses(BagError, message, public_fit.fit_many, [*paths, copy], signals, cache=tmp_path / "cache")
     monkeypatch.setattr(public_fit, "SAMPLE", sum(t.x.size + t.u.size for t in read_transients(paths[:3], signals)))
-    with pytest.raises(BagError, match=message):
-        public_fit.fit_many([*paths, copy], signals, cache=tmp_path / "cache")
+    refuses(BagError, message, public_fit.fit_many, [*paths, copy], signals, cache=tmp_path / "cache")
     assert not (tmp_path / "cache").exists()
 
 
@@ -185,24 +184,20 @@ def test_cut_cache_and_wrong_folders_are_named(tmp_path):
     (tmp_path / "other" / "thesis.tex").write_text("")
     (tmp_path / "c" / ".transitions.f64-x.tmp").write_bytes(b"of a writer that was killed")
     write_cache(tmp_path / "c", [problem])
-    with pytest.raises(FitError, match=r"thesis\.tex.*no cache"):
-        write_cache(tmp_path / "other", [problem])
+    refuses(FitError, r"thesis\.tex.*no cache", write_cache, tmp_path / "other", [problem])
 
 
 def test_bad_archives_are_refused(bags, tmp_path):
     signals, paths = bags
     auto = tmp_path / "auto.yaml"
     auto.write_text(SIGNALS.replace('field: "position[fan_speed]"', 'field: "position[fan_speed]", steady: auto'))
-    with pytest.raises(SignalError, match="'fan' has auto"):
-        fit_archive(paths, auto, cache=tmp_path / "c")
-    with pytest.raises(FitError, match="cache or on a cluster"):
-        fit_archive(paths, signals)
+    refuses(SignalError, "'fan' has auto", fit_archive, paths, auto, cache=tmp_path / "c")
+    refuses(FitError, "cache or on a cluster", fit_archive, paths, signals)
     rest = tmp_path / "rest.yaml"
     rest.write_text(SIGNALS)
     still = engine_bag(tmp_path / "still.mcap", 60, change=lambda k, x: x * 0 + (1.0 if k == 40 else 0.0))
     control = engine_bag(tmp_path / "moving.mcap", 60, 3)
-    with pytest.raises(FitError, match="at rest.*--additive noise"):
-        fit_archive([still, control], rest, cache=tmp_path / "c")
+    refuses(FitError, "at rest.*--additive noise", fit_archive, [still, control], rest, cache=tmp_path / "c")
 
 
 @contextmanager
@@ -270,8 +265,7 @@ def test_errors_of_workers_are_sentences(bags, cluster, tmp_path):
     signals, paths = bags
     wrong = tmp_path / "wrong.yaml"
     wrong.write_text(SIGNALS.replace("position[fan_speed]", "position[fan]"))
-    with pytest.raises(SignalError, match="there is no 'fan' in the message's names"):
-        fit_archive(paths, wrong, client=cluster[1])
+    refuses(SignalError, "there is no 'fan' in the message's names", fit_archive, paths, wrong, client=cluster[1])
 
 
 def test_cache_of_the_command(bags, tmp_path, capsys):

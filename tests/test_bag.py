@@ -56,6 +56,7 @@ from mcap.records import Channel
 from mcap.records import Message as McapMessage
 from mcap.stream_reader import StreamReader
 from processes import bounded
+from refusals import refuses
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
@@ -380,9 +381,7 @@ def test_a_topic_that_cannot_be_decoded_disturbs_no_other(case: str, tmp_path: P
         assert [raw.data for raw in bag.raw_messages(["/bad"])] == [float64(7)]
     info = bag.topics["/bad"]
     assert not info.readable and reason in info.reason and bag.topics["/good"].readable
-    with pytest.raises(BagError, match="topic /bad cannot be decoded") as caught:
-        bag.messages(["/good", "/bad"])
-    assert reason in str(caught.value) and "\n" not in str(caught.value)
+    assert reason in refuses(BagError, "topic /bad cannot be decoded", bag.messages, ["/good", "/bad"])
     assert {item.info.topic for item in bag.facts()} == {"/good", "/bad"}
 
 
@@ -397,8 +396,7 @@ def test_a_chunk_that_is_too_large_is_told_how_to_make_smaller(tmp_path: Path) -
 def test_a_topic_that_is_not_there(tmp_path: Path) -> None:
     bag = with_good([Topic("/other")], [], tmp_path)
     for read in (bag.messages, bag.raw_messages):
-        with pytest.raises(BagError, match=r"there is no topic /nix; topics there: /good, /other"):
-            read(["/nix"])
+        refuses(BagError, r"there is no topic /nix; topics there: /good, /other", read, ["/nix"])
 
 
 def test_schema_names_with_and_without_msg(tmp_path: Path) -> None:
@@ -710,10 +708,8 @@ def test_folders_and_files_in_the_order_given(tmp_path: Path) -> None:
     third = part(0, 9).save(tmp_path / "x_6.mcap")
     assert names(group_recordings([other, folder, third])) == [["x_5.mcap"], ["x_6.mcap"], ["f_0.mcap"]]
     for twice in ([other, other], [folder, folder], [folder, folder / "f_0.mcap"]):
-        with pytest.raises(BagError, match="named twice"):
-            group_recordings(twice)
-    with pytest.raises(BagError, match="there is no such file"):
-        group_recordings([other, tmp_path / "x_9.mcap"])
+        refuses(BagError, "named twice", group_recordings, twice)
+    refuses(BagError, "there is no such file", group_recordings, [other, tmp_path / "x_9.mcap"])
 
 
 # --- what could be a signal ---------------------------------------------------------------------------------

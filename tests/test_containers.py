@@ -18,6 +18,7 @@ from contextlib import closing
 import pytest
 from engine_bag import SIGNALS, engine_bag
 from processes import bounded
+from refusals import refuses
 from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
@@ -194,8 +195,7 @@ def test_a_ros_1_bag_whose_recorder_was_killed(converted, tmp_path):
     data[at : at + 8] = bytes(8)
     path = tmp_path / "active.bag"
     path.write_bytes(data[:begin])
-    with pytest.raises(BagError, match=r"not indexed.*mend it with `rosbag reindex active\.bag`"):
-        Bag(path)
+    refuses(BagError, r"not indexed.*mend it with `rosbag reindex active\.bag`", Bag, path)
 
 
 def database_of(path, *statements):
@@ -215,8 +215,7 @@ def test_databases_that_are_no_recording(tmp_path):
     broken = ["CREATE TABLE cookies(id)"], [TOPICS, endless], [TOPICS, "CREATE TABLE messages(id, payload)"]
     for number, statements in enumerate(broken):
         path = database_of(tmp_path / f"{number}.db3", *statements)
-        with pytest.raises(BagError, match=r"\d\.db3: is cut or damaged or no recording of ROS 2"):
-            Bag(path)
+        refuses(BagError, r"\d\.db3: is cut or damaged or no recording of ROS 2", Bag, path)
 
 
 def test_rows_that_are_no_messages_are_left_out(tmp_path):
@@ -258,8 +257,7 @@ def test_an_index_of_a_database_that_lacks_rows_is_not_believed_in_silence(conve
 )
 def test_other_versions_and_no_space_for_nothing(name, data, words, tmp_path):
     (tmp_path / name).write_bytes(data)
-    with pytest.raises(BagError, match=words):
-        Bag(tmp_path / name)
+    refuses(BagError, words, Bag, tmp_path / name)
 
 
 def test_elements_without_bytes_do_not_take_for_ever(tmp_path):

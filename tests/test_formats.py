@@ -18,6 +18,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from conftest import ROOT
+from refusals import refuses
 
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import BagError
@@ -106,13 +107,11 @@ def test_a_format_added_to_the_table_serves_every_command(run, tmp_path, cli):
 def test_recordings_of_several_formats_are_named_together(run, tmp_path):
     bag = ROOT / "bags" / "leibov_check.mcap"
     assert [type(r) for r in group_recordings([run, bag])] == [Table, Bag]
-    with pytest.raises(BagError, match="named twice"):
-        group_recordings([run, bag, run])
+    refuses(BagError, "named twice", group_recordings, [run, bag, run])
     again = shutil.copy(bag, tmp_path / "again.mcap")  # it would vouch for itself in what is left out
     with pytest.raises(BagError, match=r"again\.mcap: holds the samples of .*leibov_check\.mcap; name each"):
         read_transients([bag, again], ROOT / "config" / "signals" / "engine.yaml")
 
 
 def test_without_an_entry_the_file_is_refused_in_a_sentence(run):
-    with pytest.raises(BagError, match=r"run\.log: a text file, while a recording is wanted"):
-        open_recording(run)
+    refuses(BagError, r"run\.log: a text file, while a recording is wanted", open_recording, run)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refuses
 from test_horizon_fit import runs
 
 import uncertain_lti
@@ -38,8 +39,7 @@ def test_lengths_are_geometric_up_to_the_longest() -> None:
     assert lengths_of(HorizonRule(seconds=(0.5, 0.1)), RUNS) == [5, 25]
     assert lengths_of(HorizonRule(steps=(90, 3)), RUNS) == [3, 90]  # listed one by one they may be longer
     for rule in (HorizonRule(longest=0.02), HorizonRule(seconds=(0.01,))):
-        with pytest.raises(FitError, match=r"median step is 0.02 s"):
-            lengths_of(rule, RUNS)
+        refuses(FitError, r"median step is 0.02 s", lengths_of, rule, RUNS)
 
 
 @pytest.mark.parametrize(
@@ -71,10 +71,8 @@ def test_a_rule_is_read_from_arguments_and_signals_files(data: Any, rule: Horizo
     ],
 )
 def test_what_is_no_rule_is_refused_in_one_sentence(data: Any, words: str) -> None:
-    with pytest.raises(SignalError, match=words):
-        HorizonRule.of(data, "a.yaml: horizons")
-    with pytest.raises(FitError, match=words):
-        fit(RUNS, horizons=data)
+    refuses(SignalError, words, HorizonRule.of, data, "a.yaml: horizons")
+    refuses(FitError, words, fit, RUNS, horizons=data)
 
 
 def test_what_holds_on_left_out_data_stays_with_a_table_that_says_why() -> None:
@@ -138,11 +136,8 @@ def test_an_empty_list_means_one_step_whatever_the_signals_file_asks_for() -> No
 
 
 def test_widths_without_horizons_and_weights_with_a_choice_are_refused() -> None:
-    with pytest.raises(FitError, match="widths is 'wide'; write auto, growing or constant"):
-        fit(RUNS, horizons=[3], widths="wide")
-    with pytest.raises(FitError, match="no horizons are asked for"):
-        fit(RUNS, widths="constant")
+    refuses(FitError, "widths is 'wide'; write auto, growing or constant", fit, RUNS, horizons=[3], widths="wide")
+    refuses(FitError, "no horizons are asked for", fit, RUNS, widths="constant")
     with pytest.raises(FitError, match="transient_weights are for all"):
         fit(RUNS, horizons="auto", transient_weights=[1.0, 2.0, 1.0, 1.0])
-    with pytest.raises(FitError, match="groups are given"):
-        fit(RUNS, horizons=[3], widths="growing", groups=["a", "a", "b", "b"])
+    refuses(FitError, "groups are given", fit, RUNS, horizons=[3], widths="growing", groups=["a", "a", "b", "b"])

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from coil import coil_runs
 from engine_bag import SIGNALS, engine_bag
+from refusals import refuses
 from tanks import Tanks
 
 from uncertain_lti import Transient, UncertainLTI
@@ -250,10 +251,8 @@ def test_sizes_have_the_order_that_they_must_have(validation, found):
 def test_what_cannot_be_known_is_refused_in_words(validation):
     too_long = detectable(validation.model, validation.parts, 100.0)
     assert "lasts 100 s without a gap" in too_long.refused and not too_long.faults
-    with pytest.raises(FitError, match="positive number of seconds"):
-        detectable(validation.model, validation.parts, -1.0)
-    with pytest.raises(FitError, match="there is no fault 'rust'"):
-        detectable(validation.model, validation.parts, kinds=("rust",))
+    refuses(FitError, "positive number of seconds", detectable, validation.model, validation.parts, -1.0)
+    refuses(FitError, "there is no fault 'rust'", detectable, validation.model, validation.parts, kinds=("rust",))
     unstable = validation.model.replace(A=validation.model.A + 50.0 * np.eye(3))
     seen = detectable(unstable, validation.parts, kinds=("offset", "gain"))
     assert all("runs away" in fault.refused for fault in seen.faults)

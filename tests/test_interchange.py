@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 from test_schedule import scheduled
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, read_transients, validate
@@ -95,17 +96,13 @@ def test_what_is_no_model_is_refused():
     import control
 
     model = some_model()
-    with pytest.raises(ModelError, match="positive number of seconds"):
-        model.to_control(dt=0.0)
+    refuses(ModelError, "positive number of seconds", model.to_control, dt=0.0)
     ss = control.ss([[0.5]], [[1.0]], [[2.0]], [[0.0]])
-    with pytest.raises(ModelError, match="outputs are not its states"):
-        UncertainLTI.from_control(ss)
+    refuses(ModelError, "outputs are not its states", UncertainLTI.from_control, ss)
     with pytest.raises(ModelError, match="does not say its step"):
         UncertainLTI.from_control(control.ss([[0.5]], [[1.0]], [[1.0]], [[0.0]], True))
-    with pytest.raises(ModelError, match="need the scales"):
-        UncertainLTI.from_control(model.to_control(recorded=True), recorded=True)
-    with pytest.raises(ModelError, match="dA"):
-        UncertainLTI.from_control(model.to_control(), dA=[[1.0]])
+    refuses(ModelError, "need the scales", UncertainLTI.from_control, model.to_control(recorded=True), recorded=True)
+    refuses(ModelError, "dA", UncertainLTI.from_control, model.to_control(), dA=[[1.0]])
     with pytest.raises(ModelError, match="called 'disturbance'"):
         UncertainLTI(
             [[1.0]], [[1.0]], [[0.0]], [[0.0]], [1.0],
@@ -157,12 +154,10 @@ def test_a_file_written_by_hand(tmp_path):
 
 def test_mat_files_that_are_none(tmp_path):
     path = tmp_path / "m.mat"
-    with pytest.raises(ModelError, match="no such file"):
-        UncertainLTI.load_mat(path)
+    refuses(ModelError, "no such file", UncertainLTI.load_mat, path)
     for data in (b"", b"MATLAB 5.0", bytes(200), b"\x00" * 127 + b"\x02IM" + bytes(64)):
         path.write_bytes(data)
-        with pytest.raises(ModelError, match=r"m\.mat"):
-            UncertainLTI.load_mat(path)
+        refuses(ModelError, r"m\.mat", UncertainLTI.load_mat, path)
     model = some_model(2, 1)
     model.save_mat(path)
     whole = path.read_bytes()
@@ -182,10 +177,8 @@ def test_mat_files_that_are_none(tmp_path):
     ):
         model.save_mat(path)
         scipy_io.savemat(path, {k: v for k, v in (loaded(path) | change).items() if v is not None})
-        with pytest.raises(ModelError, match=words):
-            UncertainLTI.load_mat(path)
-    with pytest.raises(ModelError, match="cannot be written"):
-        model.save_mat(tmp_path / "no folder" / "m.mat")
+        refuses(ModelError, words, UncertainLTI.load_mat, path)
+    refuses(ModelError, "cannot be written", model.save_mat, tmp_path / "no folder" / "m.mat")
 
 
 # --- how results print ------------------------------------------------------------------------------------------
@@ -312,10 +305,8 @@ def test_a_scheduled_model_is_one_system_per_block_and_one_at_a_point():
     calm = model.replace(c=np.where(np.arange(3)[:, None] == 1, model.c, 0.0))
     assert [list(s.input_labels) for s in calm.to_control()] == [["c", "disturbance"]] * 3
     for knot in (-1, 3):
-        with pytest.raises(ModelError, match="blocks 0 to 2"):
-            model.to_control(knot=knot)
-    with pytest.raises(ModelError, match="no schedule"):
-        some_model().to_control(knot=0)
+        refuses(ModelError, "blocks 0 to 2", model.to_control, knot=knot)
+    refuses(ModelError, "no schedule", some_model().to_control, knot=0)
 
 
 @pytest.mark.parametrize(("axes", "further", "n", "m"), SCHEDULES)
@@ -369,5 +360,4 @@ def test_a_damaged_schedule_is_refused_by_its_variable(change, words, tmp_path):
     data = loaded(tmp_path / "m.mat", "model_json")
     change(data)
     scipy_io.savemat(tmp_path / "m.mat", data)
-    with pytest.raises(ModelError, match=words):
-        UncertainLTI.load_mat(tmp_path / "m.mat")
+    refuses(ModelError, words, UncertainLTI.load_mat, tmp_path / "m.mat")

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from uncertain_lti import SignalMap, UncertainLTI
 from uncertain_lti.kernel import arithmetic
@@ -175,26 +176,21 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
     one, two = np.ones((2, 4)), np.ones(2)
     point = np.zeros(3), np.ones(3), np.zeros(3), np.ones(3)
     for bad in ((one[:1], one, two), (one, one[:, :2], two), (one, one, two[:1])):
-        with pytest.raises(ValueError, match="fit"):
-            arithmetic.Judge(*bad, *point, 1.0, np.array([True, True]))
-    with pytest.raises(ValueError, match="fit"):
-        arithmetic.Judge(one, one, two, point[0][:1], *point[1:], 1.0, np.array([True, True]))
+        refuses(ValueError, "fit", arithmetic.Judge, *bad, *point, 1.0, np.array([True, True]))
+    refuses(ValueError, "fit", arithmetic.Judge, one, one, two, point[0][:1], *point[1:], 1.0, np.array([True, True]))
     judge = arithmetic.Judge(one, one, two, *point, 1.0, np.array([True, True]))
     samples = np.zeros((4, 2)), np.zeros((4, 1)), np.zeros((4, 0))
     for before, after in (([0.0], [0.0, 0.0]), ([0.0] * 3, [0.0]), ([], [])):
-        with pytest.raises(ValueError, match="values for"):
-            judge.judge(before, after, 0.1)
+        refuses(ValueError, "values for", judge.judge, before, after, 0.1)
     with pytest.raises((TypeError, ValueError)):
         judge.judge(["a", "b", "c"], [0.0, 0.0], 0.1)  # type: ignore[list-item]
     with pytest.raises(ValueError, match="fit"):
         arithmetic.centre_and_half((one, one, two), np.zeros((3, 5)), np.zeros(4), np.zeros((2, 5)), np.zeros((2, 5)))
     marks, two = np.empty(4, np.uint8), [None, np.empty((4, 2)), None, None, None]
     for numbers, some in (([np.empty((4, 3)), *two[1:]], marks), (two[:4], marks), (two, marks[:3])):
-        with pytest.raises(ValueError, match="fit"):
-            judge.judge_rows(*samples, [0], [0.1], numbers, some)
+        refuses(ValueError, "fit", judge.judge_rows, *samples, [0], [0.1], numbers, some)
     for k in ([-1], [3], [4]):
-        with pytest.raises(ValueError, match="fit the recording"):
-            judge.judge_rows(*samples, k, [0.1], two, marks)
+        refuses(ValueError, "fit the recording", judge.judge_rows, *samples, k, [0.1], two, marks)
 
 
 # --- repeats ------------------------------------------------------------------------------------------------------

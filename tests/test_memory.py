@@ -13,6 +13,7 @@ import math
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI, validate
 from uncertain_lti.base.errors import ModelError, SignalError, TransientError
@@ -60,8 +61,7 @@ def test_a_path_with_a_memory_is_read_and_written(text: str, memory: Memory | No
     ],
 )
 def test_a_wrong_memory_is_refused(text: str, words: str) -> None:
-    with pytest.raises(SignalError, match=words):
-        FieldPath(text)
+    refuses(SignalError, words, FieldPath, text)
 
 
 def pair(**more: object) -> dict[str, object]:
@@ -136,8 +136,7 @@ def test_a_model_that_remembers_has_a_newer_format_and_an_older_one_may_not_say_
     assert UncertainLTI.from_dict(data).signals.signals == signals.signals
     data = remembering({"A": [[1.0]], "B": np.zeros((1, 0))}, plain).to_dict()
     data["sampling"]["step"] = 0.01
-    with pytest.raises(ModelError, match="unknown field 'sampling.step'"):
-        UncertainLTI.from_dict(data)
+    refuses(ModelError, "unknown field 'sampling.step'", UncertainLTI.from_dict, data)
 
 
 def test_a_check_takes_the_step_of_the_model() -> None:
@@ -196,8 +195,7 @@ def test_no_memory_is_a_candidate_where_every_state_is_measured() -> None:
     [({"m": ("swin", Memory("lag"))}, "is swing meant"), ({"push": ("swing", Memory("lag"))}, "already")],
 )
 def test_a_memory_of_nothing_or_under_a_taken_name_is_refused(memories: dict[str, object], words: str) -> None:
-    with pytest.raises(TransientError, match=words):
-        with_memories(oscillating(1), memories)  # type: ignore[arg-type]
+    refuses(TransientError, words, with_memories, oscillating(1), memories)  # type: ignore[arg-type]
 
 
 def test_a_delayed_control_is_that_of_a_signals_file_with_the_delay() -> None:
@@ -217,8 +215,7 @@ def test_a_delayed_control_is_that_of_a_signals_file_with_the_delay() -> None:
 @pytest.mark.parametrize(("name", "words"), [("swing", "there is no control"), ("push_before", "takes no delay")])
 def test_what_is_no_control_or_a_memory_takes_no_delay(name: str, words: str) -> None:
     run = remember([oscillating(1)], [Remembered("push", Memory("lag"))])[0]
-    with pytest.raises(TransientError, match=words):
-        with_delays(run, {name: 1})
+    refuses(TransientError, words, with_delays, run, {name: 1})
 
 
 def test_the_lag_of_a_delayed_signal_is_as_much_longer_and_it_has_no_other_memory() -> None:

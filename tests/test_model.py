@@ -23,6 +23,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from perturbed import armed_model
+from refusals import refuses
 from test_signals import damaged
 
 from uncertain_lti.base.arrays import LARGEST, LONGEST_S
@@ -128,8 +129,7 @@ def test_samples_controls_and_steps_are_broadcast() -> None:
 @pytest.mark.parametrize(("x", "u"), [((2,), (1,)), ((3,), (2,)), ((5, 3), (5,)), ((), (1,))])
 def test_wrong_shapes_are_said(x: tuple[int, ...], u: tuple[int, ...]) -> None:
     model = random_model(np.random.default_rng(0), 3, 1)
-    with pytest.raises(ModelError, match="they must end in 3 and 1"):
-        model.bounds(np.ones(x), np.ones(u), 0.1)
+    refuses(ModelError, "they must end in 3 and 1", model.bounds, np.ones(x), np.ones(u), 0.1)
 
 
 # --- discrepancies (4)(5) and the nominal model ---------------------------------------------------------------
@@ -188,8 +188,7 @@ def test_a_free_run_follows_the_controls_and_begins_again_after_gaps() -> None:
     expected = model.operating_point.recorded_x(naive_run(model, recording))
     np.testing.assert_allclose(free.x, expected)
     assert np.isnan(expected[10]).all() and np.isfinite(np.delete(expected, 10, axis=0)).all()
-    with pytest.raises(ModelError, match="it has 3 states, 1 controls"):
-        model.free_run(Transient(t, np.zeros((30, 3)), u))
+    refuses(ModelError, "it has 3 states, 1 controls", model.free_run, Transient(t, np.zeros((30, 3)), u))
 
 
 def test_weights_of_another_shape_are_refused() -> None:
@@ -204,8 +203,7 @@ def test_the_published_eigenvalues_are_the_models() -> None:
     np.testing.assert_allclose(model.eigenvalues(), wanted, atol=0.005)
     assert model.spectral_radius(0.025) == pytest.approx(np.abs(1 + 0.025 * model.eigenvalues()).max(), rel=1e-12)
     assert model.spectral_radius(0.025) < 1 < model.spectral_radius(0.2)
-    with pytest.raises(ModelError, match="the model has no dt_median; give dt"):
-        model.spectral_radius()
+    refuses(ModelError, "the model has no dt_median; give dt", model.spectral_radius)
 
 
 # --- what a model may be -------------------------------------------------------------------------------------
@@ -227,14 +225,12 @@ ONE = np.ones((1, 1))
     ],
 )
 def test_matrices_that_are_no_model_are_refused(arguments: Any, words: str) -> None:
-    with pytest.raises(ModelError, match=words):
-        UncertainLTI(*arguments)
+    refuses(ModelError, words, UncertainLTI, *arguments)
 
 
 def test_names_must_be_as_many_as_rows_and_columns() -> None:
     signals = SignalMap((Signal("a", "", "a"), Signal("b", "", "b")))
-    with pytest.raises(ModelError, match="2 states and 0 controls are named for A"):
-        UncertainLTI(ONE, ONE, ONE, ONE, signals=signals)
+    refuses(ModelError, "2 states and 0 controls are named for A", UncertainLTI, ONE, ONE, ONE, ONE, signals=signals)
 
 
 def test_a_model_is_not_changed_behind_its_back() -> None:
@@ -249,8 +245,7 @@ def test_a_model_is_not_changed_behind_its_back() -> None:
 
 @pytest.mark.parametrize("rule", [(0, 1, 1.0), (2, 1, 1.0), (1, 0, 1.0), (1, 10**400, 1.0), (1.5, 2, 1.0), (1, 1, 0.0)])
 def test_an_alarm_rule_out_of_range_is_refused(rule: tuple[Any, ...]) -> None:
-    with pytest.raises(ModelError, match="^alarm: "):
-        AlarmRule(*rule)
+    refuses(ModelError, "^alarm: ", AlarmRule, *rule)
 
 
 # --- the file ------------------------------------------------------------------------------------------------
@@ -326,8 +321,7 @@ def test_numbers_that_json_lacks_become_null_and_the_rest_is_refused(tmp_path: P
         ({"a": "bag\udcef.mcap"}, "rename the recording whose name is not UTF-8"),
         ({"a": {1, 2}}, "mend its fit"),
     ):
-        with pytest.raises(ModelError, match=f"what JSON cannot .*{remedy}"):
-            model.replace(fit_summary=bad).save(path)
+        refuses(ModelError, f"what JSON cannot .*{remedy}", model.replace(fit_summary=bad).save, path)
         assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
 
 
@@ -461,9 +455,7 @@ def test_a_damaged_file_is_refused_by_file_and_field(place: str, value: Any, wor
 
 
 def refused(path: Path, words: str) -> None:
-    with pytest.raises(ModelError, match=words) as caught:
-        UncertainLTI.load(path)
-    sentence = str(caught.value)
+    sentence = refuses(ModelError, words, UncertainLTI.load, path)
     assert sentence.startswith(str(path)) and len(sentence.splitlines()) == 1 and len(sentence) < 500
 
 
@@ -585,12 +577,10 @@ def test_a_file_that_is_no_model_is_refused(content: bytes, words: str, tmp_path
 def test_a_file_that_is_not_there_or_far_too_large(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="there is no such model file; write one with `uncertain-lti fit`"):
         UncertainLTI.load(tmp_path / "none.model.json")
-    with pytest.raises(ModelError, match="this is a folder, and a model file is wanted here"):
-        UncertainLTI.load(tmp_path)
+    refuses(ModelError, "this is a folder, and a model file is wanted here", UncertainLTI.load, tmp_path)
     with open(tmp_path / "large.model.json", "wb") as stream:
         stream.truncate(1 << 40)
-    with pytest.raises(ModelError, match="larger than 64 MiB, so not a model file"):
-        UncertainLTI.load(tmp_path / "large.model.json")
+    refuses(ModelError, "larger than 64 MiB, so not a model file", UncertainLTI.load, tmp_path / "large.model.json")
 
 
 @settings(max_examples=100)
@@ -628,8 +618,6 @@ def test_a_write_that_fails_leaves_the_old_file_and_no_other(tmp_path: Path, mon
             model.replace(v=[1.0, 1.0]).save(path)
     assert path.read_bytes() == whole and os.listdir(tmp_path) == ["m.json"]
     (tmp_path / "folder").mkdir()
-    with pytest.raises(ModelError, match="folder: cannot be written"):
-        model.save(tmp_path / "folder")
-    with pytest.raises(ModelError, match="cannot be written: No such file or directory"):
-        model.save(tmp_path / "none" / "m.json")
+    refuses(ModelError, "folder: cannot be written", model.save, tmp_path / "folder")
+    refuses(ModelError, "cannot be written: No such file or directory", model.save, tmp_path / "none" / "m.json")
     assert sorted(os.listdir(tmp_path)) == ["folder", "m.json"]

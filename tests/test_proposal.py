@@ -21,6 +21,7 @@ from bag_writer import Message, Topic, array, cdr, header, joint_state, message,
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import bounded
+from refusals import refuses
 from test_signals import quaternion
 
 from uncertain_lti import SignalMap, fit, read_transients
@@ -350,8 +351,7 @@ def test_nothing_to_propose_is_said(tmp_path):
     messages = [Message("/talk", k, cdr("std_msgs/msg/String", data="x"), k) for k in range(50)]
     path = save(tmp_path / "a.mcap", messages, {"/talk": "std_msgs/msg/String"})
     words = "looks like the state of a machine .*; record .* in `uncertain-lti init --states`"
-    with pytest.raises(BagError, match=words):
-        propose([path])
+    refuses(BagError, words, propose, [path])
 
 
 def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, cli):
@@ -625,8 +625,7 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
         proposal = propose([table], states=more, controls=["/table:B"])
         assert signals_of(proposal) == ([("/table", "A")], [("/table", "B")])
     for asked in ({"states": ["/none"]}, {"controls": ["/other/cmd:date"]}):
-        with pytest.raises(BagError, match="meets nothing that moves"):
-            propose([path], **asked)
+        refuses(BagError, "meets nothing that moves", propose, [path], **asked)
 
 
 def test_a_column_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path):
@@ -635,8 +634,7 @@ def test_a_column_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path)
         ("speed", "a field is asked for with its topic, /table:speed$"),
         ("none", "topics there: /table$"),
     ):
-        with pytest.raises(BagError, match=words):
-            propose([path], states=[asked])
+        refuses(BagError, words, propose, [path], states=[asked])
 
 
 def table_of(path, columns, time=None, fmt="%.18e"):
@@ -703,8 +701,7 @@ def test_the_file_of_one_joint_is_that_of_all(recordings):
     assert (len(signals.states), len(signals.controls)) == (24, 12)
     (run,) = read_transients(path, signals)
     assert run.usable.sum() > 6000
-    with pytest.raises(BagError, match="no state and command of a member 'j55' \\(is j5 meant\\?\\)"):
-        propose([path], like="j55")
+    refuses(BagError, "no state and command of a member 'j55' \\(is j5 meant\\?\\)", propose, [path], like="j55")
 
 
 # --- recordings that mislead ---------------------------------------------------------------------------------
@@ -898,5 +895,4 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     assert any("class looks like a label, and is not normal in 3 rows" in w for w in proposal.warnings)
     assert propose([path], states=["/table:Label"]).states[0].path == "Label"
     bag = save(tmp_path / "a.mcap", driven(), {})
-    with pytest.raises(BagError, match="/table: not in every recording.*; give recordings of one machine"):
-        propose([path, bag])
+    refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])

@@ -19,6 +19,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling import sampler as sampler_module
@@ -538,8 +539,7 @@ def test_an_angle_that_needs_no_turn_loses_only_the_sign_of_its_zero() -> None:
 def test_a_recording_that_does_not_fit_its_topics_is_refused() -> None:
     one, two = np.zeros(1, dtype=np.int64), np.zeros(2, dtype=np.int64)
     for topic, values in ((two, [np.zeros((1, 1)), np.zeros((0, 1))]), (one, [np.zeros((1, 2)), np.zeros((0, 1))])):
-        with pytest.raises(ValueError, match="fit"):
-            Sampler(two_topics()).push_all(topic, one, one, values)
+        refuses(ValueError, "fit", Sampler(two_topics()).push_all, topic, one, one, values)
 
 
 @settings(max_examples=40)
@@ -747,5 +747,4 @@ def test_resolve_takes_the_slowest_state_topic_and_two_and_a_half_of_its_median_
 @pytest.mark.parametrize("missing", ["clock", "max_gap", "time"])
 def test_an_unresolved_map_is_refused(missing: str) -> None:
     signals = replace(two_topics(), **{missing: {} if missing == "time" else None})
-    with pytest.raises(SignalError, match="resolved"):
-        Sampler(signals)
+    refuses(SignalError, "resolved", Sampler, signals)

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refuses
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
@@ -80,8 +81,7 @@ def test_a_missing_value_has_no_weights() -> None:
     ],
 )
 def test_what_is_no_schedule_is_refused_by_name(make: object, words: str) -> None:
-    with pytest.raises(ModelError, match=words):
-        make()  # type: ignore[operator]
+    refuses(ModelError, words, make)  # type: ignore[operator]
 
 
 def scheduled(
@@ -136,8 +136,7 @@ def test_a_point_that_no_block_holds_at_is_refused_by_its_signal() -> None:
         (3.0, 3.0, "gear = 3 is not among the modes of the model, 1, 2, 4; give one of them"),
         (np.nan, 2.0, "speed is nan; give a finite number"),
     ):
-        with pytest.raises(ModelError, match=words):
-            model.at(speed=speed, gear=gear)
+        refuses(ModelError, words, model.at, speed=speed, gear=gear)
 
 
 def test_the_monitor_says_where_the_regime_is_unknown_and_gives_no_verdict_on_a_strange_mode() -> None:

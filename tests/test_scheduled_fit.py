@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 
 from uncertain_lti import OperatingPoint, Transient
 from uncertain_lti.base.errors import FitError
@@ -352,8 +353,7 @@ def test_a_knot_without_a_schedule_is_refused():
     with pytest.raises(FitError, match="no schedule"):
         Structure.from_rules([{"state": "x1", "from": "x1", "nominal": 0, "knot": 2}], ["x1"], [])
     transient = drawn(THREE, 300, 1)
-    with pytest.raises(FitError, match="3 blocks"):
-        fit(transient, schedule={"u1": (-1, 1)}, structure=Structure(2, 2, blocks=3))
+    refuses(FitError, "3 blocks", fit, transient, schedule={"u1": (-1, 1)}, structure=Structure(2, 2, blocks=3))
 
 
 @pytest.mark.parametrize(
@@ -379,8 +379,7 @@ def test_schedules_that_make_no_sense_are_refused(schedule, words):
     run = drawn(SCHEDULES["modes"], 300, 2)
     run = Transient(run.t_ns, run.x, np.column_stack([run.u, np.ones(301)]), name=run.name)
     point = OperatingPoint(np.zeros(2), np.array([0.5, 0.0, 0.0]), np.ones(2), np.array([2.0, 1.0, 1.0]))
-    with pytest.raises(FitError, match=words):
-        fit(run, schedule=schedule, operating_point=point)
+    refuses(FitError, words, fit, run, schedule=schedule, operating_point=point)
 
 
 def test_one_knot_is_one_block_and_no_schedule():

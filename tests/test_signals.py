@@ -22,6 +22,7 @@ import yaml
 from bag_writer import JAZZY
 from hypothesis import example, given
 from hypothesis import strategies as st
+from refusals import refuses
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import printable
@@ -249,9 +250,7 @@ def test_paths_by_the_grammar_lead_where_they_say(case: tuple[str, Any, float]) 
     ],
 )  # fmt: skip
 def test_a_text_that_is_no_path_is_refused_in_one_sentence(text: str) -> None:
-    with pytest.raises(SignalError, match="^field ") as caught:
-        FieldPath(text)
-    assert printable(text.strip()) in str(caught.value)
+    assert printable(text.strip()) in refuses(SignalError, "^field ", FieldPath, text)
 
 
 @given(st.text(max_size=30) | st.text('ab.[]()"0 unwrap_roll', max_size=30))
@@ -296,11 +295,8 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
     ],
 )
 def test_a_path_that_does_not_fit_names_what_is_there(type_name: str, field: str, words: str, side: str) -> None:
-    with pytest.raises(SignalError, match=words) as caught:
-        FieldPath(field).check("/t", type_name, FIELDS[side])
-    sentence = str(caught.value)
+    sentence = refuses(SignalError, words, FieldPath(field).check, "/t", type_name, FIELDS[side])
     assert sentence.startswith(f"field '{field}' of /t ({type_name})")
-    assert "\n" not in sentence
 
 
 # --- signals files ------------------------------------------------------------------------------------------
@@ -442,18 +438,13 @@ def control(entry: str) -> str:
 )
 def test_a_wrong_signals_file_is_refused_in_one_sentence(text: str | bytes, words: str, tmp_path: Path) -> None:
     path = saved(tmp_path, text)
-    with pytest.raises(SignalError, match=words) as caught:
-        SignalMap.load(path)
-    sentence = str(caught.value)
-    assert sentence.startswith(str(path))
-    assert "\n" not in sentence and len(sentence) < 400
+    sentence = refuses(SignalError, words, SignalMap.load, path)
+    assert sentence.startswith(str(path)) and len(sentence) < 400
 
 
 def test_a_signals_file_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(SignalError, match="there is no such signals file; check the path"):
-        SignalMap.load(tmp_path / "none.yaml")
-    with pytest.raises(SignalError, match="this is a folder, and a signals file is wanted here"):
-        SignalMap.load(tmp_path)
+    refuses(SignalError, "there is no such signals file; check the path", SignalMap.load, tmp_path / "none.yaml")
+    refuses(SignalError, "this is a folder, and a signals file is wanted here", SignalMap.load, tmp_path)
 
 
 @pytest.mark.parametrize("text", ["1e-3", "'0.001'", "0.001", "1.0e-3"])
@@ -511,10 +502,8 @@ def test_a_damaged_structure_is_a_map_or_a_signal_error(data: Any) -> None:
 def test_any_bytes_are_a_signal_error(tmp_path_factory: pytest.TempPathFactory, data: bytes) -> None:
     path = tmp_path_factory.getbasetemp() / "any.yaml"
     path.write_bytes(data)
-    with pytest.raises(SignalError) as caught:
-        SignalMap.load(path)
-    assert str(caught.value).startswith(str(path))
-    assert len(str(caught.value).splitlines()) == 1
+    sentence = refuses(SignalError, "", SignalMap.load, path)
+    assert sentence.startswith(str(path)) and len(sentence.splitlines()) == 1
 
 
 def test_aliases_and_old_numbers_of_yaml(tmp_path):
@@ -523,8 +512,7 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
     bomb = "a0: &a0 [x, x, x, x, x, x, x, x, x]\n"
     bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10))
     path.write_text(bomb)
-    with pytest.raises(SignalError, match=r"at line 2: an alias \(\*name\); write out what it stands for"):
-        SignalMap.load(path)
+    refuses(SignalError, r"at line 2: an alias \(\*name\); write out what it stands for", SignalMap.load, path)
     from uncertain_lti.signals.values import compose, construct
 
     read = construct(compose("{a: 010, b: 1:30, c: 1_000, d: 10, f: -0.5, g: 0x10, h: 0}"))

@@ -11,6 +11,7 @@
 
 import numpy as np
 import pytest
+from refusals import refuses
 from tanks import Tanks
 
 from uncertain_lti import EnvelopeMonitor, Transient, fit, tune
@@ -79,7 +80,5 @@ def test_ctrl_c_keeps_what_is_done():
 
 
 def test_what_cannot_be_tuned_is_refused():
-    with pytest.raises(FitError, match="positive number of seconds"):
-        tune(RUNS, budget=0)
-    with pytest.raises(FitError, match="cannot learn an alarm"):
-        tune(late(1, N=8))
+    refuses(FitError, "positive number of seconds", tune, RUNS, budget=0)
+    refuses(FitError, "cannot learn an alarm", tune, late(1, N=8))

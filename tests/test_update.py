@@ -14,6 +14,7 @@ import json
 import numpy as np
 import pytest
 from engine_bag import SIGNALS, engine_bag
+from refusals import refuses
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
@@ -77,8 +78,7 @@ def test_what_was_not_kept_is_never_left_outside():
     """Where new recordings move the elements far, the earlier ones are named, and given again they are fitted."""
     quiet, loud = runs_of(3, (20_000, 20_000))[:1], runs_of(4, (500,), noise=0.05)
     model = fit(quiet, "qp", **PAPER)
-    with pytest.raises(FitError, match="does not prove the optimum of all recordings; give run 0 again, together"):
-        model.update(loud)
+    refuses(FitError, "does not prove the optimum of all recordings; give run 0 again, together", model.update, loud)
     equal(model.update([*quiet, *loud]), fit([*quiet, *loud], "qp", **PAPER))
 
 
@@ -122,8 +122,7 @@ def test_a_recording_that_is_given_again_counts_once():
     runs = runs_of(1, (900, 800, 700))
     model = fit(runs[:2], "qp", **PAPER)
     equal(model.update(runs), fit(runs, "qp", **PAPER))
-    with pytest.raises(FitError, match="every recording is in the model already"):
-        model.update(runs[:2])
+    refuses(FitError, "every recording is in the model already", model.update, runs[:2])
 
 
 def test_the_file_holds_what_an_update_needs(tmp_path):
@@ -175,8 +174,7 @@ def test_repeats_and_residuals_join():
 def test_what_is_not_plain_is_refused_with_the_remedy(options, match):
     runs = runs_of(8, (600, 500, 400))
     model = fit(runs[:2], "qp", **PAPER, **options)
-    with pytest.raises(FitError, match=f"{match}.*; fit again with all recordings"):
-        model.update(runs[2])
+    refuses(FitError, f"{match}.*; fit again with all recordings", model.update, runs[2])
 
 
 def test_a_model_that_was_changed_is_refused():
@@ -185,17 +183,14 @@ def test_a_model_that_was_changed_is_refused():
     with pytest.raises(FitError, match="was changed after its fit.*fit again with all recordings"):
         model.replace(A=1.01 * model.A).update(runs[1])
     damaged = {**model.memory, "kept": {}}
-    with pytest.raises(FitError, match="field 'memory' of the model file is damaged"):
-        model.replace(memory=damaged).update(runs[1])
+    refuses(FitError, "field 'memory' of the model file is damaged", model.replace(memory=damaged).update, runs[1])
     other = Transient(runs[1].t, runs[1].x, runs[1].u, state_names=["a", "b", "c"])
-    with pytest.raises(FitError, match="transient has states a, b, c"):
-        model.update(other)
+    refuses(FitError, "transient has states a, b, c", model.update, other)
 
 
 def test_steps_of_another_length_are_refused_if_disturbance_and_noise_were_one_term():
     model = fit(runs_of(9, (800,)), "qp", additive="both", alarm="containment")
-    with pytest.raises(FitError, match="steps of the model have one length"):
-        model.update(runs_of(9, (700,), dt=0.03))
+    refuses(FitError, "steps of the model have one length", model.update, runs_of(9, (700,), dt=0.03))
 
 
 def test_the_command_updates(tmp_path, capsys):

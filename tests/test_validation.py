@@ -21,6 +21,7 @@ import pytest
 import validity
 from bag_writer import record
 from engine_bag import SIGNALS, engine_bag
+from refusals import refuses
 from scipy import stats
 from tanks import Tanks
 
@@ -249,8 +250,7 @@ def test_weights_go_with_their_samples():
 
 def test_recordings_that_are_too_short_are_refused(runs):
     short = [cut(r, 0, 7) for r in runs[:2]]
-    with pytest.raises(FitError, match=r"without tanks 3\.0 no model can be fitted: 6 usable"):
-        validate(short, additive="noise")
+    refuses(FitError, r"without tanks 3\.0 no model can be fitted: 6 usable", validate, short, additive="noise")
 
 
 def test_few_recordings_are_said_to_say_little(runs):
@@ -348,8 +348,7 @@ def test_wrong_options_and_wrong_groups_are_refused(days):
         (dict(groups="name=["), "no regular expression"),
         (dict(groups="name=day"), "finds nothing"),
     ):
-        with pytest.raises(FitError, match=words):
-            validate(runs, additive="noise", **options)
+        refuses(FitError, words, validate, runs, additive="noise", **options)
 
 
 def at_hour(run, hour, name="run"):
@@ -474,8 +473,7 @@ def test_what_a_fit_says_of_itself_does_not_depend_on_the_load(folder, capsys, m
 def test_validate_refuses_what_it_cannot_vouch_for(folder):
     weighted = UncertainLTI.load(folder / "m.json")
     weighted = weighted.replace(fit_summary={**weighted.fit_summary, "weights": "per state"})
-    with pytest.raises(FitError, match="fitted with weights"):
-        validate(weighted, [])
+    refuses(FitError, "fitted with weights", validate, weighted, [])
 
 
 # --- one call ---
@@ -495,9 +493,7 @@ def test_a_model_is_validated_with_its_own_settings(runs):
 
 def test_a_model_is_not_validated_with_other_settings_or_nothing(runs):
     model = fit(runs[:3], additive="noise")
-    with pytest.raises(FitError, match=r"give the recordings .* validate\(model, runs\)"):
-        uncertain_lti.validate(model)
+    refuses(FitError, r"give the recordings .* validate\(model, runs\)", uncertain_lti.validate, model)
     with pytest.raises(FitError, match="criterion: a model is validated with its own settings"):
         uncertain_lti.validate(model, runs[:3], criterion="lp")
-    with pytest.raises(FitError, match="twice"):
-        uncertain_lti.validate(runs[:3], runs[:3])
+    refuses(FitError, "twice", uncertain_lti.validate, runs[:3], runs[:3])
