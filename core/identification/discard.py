@@ -156,7 +156,7 @@ def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:
         return {}
     value = _value(row, "qp", engine.fleet.weights)
     gains = {}
-    for index in row.samples.index[np.flatnonzero(row.slack() < _ACTIVE)].tolist():
+    for index in row.samples.index[engine.programmes[row.i].carrying(_ACTIVE)].tolist():
         own = engine.programmes[row.i].trial()
         own.drop(index)
         _solve(engine, own, "qp")

@@ -189,6 +189,16 @@ class Programmes:
             return None
         return last.active[len(last.xi) : len(last.active) - len(self.row.asked)].reshape(_ROWS[kind], -1)
 
+    def carrying(self, slack: float) -> Index:
+        """Samples whose absence may lower the optimum of (10): with multipliers, or next to the edge if none are known.
+
+        Without another one the same multipliers prove the same optimum.
+        """
+        sides = self._sides("quadratic")
+        if sides is None or sides.shape[1] != len(self.row.pool):
+            return np.flatnonzero(self.row.slack() < slack)
+        return np.asarray(self.row.pool[(sides != 0).any(axis=0)])
+
     def _active_sets(self, kind: str, count: int) -> list[Sense | None]:
         """What to make multipliers of: what was active in the last programme of a kind and size, then the slack."""
         last = self._last.get(kind)
