@@ -43,7 +43,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.steady_state import codes, too_small
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import Memory
-from uncertain_lti.signals.signal_map import Signal
+from uncertain_lti.signals.signal_map import ARRIVAL, Signal
 
 LOOKED_AT, STRETCHES = 20_000, 20
 """Transitions, and stretches, that are examined at most for what shows in any of them."""
@@ -164,7 +164,8 @@ def describe(
         lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
         messages += lacking.values()
         messages += _weak(problem, sums, names, past, lacking)
-        messages += _fed_back(part, names, past)
+        later = [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)]
+        messages += _fed_back(part, names, past, later)
         messages += [m for i, m in noisy.items() if i not in lacking]
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
@@ -261,21 +262,21 @@ def _weak(
     ]
 
 
-def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int]) -> list[str]:
+def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], later: Sequence[int]) -> list[str]:
     """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to separate.
 
     u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} if a feedback sets u_k; an input that a person steps
-    at will is not.
+    at will is not. What the columns `later` had of u_k, at the end of the step before, is no explanation.
     """
     follows = successive(problem)
     if len(follows) <= 4 * problem.p:
         return []
     before, now = problem.z[follows], problem.z[follows + 1]
     n = problem.n
-    basis = np.column_stack([now[:, :n], before, np.ones(len(before))])
+    basis = np.column_stack([now[:, :n], np.delete(before, later, axis=1), np.ones(len(before))])
     gram = basis.T @ basis
     messages = []
-    for j in [j for j in range(n, problem.p) if j not in past]:
+    for j in [j for j in range(n, problem.p) if j not in past and j not in later]:
         change = now[:, j] - before[:, j]
         change = change - change.mean()
         size = float(change @ change)
@@ -407,9 +408,10 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 
 def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transient]) -> list[str]:
-    """States that keep exactly one value for long while the other signals move."""
+    """States that keep exactly one value for long while the other signals move; at an end of its range one may rest."""
     messages = []
-    spread = np.ptp(problem.z_columns, axis=1)
+    low, high = problem.z_columns.min(axis=1), problem.z_columns.max(axis=1)
+    spread = high - low
     for i in range(problem.n):
         still = problem.x_next[:, i] == problem.z[:, i]
         if still.mean() > 0.5:  # held, quantised, or at rest most of the time
@@ -419,7 +421,7 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
         for start, stop in runs[runs[:, 1] - runs[:, 0] >= FROZEN]:
             moving = (np.ptp(problem.z[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
             moving[i] = False
-            if moving.any():
+            if moving.any() and low[i] < problem.z[start, i] < high[i]:
                 messages.append(
                     f"'{names[i]}' stands at exactly one value for {stop - start} samples "
                     f"({_where(problem, [start], transients)}) while '{names[int(np.argmax(moving))]}' moves: a frozen "
