@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.kernel.arithmetic import Judge
@@ -109,6 +110,28 @@ def test_levels_of_two_that_no_row_has_both_are_no_combination() -> None:
     assert outside(model, slow) > 0.4
     again = model.update([arms(3, [(a, a) for a in ways])])
     assert outside(again, apart) < 0.05
+
+
+def test_a_place_on_which_nothing_depends_has_no_range_to_leave(tmp_path) -> None:
+    """Heading and position of a robot that drives on."""
+    rng, count = np.random.default_rng(2), 600
+    u = rng.choice([-1.0, 1.0], (count, 1)).repeat(2, axis=0)[:count]
+    speed = np.convolve(u[:, 0], np.full(5, 0.2))[:count] + 0.01 * rng.normal(size=count)
+    run = Transient(0.01 * np.arange(count), np.column_stack([speed, 0.01 * np.cumsum(speed)]), u)
+    away = run.replace(x=run.x + [0.0, 40.0])
+    assert outside(fit([run], additive="noise"), away) == 1.0
+    known = np.array([[np.nan, 0.0], [np.nan, 0.0]])
+    model = fit([run], additive="noise", structure=Structure(2, 1, fixed={"A": known, "dA": known}))
+    model.save(tmp_path / "m.json")
+    for each in (
+        model,
+        UncertainLTI.load(tmp_path / "m.json"),
+        model.update([run.replace(x=run.x[::-1], name="back")]),
+    ):
+        assert outside(each, away) == 0.0 and outside(each, run.replace(x=run.x + [9.0, 0.0])) == 1.0
+    text = (tmp_path / "m.json").read_text().replace('"anywhere": [', '"anywhere": [3, ')
+    with pytest.raises(ModelError, match="'domain.anywhere' must be a list of 3"):
+        UncertainLTI.from_dict(json.loads(text))
 
 
 @settings(max_examples=30, deadline=None)

@@ -275,6 +275,7 @@ def test_angles_are_unwrapped(tmp_path, kind, sent, field):
     assert [c.path for c in proposal.states] == [field] and "orientation.w" not in proposal.text
     model = fitted([path], proposal)
     assert model.fit_summary["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
+    assert model.domain.anywhere == [True, False], "however many turns there were"
 
 
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):

@@ -243,9 +243,12 @@ def fit_fleet(
                 f"({1.0 / LARGEST:g}); give it a smaller scale or another unit, or leave it out"
             )
     regimes, measure = fleet.columns.regimes, fleet.occupancy(low, high)
-    if measure is not None and structure is not None and regimes is None:
-        measure = measure.among(structure.together)
-    domain = Domain(low[:n], high[:n], low[n:], high[n:], measure)
+    anywhere = None
+    if structure is not None and regimes is None:
+        measure = measure and measure.among(structure.together)
+        unused = ~np.logical_or.reduce(structure.rows)
+        anywhere = unused.tolist() if unused.any() else None
+    domain = Domain(low[:n], high[:n], low[n:], high[n:], measure, anywhere=anywhere)
     scheduled: dict[str, Any] = {}
     if regimes is not None:
         each = enumerate(zip(sums.visits.tolist(), engine.tied, strict=True))

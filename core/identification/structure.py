@@ -102,11 +102,17 @@ class Structure:
                 raise FitError(f"structure: {name}{list(at)} is a half-width and cannot be below 0")
 
     @property
-    def together(self) -> NDArray[np.bool_]:
-        """Which two of [x; u] some row may have, (n + m, n + m); a row has its own state in any case."""
+    def rows(self) -> NDArray[np.bool_]:
+        """Which of [x; u] each row may have, (n, n + m)."""
         free = {name: (self.lower[name] != 0.0) | (self.upper[name] != 0.0) for name in ("A", "dA", "B", "dB")}
         every = np.concatenate([free["A"] | free["dA"], free["B"] | free["dB"]], axis=-1)
-        rows = every.reshape(-1, self.n, self.n + self.m).any(axis=0) | np.eye(self.n, self.n + self.m, dtype=bool)
+        return np.asarray(every.reshape(-1, self.n, self.n + self.m).any(axis=0))
+
+    @property
+    def together(self) -> NDArray[np.bool_]:
+        """Which two of [x; u] some row may have, (n + m, n + m); a row has its own state, too, if some row has it."""
+        rows = self.rows
+        np.fill_diagonal(rows, np.diagonal(rows) | np.asarray(rows.any(axis=0))[: self.n])
         return np.asarray(rows.T @ rows)
 
     def _known(self, name: str) -> None:

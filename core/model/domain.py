@@ -93,8 +93,9 @@ class Occupancy:
         `before`: whose ranges the grid has now; `low`, `high` (n + m,): the larger ones.
         """
         span, edges = np.maximum(high - low, 1e-300), np.arange(self.cells) / self.cells
-        own = before.greatest - before.least
-        begin = ((before.least - low) / span)[:, None] + (own / span)[:, None] * edges
+        least = np.concatenate((before.x_min, before.u_min))
+        own = np.concatenate((before.x_max, before.u_max)) - least
+        begin = ((least - low) / span)[:, None] + (own / span)[:, None] * edges
         end = begin + (own / span / self.cells)[:, None]
         first, last = (
             np.clip(((at + shift) * self.cells).astype(int), 0, self.cells - 1)
@@ -144,7 +145,8 @@ class Domain:
 
     `x_min` (n,): least states; `x_max` (n,): greatest states; `u_min` (m,): least controls; `u_max` (m,): greatest
     controls; `measure`: combinations within the box; `step_max` (n,): largest change of each state in one step,
-    normalised; default unknown.
+    normalised; default unknown; `anywhere` (n + m,): signals that the structure has in no row, which have no range to
+    leave; default none.
     """
 
     x_min: Array
@@ -153,16 +155,21 @@ class Domain:
     u_max: Array
     measure: Occupancy | None = None
     step_max: Array | None = None
+    anywhere: Sequence[bool] | None = None
 
     @property
     def least(self) -> Array:
         """Least [x; u] (n + m,)."""
-        return np.concatenate((self.x_min, self.u_min))
+        return self._end((self.x_min, self.u_min), -LARGEST)
 
     @property
     def greatest(self) -> Array:
         """Greatest [x; u] (n + m,)."""
-        return np.concatenate((self.x_max, self.u_max))
+        return self._end((self.x_max, self.u_max), LARGEST)
+
+    def _end(self, of: tuple[Array, Array], beyond: float) -> Array:
+        ends = np.concatenate(of)
+        return ends if self.anywhere is None else np.where(self.anywhere, beyond, ends)
 
     def beyond(self, z: Array) -> NDArray[np.bool_]:
         """Whether columns z = [x; u; ...] (n + m + q, K) leave the box in some element by more than a tenth of it."""

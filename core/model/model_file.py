@@ -43,6 +43,7 @@ _CONTROL = (*_SCHEDULING, "delay")
 _STEPS = ("dt_median", "dt_min", "dt_max")
 _SAMPLING = {"clock", "clock_type", "time", *_STEPS, "max_gap", "min_step", "max_skew"}
 _NEWER = {"schedule", "scheduling", "blocks", "horizons", "run", "residuals", "frozen", "signatures", "memory"}
+_OF_DOMAIN = ("measure", "step_max", "anywhere")  # what files of format 1 lack
 _IN_FILES = {"optimality_gap": "gap"}  # keys of the fit that files of format 1 call otherwise
 _IN_PYTHON = {name: key for key, name in _IN_FILES.items()}
 
@@ -78,7 +79,14 @@ def structure(model: Any) -> dict[str, Any]:
         "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
         "run": _dict(model.run),
         "domain": {name: [v if math.isfinite(v) else None for v in limits] for name, limits in box.items()}
-        | _known({"measure": _dict(domain.measure), "step_max": finite_data(domain.step_max)}, ("measure", "step_max")),
+        | _known(
+            {
+                "measure": _dict(domain.measure),
+                "step_max": finite_data(domain.step_max),
+                "anywhere": domain.anywhere,
+            },
+            _OF_DOMAIN,
+        ),
         "residuals": _dict(model.residuals),
         "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
         if model.alarm == (rule,)
@@ -92,7 +100,7 @@ def structure(model: Any) -> dict[str, Any]:
     whole = _known(whole, whole)
     newer = (
         *(whole.keys() & _NEWER, signals.arrivals, "rules" in whole["alarm"], len(arrays) > len(_IN_EVERY_FILE)),
-        *(whole["sampling"].keys() & {"step", "table"}, whole["domain"].keys() & {"measure", "step_max"}),
+        *(whole["sampling"].keys() & {"step", "table"}, whole["domain"].keys() & set(_OF_DOMAIN)),
         *(g.memory or g.valid is not None or g.ignore or g.judged for g in signals),
     )
     return whole | {"format": FORMATS[any(newer)]}
@@ -185,14 +193,18 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
 
 def _domain(data: Any, n: int, m: int, newer: bool) -> Domain:
     sizes = {"x_min": n, "x_max": n, "u_min": m, "u_max": m}
-    also = {"measure", "step_max"} if newer else set()
+    also = set(_OF_DOMAIN) if newer else set()
     box = object_of(data, "domain", set(sizes) | also, sizes)
     limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
-    measure, step_max = (box.get(name) for name in ("measure", "step_max"))
+    measure, step_max, anywhere = (box.get(name) for name in _OF_DOMAIN)
+    if anywhere is not None and not (
+        isinstance(anywhere, list) and len(anywhere) == n + m and all(isinstance(each, bool) for each in anywhere)
+    ):
+        raise ModelError(f"field 'domain.anywhere' must be a list of {n + m} of true and false")
     if step_max is not None and ((step_max := checked(step_max, "domain.step_max", (n,))) < 0.0).any():
         raise ModelError("field 'domain.step_max' holds a negative number")
     seen = None if measure is None else Occupancy.from_dict(measure, n + m)
-    return Domain(**limits, measure=seen, step_max=step_max)
+    return Domain(**limits, measure=seen, step_max=step_max, anywhere=anywhere)
 
 
 def _alarm(data: Any, newer: bool) -> tuple[Rule, ...]:

@@ -220,7 +220,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
     if some.any():
         follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
     most = follow.most
-    if some.mean() >= _OFTEN:
+    if some.any() and some.mean() >= _OFTEN:
         most[1, _held(transient.x, steps.k)] = LARGEST  # it runs on between two values, the farther the faster
     return Found(most, windows, noisy, largest)
 

@@ -153,6 +153,7 @@ def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, st
     )
 
 
+@np.errstate(all="ignore")  # what overflows is refused by the fit
 def _promising_ends(transients: Sequence[Transient], arrival: Sequence[Transient]) -> list[At]:
     """Ends with which least squares leaves clearly less, unless the controls may answer to the state at the arrival.
 

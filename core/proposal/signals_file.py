@@ -218,7 +218,16 @@ def signals_file(
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
         lines = for_members(lines, states[0].element, list(members))
+    elif around := [c for c in states if _turns(c)] if not any(map(_turns, controls)) else []:
+        lines += ["", "# Half a turn or more: nothing depends on how many turns there were.", "structure:"]
+        lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
+
+
+def _turns(candidate: Candidate) -> bool:
+    """Whether an angle went round by half a turn or more."""
+    spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
+    return candidate.path.startswith("unwrap(") and max(spans, default=0.0) >= np.pi
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
