@@ -236,7 +236,7 @@ def _collinear(problem: Problem, sums: Moments, names: Sequence[str], past: Coll
         elif controls:
             cure = f"record steps of {_quoted(controls)} that are sharper than {_quoted(states)} can follow"
         else:
-            cure = f"excite them by other controls or from other initial states, or leave one of {_quoted(states)} out"
+            cure = "excite them by other controls or from other initial states; the bounds hold as they are"
         messages.append(
             f"{_quoted([names[j] for j in part])} nearly move together (all but {value**0.5:.2%} of their size), so "
             f"their columns are poorly told apart and their elements may trade places: {cure}"
