@@ -19,15 +19,16 @@ from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
-from uncertain_lti.identification.fleet import likelier_alone
+from uncertain_lti.identification.fleet import law_of
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
-from uncertain_lti.model.horizon import Horizon, Residuals
+from uncertain_lti.model.horizon import Horizon, Residuals, Run
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
 
 C = np.array([[1.0, 0.6, 0.0], [0.6, 2.0, -0.3], [0.0, -0.3, 0.5]])
 MEAN = np.array([0.1, -0.2, 0.0])
+MEMORY = np.array([0.5, 0.0, -0.25])
 LIMIT = 10.0  # standard deviations, as the theory page says
 
 
@@ -35,7 +36,7 @@ def statistic(kind: str, window: float = 1.0, threshold: float = 1.0, n: int = 3
     joint = kind in JOINT
     return Statistic(
         KINDS.index(kind), n, window, [threshold] * (1 if joint else n), [True] * n, allowance,
-        MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n),
+        MEAN[:n], Residuals(MEAN[:n], C[:n, :n]).whitening([True] * n), MEMORY[:n],
     )  # fmt: skip
 
 
@@ -54,6 +55,7 @@ def oracle(kind: str, T: float, dt: np.ndarray, rows: np.ndarray, allowance: flo
             found.append(np.where(up >= down, up, -down))
         return np.array(found)
     r = rows - MEAN[: rows.shape[1]]
+    r[1:] -= MEMORY[: rows.shape[1]] * r[:-1]
     if kind == "mewma":
         e, spread, found = np.zeros(rows.shape[1]), 0.0, []
         root = np.linalg.cholesky(C[: rows.shape[1], : rows.shape[1]])
@@ -155,7 +157,9 @@ def test_a_huge_value_leaves_nothing_behind(kind: str) -> None:
     rows[100] = 1e20
     _, values = statistic(kind, 0.5).push_all(np.full(400, 0.01), rows)
     assert values[149].max() > 1e10
-    assert values[150:] == pytest.approx(np.broadcast_to(values[99], (250, values.shape[1])), rel=1e-12)
+    recalled = int(kind in JOINT)  # by the residual after it
+    left = values[150 + recalled :]
+    assert left == pytest.approx(np.broadcast_to(values[99], left.shape), rel=1e-12)
 
 
 def test_what_is_at_its_threshold_raises_no_alarm() -> None:
@@ -389,15 +393,41 @@ def test_a_fit_knows_the_utilisation_of_its_windows() -> None:
     assert np.array_equal(again.residuals_at(10).covariance, fitted.residuals_at(10).covariance)
 
 
-def test_the_likelier_form_of_the_covariance_is_taken() -> None:
+def test_residuals_are_those_of_least_squares_less_what_the_one_before_says_of_them(tmp_path) -> None:
+    """Of noise that lasts, and by the alarm: by sample, all at once, and of a file."""
     rng = np.random.default_rng(4)
-    half = np.exp(rng.uniform(-1.0, 1.0, (4000, 1))) * [1.0, 2.0]
-    noise = rng.standard_normal((4000, 2)) @ [[1.0, 0.3], [0.0, 1.0]]
-    assert likelier_alone(noise, half) and not likelier_alone(noise * half, half)
-    assert not likelier_alone(noise, np.broadcast_to(half[:1], half.shape)), "one half-width: the same"
-    few = noise.copy()
-    few[:100] *= 20.0 * half[:100]  # pulses
-    assert likelier_alone(few, np.where(np.arange(4000)[:, None] < 100, 20.0 * half, half))
-    half[0] = 0.0
-    assert not likelier_alone(noise, half)
-    assert not likelier_alone(np.column_stack([noise, noise[:, 0]]), np.ones((4000, 3)))
+    A, B, m, count = np.array([[0.9, 0.1], [0.0, 0.8]]), np.array([[0.1], [0.3]]), np.array([0.6, 0.0]), 20_000
+    x, u, e = np.zeros((count + 1, 2)), np.sign(rng.normal(size=(count + 1, 1))), np.zeros(2)
+    for k in range(count):
+        e = m * e + rng.multivariate_normal([0, 0], [[0.04, 0.01], [0.01, 0.02]])
+        x[k + 1] = A @ x[k] + B @ u[k] + e
+    run = Transient(0.1 * np.arange(count + 1), x, u)
+    fitted = fit(run, "lp", additive="noise")
+    law = fitted.residuals.alike(Residuals([0, 0], np.eye(2), False, Run(A, B, [0, 0])))
+    assert law is not None and fitted.residuals.relative and not law.relative
+    np.testing.assert_allclose(np.eye(2) + 0.1 * law.law.A, A, atol=0.05)  # refined once
+    np.testing.assert_allclose(0.1 * law.law.B, B, atol=0.01)
+    np.testing.assert_allclose(law.memory, m, atol=0.06)
+    np.testing.assert_allclose(law.covariance, [[0.04, 0.01], [0.01, 0.02]], rtol=0.05)
+    armed = fitted.replace(residuals=law, alarm=[StatisticRule("chi2", 0.0, 9.0), StatisticRule("mewma", 1.0, 9.0)])
+    armed.save(tmp_path / "m.json")
+    some = run.replace(slice(0, 300))
+    r = some.x[1:] - some.x[:-1] - 0.1 * (some.x[:-1] @ law.law.A.T + some.u[:-1] @ law.law.B.T + law.law.c)
+    r[1:] -= law.memory * r[:-1]
+    chi2 = np.einsum("ki,ij,kj->k", r, np.linalg.inv(law.covariance), r)
+    monitor = EnvelopeMonitor(armed)
+    whole = monitor.check(some)
+    one = np.array([monitor.judge(step).statistics for step in steps_of(some)])
+    np.testing.assert_allclose(whole.statistics[1:, 0], chi2 / 9.0, rtol=1e-9)
+    assert whole.statistics[1:].tobytes() == one[-len(r) :].tobytes()
+    again = EnvelopeMonitor(UncertainLTI.load(tmp_path / "m.json")).check(some)
+    assert again.statistics.tobytes() == whole.statistics.tobytes()
+
+
+def test_no_law_follows_from_few_transitions_or_from_what_it_explains_to_rounding() -> None:
+    rng = np.random.default_rng(5)
+    w = rng.normal(size=(8, 400))
+    assert law_of(w @ w.T, 400, 1) is not None and law_of(w @ w.T, 11, 1) is None
+    w[3] = w[:3].sum(axis=0)
+    w[7] = w[4:7].sum(axis=0)
+    assert law_of(w @ w.T, 400, 1) is None and law_of(np.full((8, 8), np.inf), 400, 1) is None

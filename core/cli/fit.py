@@ -17,7 +17,6 @@ import os
 import shlex
 from collections.abc import Iterable
 from contextlib import ExitStack
-from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -273,9 +272,9 @@ def run_validate(options: argparse.Namespace) -> Result:
     said: list[str] = []
     if options.false_alarms is not None:
         panel = learn(validation, fitted_parts(validation.model, transients), options.false_alarms)
-        model = model.with_residuals_of(validation.model).replace(alarm=panel.rules)
+        model = model.with_residuals_of(validation.model).replace(alarm=panel.rules, residuals=panel.residuals)
         said = promises(model, panel)
-    data = replace(validation, model=model).to_dict() | ({"promises": said} if said else {})
+    data = validation.judged_as(model).to_dict() | ({"promises": said} if said else {})
     with options.progress.stage("injecting faults") as step:
         data["detectable"] = detectable(
             model, validation.parts, options.within, confidence=options.confidence, progress=step

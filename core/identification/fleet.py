@@ -18,13 +18,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array, core_count
+from uncertain_lti.base.arrays import LARGEST, Array, core_count
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
 from uncertain_lti.model.domain import Occupancy, cells_for
-from uncertain_lti.model.horizon import Residuals
+from uncertain_lti.model.horizon import Residuals, Run
 
 T = TypeVar("T")
 
@@ -32,8 +32,14 @@ _LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
 _PART = 100_000
 """Transitions per part, about: the sums of the parts are added in their order, however many threads there are."""
-_COMPARED = 20_000
-"""Residuals that the two forms of `model.residuals` are compared on, about."""
+_TAKEN = 100_000
+"""Transitions that the law of the residuals is taken from, about."""
+_SAME = 1e-12
+"""Directions of regressors that vary by less than the root of this, over their size, count as constant."""
+_EXACT = 1e-10
+"""Share of the squared change of a state below which what a law leaves of it is rounding."""
+_PER_UNKNOWN = 3
+"""Transitions for each unknown of a row of that law at least."""
 
 
 _Facts = tuple[int, int, int, Columns, Array | None]
@@ -106,21 +112,18 @@ class Fleet:
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
-    def residuals(self, model: Envelope, judged: Judged) -> Residuals:
-        """Mean and covariance of the utilisation, or of the residual; `judged`: of all transitions by the same model.
+    def residuals(self, model: Envelope, judged: Judged, own_law: bool = True) -> Residuals:
+        """Mean and covariance of the utilisation, `judged`: of all transitions by the same model.
 
-        With one covariance of the residual its spread is the same in all regimes, with one of the utilisation it is as
-        the half-width; the form by which the transitions are likelier is taken.
+        With them, but of a schedule and without an `own_law`, residuals of `law_of`: their spread is the same
+        everywhere, where that of one utilisation changes as the half-widths do.
         """
-        some = self.map(passes.some_residuals, self._same(model, max(1, self.N // _COMPARED)))
-        relative = not likelier_alone(*(np.concatenate(each) for each in zip(*some, strict=True)))
-        form = 0 if relative else 1
-        mean, products = judged.total[form] / self.N, judged.products[form] / self.N
-        covariance = products - np.outer(mean, mean)
-        values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
-        if values[0] < 0.0:  # by rounding
-            covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T
-        return Residuals(mean, 0.5 * (covariance + covariance.T), relative)
+        mean = judged.total / self.N
+        found = Residuals(mean, _covariance(judged.products / self.N - np.outer(mean, mean)))
+        if not own_law or self.columns.regimes is not None:
+            return found
+        pairs = self.map(passes.in_a_row, self._same(min(1.0, _TAKEN / self.N)))
+        return found.beside(law_of(np.sum([total for total, _ in pairs], axis=0), sum(n for _, n in pairs), self.n))
 
     def moving_from_rest(self) -> tuple[int, int, int, float]:
         """Samples with x = u = 0 and a successor that is not 0; see `passes.moving_from_rest`."""
@@ -199,37 +202,48 @@ def _facts(part: Partition) -> _Facts:
     return part.N, part.n, part.p, part.columns, part.weights if part.weights.ndim == 1 else None
 
 
-_FREEDOM = 3.0
-_ROUNDS = 15
-_LIKELIER = 0.01
-"""By so much the log-likelihood of a transition must be larger for the residual in place of the utilisation."""
+def law_of(products: Array, count: int, n: int) -> Residuals | None:
+    """The law by which residuals of steps in a row are least, y_k = θ φ_k + m (y_{k-1} - θ φ_{k-1}) + ε_k, by its sums.
 
+    Of each row extended least squares: θ by least squares, and again from φ_k and the residual before. None of few
+    transitions. [Ljung, System Identification, 1999, section 10.3]
 
-def likelier_alone(residual: Array, half: Array) -> bool:
-    """Whether one covariance of the residual describes it better, as of noise of readings, than one of the utilisation.
-
-    Compared is the likelihood of a distribution of Student's with few degrees of freedom: recordings far from the
-    usual, such as pulses, leave residuals many times as large, and by a normal distribution those few would decide.
-
-    `residual` (K, n): of some transitions; `half` (K, n): their half-widths.
+    `products`, `count`: of `passes.in_a_row`.
     """
-    if not (half > 0.0).all() or len(residual) <= 2 * residual.shape[1]:
-        return False
-    alone, relative = _log_likelihood(residual), _log_likelihood(residual / half)
-    return bool(alone > relative - np.log(half).sum(axis=1).mean() + _LIKELIER)
+    r = len(products) // 2 - n
+    if count < _PER_UNKNOWN * (r + 1) or not np.abs(products).max() < LARGEST:
+        return None
+    (phi, y), (phi_before, y_before) = (np.split(half, [r]) for half in np.split(np.eye(len(products)), 2))
+
+    def on(rows: Array, others: Array) -> Array:
+        """Of each row and another the sum of their products."""
+        return np.asarray(np.einsum("ia,ab,ib->i", rows, products, others, optimize=True))
+
+    gram = phi @ products @ phi.T
+    scale = np.sqrt(np.maximum(np.diagonal(gram), 1e-300))
+    inverse = np.linalg.pinv(gram / np.outer(scale, scale), rcond=_SAME, hermitian=True) / np.outer(scale, scale)
+    theta = y @ products @ phi.T @ inverse
+    last = y_before - theta @ phi_before
+    told = last @ products @ phi.T @ inverse
+    new = last - told @ phi  # what the residual before says that φ does not
+    theta = theta - _share(on(new, y), on(new, new), on(last, last))[:, None] * told
+    residual, last = y - theta @ phi, y_before - theta @ phi_before
+    memory = _share(on(last, residual), on(last, last), on(y_before, y_before))
+    left = residual - memory[:, None] * last
+    variance, whole = on(left, left), on(y, y)
+    if not ((variance > _EXACT * whole) | (whole == 0.0)).all() or not (np.abs(theta) <= LARGEST).all():
+        return None
+    A, B, c = np.split(theta, (n, r - 1), axis=1)
+    return Residuals(np.zeros(n), _covariance(left @ products @ left.T / count), False, Run(A, B, c[:, 0]), memory)
 
 
-def _log_likelihood(values: Array) -> float:
-    """Of a row, with the likeliest mean and scatter, but for a constant; -inf if the scatter is singular."""
-    columns = np.ascontiguousarray(values.T)
-    n, count = columns.shape
-    weights = np.ones(count)
-    for _ in range(_ROUNDS):
-        centred = columns - (columns @ weights / weights.sum())[:, None]
-        scatter = (centred * weights) @ centred.T / count
-        sign, logarithm = np.linalg.slogdet(scatter)
-        if sign <= 0.0 or not np.isfinite(logarithm):
-            return -np.inf
-        distance = np.einsum("ik,ik->k", np.linalg.inv(scatter) @ centred, centred)
-        weights = (_FREEDOM + n) / (_FREEDOM + distance)
-    return float(-0.5 * logarithm - 0.5 * (_FREEDOM + n) * np.log1p(distance / _FREEDOM).mean())
+def _share(of: Array, size: Array, whole: Array) -> Array:
+    """of / size; 0 where the size is rounding of the whole."""
+    return np.divide(of, size, out=np.zeros_like(of), where=size > _EXACT * whole)
+
+
+def _covariance(products: Array) -> Array:
+    """A covariance without the negative eigenvalues that rounding leaves."""
+    values, vectors = np.linalg.eigh(0.5 * (products + products.T))
+    covariance = (vectors * np.maximum(values, 0.0)) @ vectors.T if values[0] < 0.0 else products
+    return np.asarray(0.5 * (covariance + covariance.T))

@@ -176,7 +176,7 @@ def _fitted(
         raise FitError(f"horizon of {steps} steps: {error}") from None
     some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
     fleet = Fleet.of(some)
-    residuals = fleet.residuals(found.envelope, fleet.judge(found.envelope))
+    residuals = fleet.residuals(found.envelope, fleet.judge(found.envelope), own_law=False)
     return found.envelope.with_residuals(residuals), {
         "solvers": found.solution.solvers,
         "steps": steps,

@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
 from operator import add
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.identification.assembly import scaled_eigenvalues
 from uncertain_lti.identification.problem import Block, Columns, Partition
-from uncertain_lti.kernel.arithmetic import Blocks, centre_and_half, near_bounds, occupy, pair_count, sums_of, verdicts
+from uncertain_lti.kernel.arithmetic import Blocks, near_bounds, occupy, pair_count, sums_of, verdicts
 
 T = TypeVar("T", "Moments", "Judged")
 
@@ -362,9 +363,9 @@ class Judged:
     """What the bounds of a model are on transitions.
 
     `outside` (n,): transitions outside, by row; `largest` (n,): largest width per step, normalised; `weighted` (n,):
-    largest √w_ii x width, normalised; `total` (2, n): Σ r of the utilisation r = (x_next - centre) / half, then of the
-    residual r = x_next - centre; `products` (2, n, n): Σ r rᵀ of the same; `widths` (R, n): of each block of a schedule
-    the sum of the widths at transitions of which it has the largest weight; `widest` (R, n): the largest of these.
+    largest √w_ii x width, normalised; `total` (n,): Σ r of the utilisation r = (x_next - centre) / half; `products`
+    (n, n): Σ r rᵀ; `widths` (R, n): of each block of a schedule the sum of the widths at transitions of which it has
+    the largest weight; `widest` (R, n): the largest of these.
     """
 
     outside: NDArray[np.intp]
@@ -395,16 +396,21 @@ def judge(part: Partition, model: Envelope) -> Judged:
     return sum(others, first)
 
 
-def some_residuals(part: Partition, model: Envelope, stride: int) -> tuple[Array, Array]:
-    """Residuals x_next - centre of some transitions, and their half-widths, (K, n) each."""
-    left, halves = [], []
+def in_a_row(part: Partition, share: float) -> tuple[Array, int]:
+    """Σ w wᵀ of two transitions in a row, w = [φ_k; y_k; φ_{k-1}; y_{k-1}], and how many there are.
+
+    φ = Δt [z; 1], y = x_next - x; looked at is the first share of each piece.
+    """
+    total, count = np.zeros((2 * (part.n + part.p + 1),) * 2), 0
     for block in part.blocks():
-        z, dt, x_next, base, blocks, s = _given(block.every(0, stride), part.columns)
-        centre, half = np.empty(x_next.shape), np.empty(x_next.shape)
-        centre_and_half(model.tables, z, dt, centre, half, blocks, s, base)
-        left.append((x_next - centre).T)
-        halves.append(half.T)
-    return np.concatenate(left), np.concatenate(halves)
+        one = slice(0, math.ceil(share * len(block)))
+        z, dt, x_next = block.z[:, one], block.dt[one], block.x_next[:, one]
+        rows = np.vstack([dt * z, dt, x_next - block.origin[:, one]])
+        follows = (z[: part.n, 1:] == x_next[:, :-1]).all(axis=0)
+        both = np.vstack([rows[:, 1:], rows[:, :-1]])[:, follows]
+        total += both @ both.T
+        count += both.shape[1]
+    return total, count
 
 
 def moving_from_rest(part: Partition, offset: int = 0) -> tuple[int, int, int, float]:

@@ -75,15 +75,17 @@ class _Updated(Fleet):
         both = Occupancy.of(np.logical_or.reduce(new)).occupied | seen.within(self._model.domain, low, high)
         return Occupancy(seen.cells, both)
 
-    def residuals(self, model: Envelope, judged: Judged) -> Residuals:
+    def residuals(self, model: Envelope, judged: Judged, own_law: bool = True) -> Residuals:
         """Those of the earlier recordings by the model of then, those of the new ones by this one."""
         before, count = self._model.residuals, self._model.fit_summary["transitions"]
         if before is None:
             return super().residuals(model, judged)
-        new, form = self._new.judge(model), 0 if before.relative else 1
+        if not before.relative:  # a law of its own stays, and so do its residuals
+            return before
+        new = self._new.judge(model)
         total = count + self._new.N
-        mean = (count * before.mean + new.total[form]) / total
-        squares = count * (before.covariance + np.outer(before.mean, before.mean)) + new.products[form]
+        mean = (count * before.mean + new.total) / total
+        squares = count * (before.covariance + np.outer(before.mean, before.mean)) + new.products
         covariance = squares / total - np.outer(mean, mean)
         return Residuals(mean, 0.5 * (covariance + covariance.T), before.relative)
 

@@ -56,7 +56,7 @@ cdef class Judgement:
 cdef class Judge:
     """Judges one transition after another by the bounds of one model.
 
-    `theta, delta, v`: as of `Elements`; `steady, scale` (n + m + q,): of [x; u; s], with s the q further scheduling
+    `theta, delta, v`: as of `Elements`; `law`: as theta, what residuals are counted from in place of the centre; `steady, scale` (n + m + q,): of [x; u; s], with s the q further scheduling
     signals; `least, greatest` (n + m,): normalised [x; u] that the fit saw; `margin`: multiplies the half-widths;
     `counted` (n,): states whose violations count; `occupied` (pairs, cells, cells): combinations of two signals that
     the fit saw; `schedule`: `model.schedule.Schedule`, None for one block; `positions`: where its signals are in
@@ -65,7 +65,8 @@ cdef class Judge:
 
     cdef Py_ssize_t n, size, total
     cdef double margin
-    cdef Elements elements
+    cdef Elements elements, law
+    cdef bint apart  # the law is another one than the elements
     cdef Blocks blocks
     cdef list _keep
     cdef const double* steady
@@ -88,15 +89,18 @@ cdef class Judge:
 
     def __init__(
         self, theta, delta, v, steady, scale, least, greatest, double margin, counted, occupied=None, schedule=None,
-        positions=(), known=None,
+        positions=(), known=None, law=None,
     ):
         cdef Py_ssize_t n, p, size = len(least)
         *_, n, p = theta.shape
         self.n, self.size, self.total = n, size, len(steady)
         self.margin, self.blocks = margin, Blocks(() if schedule is None else schedule.axes, known)
         lead = () if schedule is None else (self.blocks.count,)
-        if not theta.shape == delta.shape == (*lead, n, p) or v.shape != (*lead, n) or len(counted) != n or p < size:
+        self.apart, law = law is not None, theta if law is None else law
+        if not law.shape == theta.shape == delta.shape == (*lead, n, p) or v.shape != (*lead, n) or p < size:
             raise ValueError("the terms do not fit one another")
+        if len(counted) != n:
+            raise ValueError("the states that count do not fit the terms")
         if not len(scale) == self.total >= size == len(greatest) >= n:
             raise ValueError("the operating point or the domain does not fit the terms")
         if schedule is not None and not (
@@ -107,6 +111,7 @@ cdef class Judge:
         if occupied is not None and occupied.shape != (pair_count(size), self.cells, self.cells):
             raise ValueError("the occupied cells do not fit the signals")
         self.elements = Elements(theta, delta, v)
+        self.law = Elements(law, delta, v) if self.apart else self.elements
         cdef arrays.array numbers = doubles(
             np.concatenate([steady, scale, least, greatest, cells_per_unit(least, greatest, self.cells)])
         )
@@ -182,9 +187,10 @@ cdef class Judge:
         cdef Tiles tiles = Tiles(n, p, z[: self.size], times, None, after, self.blocks, at_schedule)
         cdef unsigned char beyond[_SORTED]  # bits of what makes the numbers of a transition none, and of repeats
         cdef unsigned char out[_TOGETHER]
-        cdef double* psi = room_for(p + 2)
+        cdef double* psi = room_for(p + 3)
         cdef double* centre = psi + p * _TOGETHER
         cdef double* half = centre + _TOGETHER
+        cdef double* expected = half + _TOGETHER if self.apart and to[2] != NULL else centre
         with nogil:
             for low from 0 <= low < count by _SORTED:
                 tiles.begin(0, count - low if count - low < _SORTED else _SORTED, 0)
@@ -210,9 +216,13 @@ cdef class Judge:
                         flags[begins[low + tiles.index[q]] + 1] = self.marks_of(tiles.regimes[q], out[q])
                     for i in range(n):
                         tiles.bounds(self.elements, i, psi, centre, half)
+                        if expected != centre:
+                            tiles.centres(self.law, i, expected)
                         for q in range(tiles.many):
                             at = begins[low + tiles.index[q]] + 1
-                            flags[at] |= self.place(i, centre[q], half[q], tiles.end[i * _TOGETHER + q], to, at * n + i)
+                            flags[at] |= self.place(
+                                i, centre[q], half[q], expected[q], tiles.end[i * _TOGETHER + q], to, at * n + i
+                            )
                 for q in range(tiles.count):
                     at = begins[low + q] + 1
                     if beyond[q] & _BEYOND:
@@ -241,7 +251,7 @@ cdef class Judge:
         return _JUDGED | (_UNKNOWN | _OUTSIDE if regime > 0 else 0) | (_OUTSIDE if outside else 0)
 
     cdef inline int place(
-        self, Py_ssize_t i, double centre, double half, double end, double** to, Py_ssize_t at
+        self, Py_ssize_t i, double centre, double half, double expected, double end, double** to, Py_ssize_t at
     ) noexcept nogil:
         """What the bounds say of the end of a state, into numbers that are not NULL, and in bits."""
         cdef double lower = lower_of(centre, half, self.margin), upper = upper_of(centre, half, self.margin)
@@ -251,7 +261,7 @@ cdef class Judge:
         if to[1] != NULL:
             to[1][at] = recorded(upper, self.steady[i], self.scale[i])
         if to[2] != NULL:
-            to[2][at] = end - centre
+            to[2][at] = end - expected
         if to[3] != NULL:
             to[3][at] = 0.0 if inside else 1.0
         if to[4] != NULL:
@@ -267,12 +277,15 @@ cdef class Judge:
         self.leave_domain(self.phi, 1, 1, &out)
         cdef int marks = self.marks_of(regime, out)
         self.elements.sum(self.phi, self.places, self.weights, self.blocks.corners)
+        if self.apart:
+            self.law.sum(self.phi, self.places, self.weights, self.blocks.corners)
         for j in range(5):
             to[j] = values + j * n
         for i in range(n):
             marks |= self.place(
                 i, centre_of(self.phi[i], dt, self.elements.rate[i]),
-                half_of(dt, self.elements.spread[i], self.elements.still[i]), self.end[i], to, i,
+                half_of(dt, self.elements.spread[i], self.elements.still[i]),
+                centre_of(self.phi[i], dt, self.law.rate[i]), self.end[i], to, i,
             )
         return marks
 

@@ -185,8 +185,7 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     """The verdict on all transitions, by the arithmetic of every other verdict.
 
     `tables`: as of `centre_and_half`; `roots` (n, K) or (n, 1): √w. Returns of each state the transitions outside, the
-    largest width and the largest √w x width; Σ of the utilisation and of the residual (2, n), their products (2, n, n);
-    and of each block of a schedule the sum and the largest of the widths where it is the main one (R, n).
+    largest width and the largest √w x width; Σ of the utilisation (n,), its products (n, n); and of each block of a schedule the sum and the largest of the widths where it is the main one (R, n).
     """
     cdef Elements elements = Elements(*tables)
     cdef Tiles tiles = Tiles(elements.n, elements.p, z, dt, base, after, blocks, s)
@@ -194,19 +193,18 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
     cdef const double[:, :] root = roots
     cdef bint each = roots.shape[1] > 1
     outside, largest = np.zeros(n, dtype=np.intp), np.zeros((2, n))
-    total, products = np.zeros((2, n)), np.zeros((2, n, n))
+    total, products = np.zeros(n), np.zeros((n, n))
     widths = np.zeros((2, tiles.blocks.count, n))
     cdef Py_ssize_t[::1] left_out = outside
     cdef double[:, ::1] most = largest
-    cdef double[:, ::1] sum_of = total
-    cdef double[:, :, ::1] product_of = products
+    cdef double[::1] sum_of = total
+    cdef double[:, ::1] product_of = products
     cdef double[:, :, ::1] of_block = widths
-    cdef double* psi = room_for(elements.p + 2 + 2 * n)
+    cdef double* psi = room_for(elements.p + 2 + n)
     cdef double* centre = psi + elements.p * _TOGETHER
     cdef double* half = centre + _TOGETHER
-    cdef double* values = half + _TOGETHER  # utilisations, then residuals
+    cdef double* values = half + _TOGETHER  # utilisations
     cdef double* utilised
-    cdef double* left
     cdef const double* end
     cdef double width, weighted
     if not (root.shape[0] == n and root.shape[1] in (1, tiles.count)):
@@ -227,27 +225,22 @@ def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
                         width = 2.0 * (half[q] * root[i, tiles.index[q]])
                         weighted = width if width > weighted else weighted
                     most[1, i] = weighted if weighted > most[1, i] else most[1, i]
-                utilised, left = values + i * _TOGETHER, values + (n + i) * _TOGETHER
+                utilised = values + i * _TOGETHER
                 for q in range(tiles.whole):
-                    left[q] = end[q] - centre[q]
-                    utilised[q] = utilisation_of(left[q], half[q])
-                sum_of[0, i] += dot(utilised, tiles.ones, tiles.whole)
-                sum_of[1, i] += dot(left, tiles.ones, tiles.whole)
+                    utilised[q] = utilisation_of(end[q] - centre[q], half[q])
+                sum_of[i] += dot(utilised, tiles.ones, tiles.whole)
                 for q in range(tiles.many if tiles.corners else 0):
                     c = tiles.places[main_corner(tiles, q)]
                     width = 2.0 * half[q]
                     of_block[0, c, i] += width
                     of_block[1, c, i] = width if width > of_block[1, c, i] else of_block[1, c, i]
-            for k in range(2):
-                for i in range(n):
-                    for j in range(i, n):
-                        product_of[k, i, j] += dot(
-                            values + (k * n + i) * _TOGETHER, values + (k * n + j) * _TOGETHER, tiles.whole
-                        )
+            for i in range(n):
+                for j in range(i, n):
+                    product_of[i, j] += dot(values + i * _TOGETHER, values + j * _TOGETHER, tiles.whole)
     free(psi)
     if not each:
         largest[1] = largest[0] * roots[:, 0]
-    return outside, largest[0], largest[1], total, np.stack([mirrored(part) for part in products]), *widths
+    return outside, largest[0], largest[1], total, mirrored(products), *widths
 
 
 cdef inline void lowered(const double* values, Py_ssize_t count, double* least) noexcept nogil:

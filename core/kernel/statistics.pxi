@@ -32,8 +32,8 @@ cdef class Statistic:
     """One statistic of one verdict after another, and whether it is over its threshold.
 
     `kind`: one of the kinds above; `n`: number of states; `window_s`: T, s; `thresholds`: what raises the alarm if it
-    is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,) and `whitening` (n, n): of what
-    chi2 and mewma take, see `model.residuals`; `alarm`: the statistic of some state that counts is over its threshold.
+    is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,), `whitening` (n, n), `memory` (n,): of
+    what chi2 and mewma take, see `model.residuals`: each number less its mean, less so much of the one before; `alarm`: the statistic of some state that counts is over its threshold.
     Each state has its own window, so a verdict that leaves one state out changes nothing of that state.
     """
 
@@ -47,6 +47,8 @@ cdef class Statistic:
     cdef const unsigned char* counted
     cdef const double* mean
     cdef const double* whitening
+    cdef const double* memory  # NULL if it is 0
+    cdef double* before  # (n,): the last row less its mean; 0 before the first
     cdef double* now  # (size,): the statistic over its threshold
     cdef double* up  # sum of the newer half; moving average; sum upwards
     cdef double* down  # the same downwards
@@ -65,26 +67,29 @@ cdef class Statistic:
 
     def __init__(
         self, int kind, Py_ssize_t n, double window_s, thresholds, counted, double allowance=0.0, mean=None,
-        whitening=None,
+        whitening=None, memory=None,
     ):
         joint = kind == CHI2 or kind == MEWMA
         size = 1 if joint else n
         if len(thresholds) != size or len(counted) != n:
             raise ValueError("the thresholds or the states that count do not fit the states")
-        if joint and (np.shape(mean) != (n,) or np.shape(whitening) != (n, n)):
+        memory = np.zeros(n) if joint and memory is None else memory
+        if joint and not (np.shape(mean) == np.shape(memory) == (n,) and np.shape(whitening) == (n, n)):
             raise ValueError("the mean or the covariance does not fit the states")
         self.kind, self.n, self.size = kind, n, size
         self.window, self.window_ns, self.allowance = window_s, round(window_s * 1e9), allowance
         cdef arrays.array given = doubles([float(threshold) for threshold in thresholds])
-        cdef arrays.array law = doubles(np.concatenate([mean, np.reshape(whitening, -1)]) if joint else [])
-        cdef arrays.array room = doubles(np.zeros(3 * n + 2 * n * _TOGETHER))
+        cdef arrays.array law = doubles(np.concatenate([mean, memory, np.ravel(whitening)]) if joint else [])
+        cdef arrays.array room = doubles(np.zeros(4 * n + 2 * n * _TOGETHER))
         cdef arrays.array places = array("q", bytes(8 * (4 * n + _TOGETHER)))
         cdef bytes flags = bytes([1]) if joint else bytes(map(bool, counted))
         self._keep = [given, law, room, places, flags]
         self.thresholds, self.counted, self.mean = given.data.as_doubles, flags, law.data.as_doubles
-        self.whitening, self.now = self.mean + n, room.data.as_doubles
+        self.whitening, self.now = self.mean + 2 * n, room.data.as_doubles
+        self.memory = self.mean + n if joint and np.any(memory) else NULL
         self.up, self.down, self.terms = self.now + n, self.now + 2 * n, self.now + 3 * n
         self.after = self.terms + n * _TOGETHER
+        self.before = self.after + n * _TOGETHER
         self.begin = places.data.as_longlongs
         self.middle, self.end, self.total = self.begin + n, self.begin + 2 * n, self.begin + 3 * n
         self.step_ns = self.begin + 4 * n
@@ -100,7 +105,7 @@ cdef class Statistic:
         """Forget every verdict."""
         cdef Py_ssize_t i
         for i in range(self.n):
-            self.up[i] = self.down[i] = 0.0
+            self.up[i] = self.down[i] = self.before[i] = 0.0
             self.now[i] = NAN
             self.begin[i] = self.middle[i] = self.end[i] = self.total[i] = 0
         self.spread = 0.0
@@ -198,7 +203,7 @@ cdef class Statistic:
         """What each of some verdicts adds of each state; NaN where it adds nothing."""
         cdef Py_ssize_t i, j, q, n = self.n
         cdef bint joint = self.kind == _CHI2 or self.kind == _MEWMA
-        cdef double value, weight, mean, limit = _LIMIT if self.kind == _EWMA or self.kind == _CUSUM else _MOST
+        cdef double value, weight, limit = _LIMIT if self.kind == _EWMA or self.kind == _CUSUM else _MOST
         cdef double* values
         cdef double* term = self.terms
         cdef double total[_TOGETHER]
@@ -218,14 +223,25 @@ cdef class Statistic:
         for q in range(count):
             square[q], missing[q] = 0.0, 0
         for i in range(n):
+            values = self.after + i * _TOGETHER
+            for q in range(count):
+                values[q] -= self.mean[i]
+                missing[q] |= values[q] != values[q]
+        for i in range(n if self.memory != NULL else 0):
+            values = self.after + i * _TOGETHER
+            for q in range(count):
+                if not missing[q]:
+                    value = self.before[i]
+                    self.before[i] = values[q]
+                    values[q] -= self.memory[i] * value
+        for i in range(n):
             term = self.terms + i * _TOGETHER
             for q in range(count):
                 total[q] = 0.0
-                missing[q] |= self.after[i * _TOGETHER + q] != self.after[i * _TOGETHER + q]
             for j in range(i + 1):
-                values, weight, mean = self.after + j * _TOGETHER, self.whitening[i * n + j], self.mean[j]
+                values, weight = self.after + j * _TOGETHER, self.whitening[i * n + j]
                 for q in range(count):
-                    total[q] += weight * (values[q] - mean)
+                    total[q] += weight * values[q]
             for q in range(count):
                 square[q] += total[q] * total[q]
                 term[q] = -_LIMIT if total[q] < -_LIMIT else total[q] if total[q] <= _LIMIT else _LIMIT

@@ -266,11 +266,8 @@ cdef class Tiles:
         cdef Py_ssize_t q, n = self.n
         cdef double still = elements.v[i]
         cdef const double* step = self.step
-        cdef const double* start = self.start + i * _TOGETHER
-        self.sum(elements.theta, i, n, elements.p, self.phi, centre)
+        self.centres(elements, i, centre)
         self.sum(elements.delta, i, n, elements.p, psi, half)
-        for q in range(self.whole):
-            centre[q] = centre_of(start[q], step[q], centre[q])
         if not self.corners:
             for q in range(self.whole):
                 half[q] = half_of(step[q], half[q], still)
@@ -278,6 +275,14 @@ cdef class Tiles:
         self.sum(elements.v, i, n, 1, self.ones, self.still)
         for q in range(self.whole):
             half[q] = half_of(step[q], half[q], self.still[q])
+
+    cdef void centres(self, Elements elements, Py_ssize_t i, double* centre) noexcept nogil:
+        """Centre (_TOGETHER,) of the bounds of a state at each transition."""
+        cdef Py_ssize_t q
+        cdef const double* start = self.start + i * _TOGETHER
+        self.sum(elements.theta, i, self.n, elements.p, self.phi, centre)
+        for q in range(self.whole):
+            centre[q] = centre_of(start[q], self.step[q], centre[q])
 
     cdef void sizes(self, Py_ssize_t columns, double* psi) noexcept nogil:
         """psi (columns, _TOGETHER) = |phi|."""

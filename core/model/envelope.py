@@ -159,9 +159,17 @@ class Envelope(Elements):
 
     def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
         """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count."""
-        return self._judge(self.tables, margin, counted)
+        forms = () if self.residuals is None else self.residuals.forms
+        law = next((form.law.tables[0] for form in forms if form.law is not None), None)
+        return self._judge(self.tables, margin, counted, law)
 
-    def _judge(self, elements: tuple[Array, Array, Array], margin: float, counted: NDArray[np.bool_]) -> Judge:
+    def _judge(
+        self,
+        elements: tuple[Array, Array, Array],
+        margin: float,
+        counted: NDArray[np.bool_],
+        law: Array | None = None,
+    ) -> Judge:
         point, domain = self.operating_point, self.domain
         return Judge(
             *elements,
@@ -175,6 +183,7 @@ class Envelope(Elements):
             self.schedule,
             self.scheduling_positions,
             [data.known for data in self.block_data],
+            law,
         )
 
     def _runner(self) -> Judge:

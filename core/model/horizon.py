@@ -104,6 +104,7 @@ def unbroken_over(k: NDArray[np.intp], vectors: Iterable[Array], schedule: Sched
 
 
 _OF_RESIDUALS = ("mean", "covariance")
+_OF_LAW = (*_OF_RUN, "memory")
 _RELATIVE = "relative"
 _LEAST = 1e-12
 """Share of the state's own variance below which what the others leave of it counts as none."""
@@ -112,32 +113,65 @@ _LEAST = 1e-12
 class Residuals:
     """Mean and covariance of the utilisation (x_{k+1} - centre_k) / half_k over the transitions of the fit.
 
-    Of a horizon those of the utilisation of its envelope, over the windows of the fit. If the spread of residuals
-    changes with x, u and the regime as the half-widths do, one covariance describes the utilisation better; noise of
-    the readings is the same everywhere, and then one of the residual itself, x_{k+1} - centre_k, normalised, does. The
-    fit takes the likelier one.
+    Of a horizon those of the utilisation of its envelope, over the windows of the fit. Where the spread of residuals
+    does not change with x and u as the half-widths do, one covariance describes the residual itself better, normalised:
+    that of a law of its own, x_{k+1} - x_k - Δt (A x_k + B u_k + c), each less so much of the one before as its memory
+    says; of older files x_{k+1} - centre_k.
 
-    `mean` (n,): mean of each state; `covariance` (n, n): symmetric, with no negative eigenvalue but by rounding;
-    `relative`: of the utilisation; False: of the residual itself.
+    `mean` (n,): mean of each state; `covariance` (n, n): symmetric, with no negative eigenvalue but by rounding, of
+    what the memory leaves; `relative`: of the utilisation; False: of the residual itself; `law`: A, B and c; `memory`
+    (n,): what is expected of a residual less its mean is this times the one before; `other`: what describes the same
+    transitions in the other form, until the alarm takes one of them.
     """
 
-    def __init__(self, mean: ArrayLike, covariance: ArrayLike, relative: bool = True) -> None:
-        self.relative = relative
+    def __init__(
+        self,
+        mean: ArrayLike,
+        covariance: ArrayLike,
+        relative: bool = True,
+        law: Run | None = None,
+        memory: ArrayLike | None = None,
+        other: Residuals | None = None,
+    ) -> None:
+        self.relative, self.law, self.other = relative, law, other
         self.mean = checked(mean, "residuals.mean", None)
         n = len(self.mean) if self.mean.ndim == 1 else 0
         if self.mean.ndim != 1 or n == 0:
             raise ModelError(f"residuals.mean has shape {self.mean.shape}; it must have one number per state")
+        if law is not None and relative:
+            raise ModelError("residuals.relative is true, and there is a law; the utilisation has none")
         self.covariance = checked(covariance, "residuals.covariance", (n, n))
+        self.memory = checked(np.zeros(n) if memory is None else memory, "residuals.memory", (n,))
         size = float(np.abs(self.covariance).max())
         if not np.allclose(self.covariance, self.covariance.T, rtol=1e-9, atol=1e-12 * size):
             raise ModelError("residuals.covariance is not symmetric; fit the model again")
         least = float(np.linalg.eigvalsh(self.covariance / (size or 1.0)).min())
         if least < -1e-9 or (np.diagonal(self.covariance) < 0).any():
             raise ModelError("residuals.covariance has a negative variance; fit the model again")
-        self.mean.flags.writeable = self.covariance.flags.writeable = False
+        self.mean.flags.writeable = self.covariance.flags.writeable = self.memory.flags.writeable = False
 
     def __repr__(self) -> str:
         return f"Residuals({len(self.mean)} states)"
+
+    def beside(self, other: Residuals | None) -> Residuals:
+        """The same with another form, or alone."""
+        return Residuals(self.mean, self.covariance, self.relative, self.law, self.memory, other)
+
+    @property
+    def forms(self) -> tuple[Residuals, ...]:
+        """Itself, and the other."""
+        return (self,) if self.other is None else (self, self.other)
+
+    def alike(self, form: Residuals) -> Residuals | None:
+        """That of the forms which is as another is, with the rest of them; None if neither is."""
+        if self.form == form.form:
+            return self
+        return self.other if self.other is not None and self.other.form == form.form else None
+
+    @property
+    def form(self) -> tuple[bool, bool]:
+        """Whether it is relative, and whether it has a law."""
+        return self.relative, self.law is not None
 
     def whitening(self, counted: ArrayLike) -> Array:
         """L^-1 of the counted states' covariance C = L Lᵀ: the sum of squares of L^-1 r is rᵀ C^-1 r.
@@ -164,17 +198,24 @@ class Residuals:
     def to_dict(self) -> dict[str, Any]:
         """The form of the model file."""
         found = {"mean": self.mean.tolist(), "covariance": self.covariance.tolist()}
+        if self.law is not None:
+            (law,) = self.law.blocks_to_list(_OF_RUN)
+            found |= law | {"memory": self.memory.tolist()}
         return found | ({_RELATIVE: True} if self.relative else {})
 
     @classmethod
     def from_dict(cls, data: Any, name: str = "residuals") -> Residuals:
         """From a model file."""
-        data = object_of(data, name, known=(*_OF_RESIDUALS, _RELATIVE), needed=_OF_RESIDUALS)
+        data = object_of(data, name, known=(*_OF_RESIDUALS, _RELATIVE, *_OF_LAW), needed=_OF_RESIDUALS)
         relative = data.get(_RELATIVE, False)
         if not isinstance(relative, bool):
             raise ModelError(f"field '{name}.{_RELATIVE}' is {reprlib.repr(relative)}; it must be true or false")
+        given = [key for key in _OF_LAW if key in data]
+        if given and len(given) < len(_OF_LAW):
+            raise ModelError(f"field '{name}' has {', '.join(given)}; a law has {', '.join(_OF_LAW)}")
         try:
-            return cls(data["mean"], data["covariance"], relative)
+            law = Run(*(data[key] for key in _OF_RUN)) if given else None
+            return cls(data["mean"], data["covariance"], relative, law, data.get("memory"))
         except ModelError as error:
             raise ModelError(str(error).replace("residuals", name, 1)) from None
 

@@ -188,6 +188,9 @@ class UncertainLTI(Envelope):
         rules = (alarm_rule or AlarmRule(),) if alarm is None else checked_rules(alarm)
         if alarm is not None and alarm_rule is not None:
             rules = with_containment(rules, alarm_rule)
+        for residuals in () if self.residuals is None else self.residuals.forms:
+            if residuals.law is not None:
+                self.fits(residuals.law, "residuals")
         if self.residuals is not None and len(self.residuals.mean) != self.n:
             raise ModelError(f"residuals of {plural(len(self.residuals.mean), 'state')} for {plural(self.n, 'state')}")
         horizons = {1, *(h.steps for h in self.horizons)}
@@ -206,8 +209,8 @@ class UncertainLTI(Envelope):
     def with_residuals_of(self, other: UncertainLTI, instead: bool = False) -> UncertainLTI:
         """The same model with the `residuals` of another fit, as far as it has the same horizons.
 
-        Where one is of the utilisation and one of the residual itself, this model keeps its own `instead`, and takes
-        those of the other otherwise: thresholds are for one form.
+        Those are taken that are of the form of its own: thresholds are for one form. Where the other has none of it,
+        this model keeps its own `instead`, and takes those of the other otherwise.
 
         Parameters
         ----------
@@ -225,7 +228,8 @@ class UncertainLTI(Envelope):
         def chosen(own: Residuals | None, given: Residuals | None) -> Residuals | None:
             if own is None or given is None:
                 return own or given
-            return own if instead == (given.relative != own.relative) else given
+            alike = given.alike(own)
+            return (own if alike is None else alike) if instead else (given if alike is None else own)
 
         of = {horizon.steps: horizon.residuals for horizon in other.horizons}
         return self.replace(

@@ -133,7 +133,7 @@ class Alarm:
         law: tuple[Any, ...] = ()
         if rule.kind in JOINT:
             residuals = self._model.residuals_at(rule.horizon)
-            law = residuals.mean, residuals.whitening(self._counted)
+            law = residuals.mean, residuals.whitening(self._counted), residuals.memory
         counted, limits = self._counted.tolist(), rule.thresholds(n)
         return Statistic(KINDS.index(rule.kind), n, rule.window_s, limits, counted, rule.allowance, *law)
 

@@ -373,7 +373,8 @@ def _cases(model: UncertainLTI, parts: Sequence[Part], within: float, cases: int
 
 def _alarming(own: UncertainLTI, model: UncertainLTI) -> UncertainLTI:
     """A model with the alarm of another; which combinations it has seen takes long to tell, and no alarm asks."""
-    return own.replace(alarm=model.alarm, domain=replace(own.domain, measure=None))
+    residuals = model.with_residuals_of(own, instead=True).residuals
+    return own.replace(alarm=model.alarm, residuals=residuals, domain=replace(own.domain, measure=None))
 
 
 def _onsets(transient: Transient, within: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

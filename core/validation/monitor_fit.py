@@ -64,7 +64,7 @@ class Monitored:
                 alarm["note"] = self.why
         if self.centred:
             alarm["centred"] = True
-        left = {"not_done": self.why} if self.validation is None else replace(self.validation, model=model).to_dict()
+        left = {"not_done": self.why} if self.validation is None else self.validation.judged_as(model).to_dict()
         return model.replace(fit_summary={**model.fit_summary, "alarm": alarm}, validation=left)
 
 
@@ -113,7 +113,7 @@ def monitored_like(
     """The model of all recordings with the panel that some of them left out, as `taken` was; `note`: on which."""
     if taken.panel is None:
         return replace(taken, model=model)
-    seen, left = _seen(model, transients, _SHOWN), taken.validation and replace(taken.validation, model=model)
+    seen, left = _seen(model, transients, _SHOWN), taken.validation and taken.validation.judged_as(model)
     fitted = fitted_parts(model, transients) if left else seen.parts
     return Monitored(*_armed(left or seen, fitted, rate), left, "; ".join(filter(None, (taken.why, note))))
 
@@ -125,7 +125,7 @@ def _seen(model: UncertainLTI, transients: Sequence[Transient], most: float) -> 
 
 def _armed(validation: Validation, fitted: Sequence[Part], rate: float | None) -> tuple[UncertainLTI, Panel]:
     panel = learn(validation, fitted, rate)
-    return validation.model.replace(alarm=panel.rules), panel
+    return validation.model.replace(alarm=panel.rules, residuals=panel.residuals), panel
 
 
 def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], **options: Any) -> Monitored:

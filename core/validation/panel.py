@@ -43,6 +43,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import lasting, plural, shortlist
 from uncertain_lti.identification.memory import as_text, of_text
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
+from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Alarm
 from uncertain_lti.validation.intervals import cluster_size, rate_interval
@@ -54,7 +55,9 @@ PANEL = (("energy", 1, 1), ("energy", 10, 10))
 SLOW = (("ewma", 100, 2),)
 """The same of slow rules, where TELLING recordings or groups say how far they differ."""
 SLOW_OF_FEW = (("mean", 30, 3), ("chi2", 30, 3))
-"""The same of fewer, or of one, whose blocks share what drifts slowly."""
+"""The same of fewer, or of one, whose blocks share what drifts slowly; chi2 of several states."""
+SLOW_OF_LAW = (("mewma", 10, 3), ("chi2", 30, 3))
+"""The same where their residuals are of least squares."""
 FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
 CONFIDENCE = 0.9
@@ -168,10 +171,11 @@ class Panel:
     `rules`: the panel; `limit`: false alarms per hour at most, with CONFIDENCE; `alarms`: those on what was left out;
     `hours`: under verdict there; `units`: independent recordings, groups or blocks; `what`: which of them;
     `biases` (n,): jump of the reading of each state that the energy of one verdict shows some nine of ten times, the
-    threshold above twice the median size, recorded units; `within`: in this time, s; `figure`: what ways to fit are
-    compared by, the geometric mean over the states of the lasting offset that the energy over a window shows;
+    threshold above twice the median size, or that alone brings chi2 to its threshold, recorded units; `within`: in this
+    time, s; `figure`: what ways to fit are compared by, the geometric mean over the states of the lasting offset that
+    the energy over a window shows;
     `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the others do not cover;
-    `asked`: rate that was asked for.
+    `asked`: rate that was asked for; `residuals`: of the model, in the form that the joint rules take.
     """
 
     rules: tuple[Rule, ...]
@@ -186,22 +190,37 @@ class Panel:
     evidence: Evidence
     unlike: tuple[str, ...] = ()
     asked: float | None = None
+    residuals: Residuals | None = None
 
     @classmethod
     def of(
-        cls, evidence: Evidence, rules: Sequence[StatisticRule], what: str, unlike: Sequence[str], asked: float | None
+        cls,
+        model: UncertainLTI,
+        evidence: Evidence,
+        rules: Sequence[StatisticRule],
+        what: str,
+        unlike: Sequence[str],
+        asked: float | None,
     ) -> Panel:
-        """That of these rules; `what`: of `Validation.what`."""
-        n = evidence.widths.shape[1]
+        """That of these rules on a model whose residuals are of one form; `what`: of `Validation.what`."""
+        n, residuals = model.n, model.residuals
         thresholds = evidence.thresholds(rules, n, what)
         energies = [i for i, rule in enumerate(rules) if (rule.kind, rule.horizon) == ("energy", 1)]
         usual, median = evidence.widths / 2.0
         sample, window = (evidence.factor * thresholds[i] for i in (energies[0], energies[-1]))
+        biases = usual * (sample + 2.0 * evidence.median[:n])
+        for rule, size in zip(rules, thresholds, strict=True):
+            if (rule.kind, rule.horizon) == ("chi2", 1) and residuals is not None:
+                room = evidence.factor * size * math.sqrt(max(round(rule.window_s / evidence.dt), 1))
+                unit = usual if residuals.relative else model.operating_point.X
+                certain = np.linalg.norm(residuals.whitening(np.ones(n, dtype=bool)), axis=0)
+                known = certain > 0.0
+                biases[known] = np.minimum(biases, unit * room / np.maximum(certain, 1e-300))[known]
         return cls(
             evidence.learnt(rules, what), _limit(evidence, len(rules)), int(evidence.counts.sum()), evidence.hours,
-            len(evidence.peaks), what, usual * (sample + 2.0 * evidence.median[:n]), evidence.dt,
+            len(evidence.peaks), what, biases, evidence.dt,
             float(np.exp(np.log(np.maximum(median * window, 1e-300)).mean())), evidence,
-            tuple(unlike), asked,
+            tuple(unlike), asked, residuals,
         )  # fmt: skip
 
     def summary(self, model: UncertainLTI) -> dict[str, Any]:
@@ -241,7 +260,9 @@ def rules_for(model: UncertainLTI, steps: int, dt: float, apart: bool = False) -
     found = []
     longest = {horizon.steps: horizon.residuals for horizon in model.horizons[-1:]}
     for h, residuals in ({1: model.residuals} | longest).items():
-        for kind, window, least in (*PANEL, *(SLOW if apart else SLOW_OF_FEW)):
+        law = None if residuals is None or model.n == 1 else residuals.law
+        slow = SLOW if apart else SLOW_OF_FEW if law is None else SLOW_OF_LAW
+        for kind, window, least in (*PANEL, *slow):
             window = min(window, steps // least)
             if window < 1 or (kind in JOINT and (model.n < 2 or residuals is None)):
                 continue
@@ -284,15 +305,48 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     dt = float(np.median(np.concatenate([part.dt for part in parts])))
     lengths = sorted(part.judged for part in parts)
     apart = validation.what != "block" and int(unit_numbers(parts).max()) + 1 >= TELLING
-    rules = rules_for(validation.model, lengths[len(lengths) // 10], dt, apart)
-    evidence, shown, unlike = _gathered(rules, parts, fitted, dt)
+    stretch = lengths[len(lengths) // 10]
+    rules = rules_for(validation.model, stretch, dt, apart)
+    model, left, fitted = _narrowest(validation.model, rules, parts, fitted, dt, validation.what)
+    rules = rules_for(model, stretch, dt, apart)
+    evidence, shown, unlike = _gathered(rules, left, fitted, dt)
     found = evidence.with_alarms(rules, validation.what, shown)
     while rate is not None and _limit(found, len(rules)) <= rate and found.factor > _LEAST:
         lower = replace(evidence, factor=found.factor / _FINE).with_alarms(rules, validation.what, shown)
         if _limit(lower, len(rules)) > rate:
             break
         found = lower
-    return Panel.of(found, rules, validation.what, unlike, rate)
+    return Panel.of(model, found, rules, validation.what, unlike, rate)
+
+
+def _narrowest(
+    model: UncertainLTI,
+    rules: Sequence[StatisticRule],
+    parts: Sequence[Part],
+    fitted: Sequence[Part],
+    dt: float,
+    what: str,
+) -> tuple[UncertainLTI, Sequence[Part], Sequence[Part]]:
+    """The model with the form of its residuals in which the joint statistics of one step leave the least room.
+
+    Room is the volume that a joint statistic allows to a residual: the root of the determinant of its covariance, in
+    utilisation times half-widths, and of its threshold. Returns what is left out and fitted in that form, too.
+    """
+    joint = [rule for rule in rules if rule.kind == "chi2" and rule.horizon == 1]
+    forms = () if model.residuals is None else model.residuals.forms
+    best, least = (model, parts, fitted), math.inf
+    for form in forms if joint else forms[:1]:
+        own, room = model.replace(residuals=form.beside(None)), 0.0
+        left, seen = ([part.judged_as(own) for part in each] for each in (parts, fitted))
+        if joint and len(forms) > 1:
+            evidence, *_ = _gathered(joint, left, seen, dt)
+            roots = np.diagonal(form.whitening(np.ones(model.n, dtype=bool)))
+            half = evidence.widths[1] / 2.0 / model.operating_point.X if form.relative else np.ones(model.n)
+            sizes = np.log(half[roots > 0.0] / roots[roots > 0.0])
+            room = float(sizes.sum() / max(len(sizes), 1) + np.log(evidence.thresholds(joint, model.n, what)).mean())
+        if room < least:
+            best, least = (own, left, seen), room
+    return best
 
 
 def extended(
@@ -309,7 +363,7 @@ def extended(
         return None
     new, shown, unlike = _gathered(rules, parts, fitted, evidence.dt)
     both = (evidence + new).with_alarms(rules, what, shown)
-    return Panel.of(both, rules, what, [*alarm["unlike"], *unlike], asked)
+    return Panel.of(model, both, rules, what, [*alarm["unlike"], *unlike], asked)
 
 
 def _gathered(

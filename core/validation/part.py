@@ -114,6 +114,10 @@ class Part:
     def __repr__(self) -> str:
         return f"Part({self.name!r}: {plural(self.judged, 'verdict')}, {self.violated} violated)"
 
+    def judged_as(self, full: UncertainLTI) -> Part:
+        """The same by a full model whose residuals are of another form."""
+        return replace(self, judged_by=full.with_residuals_of(self.model, instead=True))
+
     def without(self, left: NDArray[np.bool_]) -> Part:
         """The part without some of its verdicts, (K,), as if there had been none."""
         if not left.any():

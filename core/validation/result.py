@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -122,6 +122,21 @@ class Validation:
     confidence: float
     grouping: str = ""
     hint: str = ""
+
+    def judged_as(self, model: UncertainLTI) -> Validation:
+        """The same of the model with its alarm.
+
+        Parameters
+        ----------
+        model : UncertainLTI
+            The fit to all recordings, with residuals of one form.
+
+        Returns
+        -------
+        Validation
+            Whose parts are judged as that model judges.
+        """
+        return replace(self, model=model, parts=tuple(part.judged_as(model) for part in self.parts))
 
     @property
     def what(self) -> str:
