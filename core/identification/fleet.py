@@ -32,7 +32,7 @@ _LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
 _PART = 100_000
 """Transitions per part, about: the sums of the parts are added in their order, however many threads there are."""
-_TAKEN = 100_000
+_TAKEN = 50_000
 """Transitions that the law of the residuals is taken from, about."""
 _SAME = 1e-12
 """Directions of regressors that vary by less than the root of this, over their size, count as constant."""
@@ -115,8 +115,8 @@ class Fleet:
     def residuals(self, model: Envelope, judged: Judged, own_law: bool = True) -> Residuals:
         """Mean and covariance of the utilisation, `judged`: of all transitions by the same model.
 
-        With them, but of a schedule and without an `own_law`, residuals of `law_of`: their spread is the same
-        everywhere, where that of one utilisation changes as the half-widths do.
+        With them, but of a schedule and without an `own_law`, as of a structure, which a law does not know, residuals
+        of `law_of`: their spread is the same everywhere, where that of one utilisation changes as the half-widths do.
         """
         mean = judged.total / self.N
         found = Residuals(mean, _covariance(judged.products / self.N - np.outer(mean, mean)))
