@@ -85,6 +85,20 @@ def test_a_slow_average_takes_four_recordings_that_say_how_far_they_differ(runs)
     assert [rule.kind for rule in fit(alone, "lp", additive="noise").alarm] == ["energy", "energy", "ewma"]
 
 
+def test_the_form_of_the_residuals_is_that_whose_threshold_encloses_less(runs):
+    """Spread that grows with the control is told by half-widths; noise of readings is the same everywhere."""
+    rng, u = np.random.default_rng(1), np.repeat([1.0, 0.05] * 30, 25)[:, None]
+    x = np.zeros((len(u), 2))
+    for k in range(len(u) - 1):
+        x[k + 1] = 0.5 * x[k] + u[k] * (1.0 + 0.2 * rng.uniform(-1, 1, 2))
+    uneven = fit(Transient(DT * np.arange(len(u)), x, u), "qp", additive="none")
+    even = fit(runs[:1], "lp", additive="noise")
+    for model, relative, slow in ((uneven, True, "mean"), (even, False, "mewma")):
+        assert model.residuals.relative == relative and len(model.residuals.forms) == 1
+        assert (model.residuals.law is None) == relative
+        assert [rule.kind for rule in model.alarm] == ["energy", "energy", slow, "chi2"]
+
+
 def test_flags_stay_those_of_the_bounds(model, runs):
     """The alarm's thresholds are no margin of the flags."""
     verdicts = EnvelopeMonitor(model).check(runs[0])
