@@ -129,7 +129,8 @@ def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
     found = messages(run(feedback=K, noise=0.0, u=np.zeros((1501, 2))))
     assert sum(WORDS["feedback"] in m for m in found) == 2
     own = 5 * steps(np.random.default_rng(6), 1501, held=6)
-    for healthy in (run(5, noise=0.0), run(feedback=0.2 * np.eye(2), u=own, noise=0.0)):  # steps of its own on top
+    topped = run(feedback=0.2 * np.eye(2), u=own, noise=0.0)  # steps of its own on top
+    for healthy in (run(5, noise=0.0), topped, run(5, noise=0.0, at="both")):
         assert "feedback" not in said(messages(healthy))
 
 
@@ -146,6 +147,8 @@ def test_frozen_sensor_is_named_with_its_stretch():
 
 
 def test_a_machine_at_rest_is_not_frozen():
+    at_its_end = put(slice(400, 520), 1, lambda x: x[:, 1].max())
+    assert "frozen" not in said(messages(run(change=at_its_end)))
     u = steps(np.random.default_rng(7), 1501)
     u[300:700] = 0.0
 

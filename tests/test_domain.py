@@ -118,10 +118,15 @@ def test_a_place_on_which_nothing_depends_has_no_range_to_leave(tmp_path) -> Non
     u = rng.choice([-1.0, 1.0], (count, 1)).repeat(2, axis=0)[:count]
     speed = np.convolve(u[:, 0], np.full(5, 0.2))[:count] + 0.01 * rng.normal(size=count)
     run = Transient(0.01 * np.arange(count), np.column_stack([speed, 0.01 * np.cumsum(speed)]), u)
+    run = run.replace(x=run.x + 1e-4 * rng.normal(size=run.x.shape))
     away = run.replace(x=run.x + [0.0, 40.0])
     assert outside(fit([run], additive="noise"), away) == 1.0
     known = np.array([[np.nan, 0.0], [np.nan, 0.0]])
-    model = fit([run], additive="noise", structure=Structure(2, 1, fixed={"A": known, "dA": known}))
+    structure = Structure(2, 1, fixed={"A": known, "dA": known})
+    assert not structure.together[1].any()
+    model = fit([run], additive="noise", structure=structure)
+    assert model.residuals is not None and len(model.residuals.forms) == 1, "a law would have the place in it"
+    assert model.domain.measure is not None and model.domain.measure.occupied[0].all()
     model.save(tmp_path / "m.json")
     for each in (
         model,

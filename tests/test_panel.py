@@ -21,6 +21,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
+from uncertain_lti.validation.detectable import _alarming
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
 from uncertain_lti.validation.panel import CONFIDENCE, Evidence, Panel, learn, promises, rules_for, sizes_of, worth
@@ -97,6 +98,30 @@ def test_the_form_of_the_residuals_is_that_whose_threshold_encloses_less(runs):
         assert model.residuals.relative == relative and len(model.residuals.forms) == 1
         assert (model.residuals.law is None) == relative
         assert [rule.kind for rule in model.alarm] == ["energy", "energy", slow, "chi2"]
+
+
+def test_a_jump_that_only_both_of_two_alike_tell_counts(runs):
+    rng, alike = np.random.default_rng(2), []
+    for run in runs[:2]:
+        other = run.x[:, :1] + 1e-4 * rng.normal(size=(len(run), 1))
+        alike.append(run.replace(x=np.hstack([run.x[:, :1], other])))
+    few = fit(alike[:1], "lp", additive="noise")
+    size = few.fit_summary["alarm"]["biases"][1]
+    alone = fit(Transient(runs[0].t, runs[0].x[:, :1], runs[0].u), "lp", additive="noise")
+    assert size < 0.1 * alone.fit_summary["alarm"]["biases"][0]
+    x = alike[1].x.copy()
+    x[300:, 1] += size
+    assert EnvelopeMonitor(few).check(alike[1].replace(x=x)).alarm[300]
+
+
+def test_what_is_learnt_by_a_law_is_judged_by_it_where_it_is_injected_and_after_an_update(runs):
+    model = fit(runs[:1], "lp", additive="noise")
+    own = fitting.fit(runs[1:2], "lp", additive="noise")
+    assert own.residuals.relative and _alarming(own, model).residuals.form == model.residuals.form == (False, True)
+    later = model.update(runs[1:2])
+    for name in ("covariance", "memory"):
+        assert np.array_equal(getattr(later.residuals, name), getattr(model.residuals, name))
+    assert np.array_equal(later.residuals.law.A, model.residuals.law.A)
 
 
 def test_flags_stay_those_of_the_bounds(model, runs):

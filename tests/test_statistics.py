@@ -19,10 +19,13 @@ from steps import steps_of
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.fleet import law_of
+from uncertain_lti.identification.passes import in_a_row
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Horizon, Residuals, Run
+from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text
 
@@ -422,6 +425,14 @@ def test_residuals_are_those_of_least_squares_less_what_the_one_before_says_of_t
     assert whole.statistics[1:].tobytes() == one[-len(r) :].tobytes()
     again = EnvelopeMonitor(UncertainLTI.load(tmp_path / "m.json")).check(some)
     assert again.statistics.tobytes() == whole.statistics.tobytes()
+
+
+def test_transitions_are_in_a_row_where_one_begins_with_the_end_of_the_other() -> None:
+    rng = np.random.default_rng(6)
+    runs = [Transient(0.1 * np.arange(k), rng.normal(size=(k, 2)), rng.normal(size=(k, 1))) for k in (40, 30)]
+    problem = assemble(runs, OperatingPoint(np.zeros(2), np.zeros(1), np.ones(2), np.ones(1)), None, "none")
+    total, count = in_a_row(problem, 1.0)
+    assert problem.N == 68 and count == 66 and total.shape == (12, 12) and total[3, 3] == pytest.approx(66 * 0.01)
 
 
 def test_no_law_follows_from_few_transitions_or_from_what_it_explains_to_rounding() -> None:
