@@ -21,6 +21,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
+from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.validation.detectable import _alarming
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
@@ -122,6 +123,19 @@ def test_what_is_learnt_by_a_law_is_judged_by_it_where_it_is_injected_and_after_
     for name in ("covariance", "memory"):
         assert np.array_equal(getattr(later.residuals, name), getattr(model.residuals, name))
     assert np.array_equal(later.residuals.law.A, model.residuals.law.A)
+
+
+def test_residuals_are_counted_from_the_law_only_where_the_model_has_taken_it(runs, tmp_path):
+    """A model as fitted is as its file has it, and thresholds of an older file are for distances from the centre."""
+    plain = fit(runs[:3], "lp", additive="noise", alarm="containment")
+    plain.save(tmp_path / "m.json")
+    fresh, read = (EnvelopeMonitor(m).check(runs[3]).residual for m in (plain, UncertainLTI.load(tmp_path / "m.json")))
+    assert fresh.tobytes() == read.tobytes()
+    old = plain.replace(residuals=Residuals(plain.residuals.mean, plain.residuals.covariance, relative=False))
+    for part in validate(old, runs[:3]).parts:
+        steps = part.transient.transitions()
+        centre, _ = part.model.columns_centre_and_half(part.model.normalised_columns(steps), steps.dt)
+        assert part.residual == pytest.approx(steps.x_next - centre.T, abs=1e-12)
 
 
 def test_flags_stay_those_of_the_bounds(model, runs):

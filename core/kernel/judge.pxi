@@ -56,9 +56,10 @@ cdef class Judgement:
 cdef class Judge:
     """Judges one transition after another by the bounds of one model.
 
-    `theta, delta, v`: as of `Elements`; `law`: as theta, what residuals are counted from in place of the centre; `steady, scale` (n + m + q,): of [x; u; s], with s the q further scheduling
-    signals; `least, greatest` (n + m,): normalised [x; u] that the fit saw; `margin`: multiplies the half-widths;
-    `counted` (n,): states whose violations count; `occupied` (pairs, cells, cells): combinations of two signals that
+    `theta, delta, v`: as of `Elements`; `law`: as theta, what residuals are counted from in place of the centre;
+    `steady, scale` (n + m + q,): of [x; u; s], with s the q further scheduling signals; `least, greatest` (n + m,):
+    normalised [x; u] that the fit saw; `margin`: multiplies the half-widths; `counted` (n,): states whose violations
+    count; `occupied` (pairs, cells, cells): combinations of two signals that
     the fit saw; `schedule`: `model.schedule.Schedule`, None for one block; `positions`: where its signals are in
     [x; u; s]; `known` (R,): blocks that a recording visited.
     """

@@ -32,8 +32,9 @@ cdef class Statistic:
     """One statistic of one verdict after another, and whether it is over its threshold.
 
     `kind`: one of the kinds above; `n`: number of states; `window_s`: T, s; `thresholds`: what raises the alarm if it
-    is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,), `whitening` (n, n), `memory` (n,): of
-    what chi2 and mewma take, see `model.residuals`: each number less its mean, less so much of the one before; `alarm`: the statistic of some state that counts is over its threshold.
+    is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,), `whitening` (n, n), `memory` (n,):
+    of what chi2 and mewma take, see `model.residuals`: each number less its mean, less so much of the one before;
+    `alarm`: the statistic of some state that counts is over its threshold.
     Each state has its own window, so a verdict that leaves one state out changes nothing of that state.
     """
 

@@ -159,9 +159,8 @@ class Envelope(Elements):
 
     def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
         """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count."""
-        forms = () if self.residuals is None else self.residuals.forms
-        law = next((form.law.tables[0] for form in forms if form.law is not None), None)
-        return self._judge(self.tables, margin, counted, law)
+        law = None if self.residuals is None else self.residuals.law
+        return self._judge(self.tables, margin, counted, None if law is None else law.tables[0])
 
     def _judge(
         self,

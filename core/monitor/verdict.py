@@ -493,7 +493,10 @@ class Verdicts:
 
     @property
     def residual(self) -> Array:
-        """x_next - centre, normalised; NaN without a verdict (N+1, n)."""
+        """x_next - centre, or less what the law of the model's residuals expects, normalised; NaN without a verdict.
+
+        (N+1, n).
+        """
         return self.numbers()[RESIDUAL]
 
     @property

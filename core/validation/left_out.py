@@ -227,6 +227,9 @@ def validate(
             "these recordings do not give this model again, so what was left out of them would say nothing about it; "
             "name the recordings it was fitted to, or fit it again"
         )
+    kept = subject.residuals
+    if kept is not None and again.residuals is not None and again.residuals.alike(kept) is None:  # of an older file
+        again = again.replace(residuals=kept)
     groups = None if isinstance(groups, str) and groups == "none" else groups
     return leave_out(runs, alarm_rule=subject.alarm_rule, groups=groups, full=again, **options, **own)
 

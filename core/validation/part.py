@@ -79,14 +79,14 @@ class Part:
     `transient`: what was left out; `dt` (K,): step of each judged transition, s; `starts`: positions at which the alarm
     restarts: 0, and after every step back in time; `utilisation` (K, n): (x_next - centre) / half; `outside` (K, n):
     left its bounds at margin 1, which rounding decides where `utilisation` is about 1; `residual` (K, n): x_next -
-    centre, normalised; `longer`, `longer_residual` (K, H, n): utilisation and residual by each horizon of the full
-    model; NaN where a window is broken, or the left-out model has none; `longer_width` (H, n): mean width of the
-    left-out model's envelopes over each horizon on this part, recorded units; NaN likewise; `extrapolated` (K,):
-    `Reach.level`; `outside_domain`: verdicts from outside the domain fitted without this part; `unseen`: violated
-    verdicts from inside that domain; `mean_width`, `max_width` (n,): of the left-out model's bounds on this part,
-    recorded units; `relative_width` (n,): the mean over that of the full model on the same samples; `usual_width` (n,):
-    width that USUAL of the full model's bounds, which judge from now on, have at most there, recorded units;
-    `median_width` (n,): the same of half of the left-out model's.
+    centre, or less what a law expects, normalised; `longer`, `longer_residual` (K, H, n): utilisation and residual by
+    each horizon of the full model; NaN where a window is broken, or the left-out model has none; `longer_width` (H, n):
+    mean width of the left-out model's envelopes over each horizon on this part, recorded units; NaN likewise;
+    `extrapolated` (K,): `Reach.level`; `outside_domain`: verdicts from outside the domain fitted without this part;
+    `unseen`: violated verdicts from inside that domain; `mean_width`, `max_width` (n,): of the left-out model's bounds
+    on this part, recorded units; `relative_width` (n,): the mean over that of the full model on the same samples;
+    `usual_width` (n,): width that USUAL of the full model's bounds, which judge from now on, have at most there,
+    recorded units; `median_width` (n,): the same of half of the left-out model's.
     """
 
     name: str
@@ -167,7 +167,11 @@ def judge(
 
     `level`: as of `Reach`; default within what was fitted.
     """
-    verdicts = EnvelopeMonitor(model, 1, 1, 1.0).check(transient)
+    judging = model
+    if full.residuals is not None and model.residuals is not None:  # those of the law, where the full model may take it
+        form = model.residuals.alike(full.residuals.forms[-1])
+        judging = model if form is None else model.replace(residuals=form)
+    verdicts = EnvelopeMonitor(judging, 1, 1, 1.0).check(transient)
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
