@@ -104,6 +104,15 @@ def test_a_half_width_that_is_fixed_stays_to_the_bit(criterion):
     assert ((lower <= x[1:]) & (x[1:] <= upper)).all()
 
 
+def test_what_fixed_half_widths_leave_outside_is_covered_at_once(monkeypatch):
+    """A pass over all transitions is half of a fit, so that the repair must not feel its way."""
+    passes, judge = [], Fleet.judge
+    monkeypatch.setattr(Fleet, "judge", lambda self, model: passes.append(model) or judge(self, model))
+    lengths = (2, 4, 8)
+    model = fit(plant(7, 5, 4, 3000, 1e-4), "qp", additive="noise", horizons=lengths, widths="constant")
+    assert len(model.horizons) == 3 and len(passes) == 1 + 2 * 3  # of each horizon once more for its residuals
+
+
 def test_a_largest_half_width_is_not_exceeded_by_the_repair():
     transient = plant(4, 3, 2, 300, 1e-3)
     free = fit(transient, "lp", additive="noise")

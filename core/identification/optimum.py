@@ -57,7 +57,11 @@ def repair(
     low, high = engine.half_limits
     fixed = low == high
     movable = free & ~fixed
-    lifted = np.where(fixed, d, d + units * np.maximum(solution.violation, 0.0))
+    carried = np.ones(n)
+    if not gentle:  # what is fixed covers nothing of its size, so that the others cover it
+        largest = [*(sums.dt_max * np.maximum(-sums.low, sums.high)), *(sums.dt_max**t.times_dt for t in columns.half)]
+        carried += np.tile(largest, columns.count) @ (units * fixed)
+    lifted = np.where(fixed, d, d + units * carried * np.maximum(solution.violation, 0.0))
     blocks = (columns.count, -1, n)
     nominal, own = np.zeros(d.shape).reshape(blocks), np.zeros(d.shape).reshape(blocks)
     elements = np.abs(theta).reshape(blocks)
