@@ -118,7 +118,7 @@ def test_the_fit_stores_mean_and_covariance_of_its_utilisation(scheduled: bool) 
 def test_the_words_of_an_alarm_tell_rules_of_one_kind_by_their_windows() -> None:
     rules = [StatisticRule("energy", 0.1, 0.5), StatisticRule("energy", 2.0, 0.5), StatisticRule("mean", 0.0, 0.5)]
     alarm = Alarm(rules, two_states(), np.ones(2, dtype=bool))
-    why = alarm.reasons([0, 1, 2], [3.0, 0.0, 2.0, 0.0, 4.0, 0.0], ZEROS, np.zeros(2))
+    why = alarm.reasons([(0, -1), (1, -1), (2, -1)], [3.0, 0.0, 2.0, 0.0, 4.0, 0.0], ZEROS, np.zeros(2))
     assert [raised.words for raised in why] == [
         "energy of x1 (over 0.1 s) at 3 times its threshold",
         "energy of x1 (over 2 s) at 2 times its threshold",
@@ -197,14 +197,18 @@ def test_each_rule_names_the_states_that_it_blames() -> None:
     rules = [AlarmRule(1, 1), AlarmRule(1, 1, 2.0, horizon=4), StatisticRule("mean", 0.0, 1.0), RULES[4]]
     sizes, flags, values = np.array([[1.5, 0.5], [-2.0, 2.1]]), np.array([1.0, 0.0]), [1.0, -1.1, 7.0]
     alarm = Alarm(rules, two_states(), np.ones(2, dtype=bool))
-    found = [(r.label, r.horizon, r.state, r.value) for r in alarm.reasons(range(4), values, sizes, flags)]
+    found = [
+        (r.label, r.horizon, r.state, r.value) for r in alarm.reasons(enumerate([-1, -1, -1, 1]), values, sizes, flags)
+    ]
     assert found == [
         ("containment", 1, "x1", 1.0), ("containment@4", 4, "x2", 1.0), ("mean", 1, "x2", -1.1), ("chi2", 1, "x2", 7.0),
     ]  # fmt: skip
-    masked = Alarm(rules, two_states(), np.array([False, True])).reasons(range(3), values, sizes, flags)
+    masked = Alarm(rules, two_states(), np.array([False, True])).reasons(enumerate([-1] * 3), values, sizes, flags)
     assert [(r.label, r.state) for r in masked] == [("containment", ""), ("containment@4", "x2"), ("mean", "x2")]
-    (joint,) = Alarm(rules, two_states(), np.array([True, False])).reasons([3], values, sizes, flags)
-    assert joint.words == "chi2 of all states (nearest: x1) at 7 times its threshold"
+    (joint,) = Alarm(rules, two_states(), np.array([True, False])).reasons([(3, 0)], values, sizes, flags)
+    assert joint.words == "chi2 of all states (points to x1) at 7 times its threshold"
+    (nobody,) = alarm.reasons([(3, -1)], values, sizes, flags)
+    assert nobody.words == "chi2 of all states at 7 times its threshold"
 
 
 PATHS = [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)", "rate")]

@@ -99,6 +99,50 @@ def test_every_statistic_is_its_formula(kind: str, T: float, jitter: float) -> N
     assert np.array_equal(alarm, (np.abs(values) > 1).any(axis=1)) and 0 < alarm.sum() < 700
 
 
+@pytest.mark.parametrize("kind", JOINT)
+@pytest.mark.parametrize(("T", "counted"), [(0.5, [True] * 3), (0.0, [True] * 3), (0.5, [True, False, True])])
+def test_all_states_together_point_to_the_one_without_which_the_rest_is_least(
+    kind: str, T: float, counted: list[bool]
+) -> None:
+    """By the low-pass of what the chi-square falls by without it; live as offline, and as before without a verdict."""
+    rng = np.random.default_rng(4)
+    dt, rows = rng.uniform(0.001, 0.02, 400), rng.normal(size=(400, 3))
+    rows[100:150, 0] += 3.0
+    rows[200:250, 2] -= 2.0
+    rows[350:, 1] += 4.0
+    rows[300, 0] = np.nan
+    residuals = Residuals(MEAN, C)
+
+    def made() -> Statistic:
+        law = MEAN, residuals.whitening(counted), MEMORY
+        return Statistic(KINDS.index(kind), 3, T, [1.0], counted, 0.0, *law)
+
+    blamed = np.full((400, 2), 7, dtype=np.int16)
+    made().push_all(dt, rows, blamed=blamed[:, 1])
+    one, every = made(), []
+    assert one.blamed == -1
+    for step, row in zip(dt, rows, strict=True):
+        Statistics([one], [0]).push(step, array("d", row))
+        every.append(one.blamed)
+    assert blamed[:, 1].tolist() == every and (blamed[:, 0] == 7).all()
+    r = np.delete(rows, 300, axis=0) - MEAN
+    r[1:] -= MEMORY * r[:-1]
+
+    def square(states: list[bool]) -> np.ndarray:
+        return np.asarray(np.square(r @ residuals.whitening(states).T).sum(axis=1))
+
+    less = np.zeros((399, 3))
+    for i in np.flatnonzero(counted):
+        less[:, i] = square(counted) - square([on and j != i for j, on in enumerate(counted)])
+    share = np.zeros(3)
+    for k, step in enumerate(np.delete(dt, 300)):
+        share = share + (less[k] - share) * step / (T + step)
+        assert every[k + (k >= 300)] == share.argmax()
+    assert every[300] == every[299] and set(every) == set(np.flatnonzero(counted).tolist())
+    one.reset()
+    assert one.blamed == -1
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_one_at_a_time_and_all_at_once_are_the_same_bits(kind: str) -> None:
     rng = np.random.default_rng(2)

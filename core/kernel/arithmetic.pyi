@@ -126,6 +126,7 @@ class Repeating:
 
 class Statistic:
     alarm: bool
+    blamed: int
     def __init__(
         self,
         kind: int,
@@ -147,6 +148,7 @@ class Statistic:
         judged: NDArray[np.bool_] | None = None,
         raised: NDArray[np.bool_] | None = None,
         found: Array | None = None,
+        blamed: NDArray[np.int16] | None = None,
     ) -> tuple[NDArray[np.bool_], Array]: ...
 
 class Statistics:

@@ -34,11 +34,14 @@ cdef class Statistic:
     `kind`: one of the kinds above; `n`: number of states; `window_s`: T, s; `thresholds`: what raises the alarm if it
     is exceeded; `counted`: states that raise it; `allowance`: of cusum; `mean` (n,), `whitening` (n, n), `memory` (n,):
     of what chi2 and mewma take, see `model.residuals`: each number less its mean, less so much of the one before;
-    `alarm`: the statistic of some state that counts is over its threshold.
+    `alarm`: the statistic of some state that counts is over its threshold; `blamed`: the state that chi2 or mewma
+    point to, of the largest low-pass over T of (C^-1 r)_i^2 / (C^-1)_ii, by which r^T C^-1 r falls if state i is left
+    free; -1 if there is none. [Alcala and Qin, Automatica 45, 2009]
     Each state has its own window, so a verdict that leaves one state out changes nothing of that state.
     """
 
     cdef readonly bint alarm
+    cdef readonly Py_ssize_t blamed
     cdef int kind
     cdef Py_ssize_t n, size
     cdef double window, allowance
@@ -50,6 +53,9 @@ cdef class Statistic:
     cdef const double* whitening
     cdef const double* memory  # NULL if it is 0
     cdef double* before  # (n,): the last row less its mean; 0 before the first
+    cdef double* share  # (n,): low-pass of what each state has of chi2 or mewma
+    cdef const double* unit  # (n,): (C^-1)_ii; 0 of a state that has none
+    cdef double* shares  # (n, _TOGETHER): (C^-1 r)_i of each of some verdicts
     cdef double* now  # (size,): the statistic over its threshold
     cdef double* up  # sum of the newer half; moving average; sum upwards
     cdef double* down  # the same downwards
@@ -80,17 +86,20 @@ cdef class Statistic:
         self.kind, self.n, self.size = kind, n, size
         self.window, self.window_ns, self.allowance = window_s, round(window_s * 1e9), allowance
         cdef arrays.array given = doubles([float(threshold) for threshold in thresholds])
-        cdef arrays.array law = doubles(np.concatenate([mean, memory, np.ravel(whitening)]) if joint else [])
-        cdef arrays.array room = doubles(np.zeros(4 * n + 2 * n * _TOGETHER))
+        law_of = [mean, memory, np.square(whitening).sum(axis=0), np.ravel(whitening)] if joint else [()]
+        cdef arrays.array law = doubles(np.concatenate(law_of))
+        cdef arrays.array room = doubles(np.zeros(5 * n + 3 * n * _TOGETHER))
         cdef arrays.array places = array("q", bytes(8 * (4 * n + _TOGETHER)))
         cdef bytes flags = bytes([1]) if joint else bytes(map(bool, counted))
         self._keep = [given, law, room, places, flags]
         self.thresholds, self.counted, self.mean = given.data.as_doubles, flags, law.data.as_doubles
-        self.whitening, self.now = self.mean + 2 * n, room.data.as_doubles
+        self.unit, self.whitening, self.now = self.mean + 2 * n, self.mean + 3 * n, room.data.as_doubles
         self.memory = self.mean + n if joint and np.any(memory) else NULL
         self.up, self.down, self.terms = self.now + n, self.now + 2 * n, self.now + 3 * n
         self.after = self.terms + n * _TOGETHER
-        self.before = self.after + n * _TOGETHER
+        self.shares = self.after + n * _TOGETHER
+        self.before = self.shares + n * _TOGETHER
+        self.share = self.before + n
         self.begin = places.data.as_longlongs
         self.middle, self.end, self.total = self.begin + n, self.begin + 2 * n, self.begin + 3 * n
         self.step_ns = self.begin + 4 * n
@@ -106,11 +115,11 @@ cdef class Statistic:
         """Forget every verdict."""
         cdef Py_ssize_t i
         for i in range(self.n):
-            self.up[i] = self.down[i] = self.before[i] = 0.0
+            self.up[i] = self.down[i] = self.before[i] = self.share[i] = 0.0
             self.now[i] = NAN
             self.begin[i] = self.middle[i] = self.end[i] = self.total[i] = 0
         self.spread = 0.0
-        self.alarm = False
+        self.alarm, self.blamed = False, -1
 
     def values(self):
         """The statistic over its threshold: 1 and -1 are the threshold; NaN before the first verdict on a state.
@@ -123,14 +132,14 @@ cdef class Statistic:
             found.data.as_doubles[i] = self.now[i]
         return found
 
-    def push_all(self, dt, rows, judged=None, raised=None, found=None):
+    def push_all(self, dt, rows, judged=None, raised=None, found=None, blamed=None):
         """Take many verdicts.
 
         `dt` (K,): steps, s; `rows` (K, n): the utilisation of each state, or the residual, a row for each verdict. NaN
         is no verdict on that state, and changes nothing of it, nor of any state if all are seen together; `judged`
         (K,): where there is a verdict, default everywhere. Returns (K,): the alarm after each; Returns (K, size):
         `values` after each, NaN without a verdict; both in `raised` and `found` where these are given. A `found` of
-        no columns takes none.
+        no columns takes none. `blamed` (K,): takes the state that each points to.
         """
         cdef Py_ssize_t k, count = len(dt)
         rows = np.asarray(rows, dtype=np.float64)
@@ -150,27 +159,38 @@ cdef class Statistic:
         fits = alarm.shape[0] == values.shape[0] == times.shape[0] == given.shape[0] == count
         if not fits or values.shape[1] not in (0, self.size):
             raise ValueError("the numbers of the verdicts do not fit the states")
+        cdef bint points = blamed is not None and (self.kind == _CHI2 or self.kind == _MEWMA)
+        cdef short[:] pointed = blamed if points else np.empty(count, dtype=np.int16)
+        if pointed.shape[0] != count:
+            raise ValueError("the states that are blamed do not fit the verdicts")
+        cdef short at[_TOGETHER]
         cdef Py_ssize_t i, q, many, apart = table.strides[0] // 8, kept = values.shape[1]
         cdef unsigned char over[_TOGETHER]
         with nogil:
             for k from 0 <= k < count by _TOGETHER:
                 many = count - k if count - k < _TOGETHER else _TOGETHER
-                self.push(&times[k], &table[k, 0], apart, &given[k], many)
+                self.push(&times[k], &table[k, 0], apart, &given[k], many, at if points else NULL)
                 self.raises(many, over)
                 for q in range(many):
                     for i in range(kept):
                         values[k + q, i] = self.after[i * _TOGETHER + q] if given[k + q] else NAN
                     alarm[k + q] = over[q]
+                    if points:
+                        pointed[k + q] = at[q]
         return raised, found
 
     cdef int push(
-        self, const double* dt, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count
+        self, const double* dt, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count,
+        short* blamed,
     ) except -1 nogil:
         """Take some verdicts, of which `after` holds the statistic; `raises` takes them then."""
         cdef Py_ssize_t i, q
+        cdef bint points = blamed != NULL and (self.kind == _CHI2 or self.kind == _MEWMA)
         for q in range(count):
             self.step_ns[q] = <long long>(dt[q] * 1e9 + 0.5)
-        self.take(rows, apart, given, count)
+        self.take(rows, apart, given, count, points)
+        if points:
+            self.blame(dt, count, blamed)
         if self.kind == _MEWMA:
             self.average_together(dt, count)
         for i in range(self.size):
@@ -199,9 +219,9 @@ cdef class Statistic:
             self.alarm = raised[q]
 
     cdef void take(
-        self, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count
+        self, const double* rows, Py_ssize_t apart, const unsigned char* given, Py_ssize_t count, bint points
     ) noexcept nogil:
-        """What each of some verdicts adds of each state; NaN where it adds nothing."""
+        """What each of some verdicts adds of each state; NaN where it adds nothing; `points`: `shares` as well."""
         cdef Py_ssize_t i, j, q, n = self.n
         cdef bint joint = self.kind == _CHI2 or self.kind == _MEWMA
         cdef double value, weight, limit = _LIMIT if self.kind == _EWMA or self.kind == _CUSUM else _MOST
@@ -235,6 +255,9 @@ cdef class Statistic:
                     value = self.before[i]
                     self.before[i] = values[q]
                     values[q] -= self.memory[i] * value
+        for i in range(n if points else 0):
+            for q in range(count):
+                self.shares[i * _TOGETHER + q] = 0.0
         for i in range(n):
             term = self.terms + i * _TOGETHER
             for q in range(count):
@@ -243,6 +266,10 @@ cdef class Statistic:
                 values, weight = self.after + j * _TOGETHER, self.whitening[i * n + j]
                 for q in range(count):
                     total[q] += weight * values[q]
+            for j in range(i + 1 if points else 0):
+                values, weight = self.shares + j * _TOGETHER, self.whitening[i * n + j]
+                for q in range(count):
+                    values[q] += weight * total[q]
             for q in range(count):
                 square[q] += total[q] * total[q]
                 term[q] = -_LIMIT if total[q] < -_LIMIT else total[q] if total[q] <= _LIMIT else _LIMIT
@@ -251,6 +278,22 @@ cdef class Statistic:
                 self.terms[q] = square[q] if square[q] <= _MOST else _MOST
             if missing[q]:
                 self.terms[q] = NAN
+
+    cdef void blame(self, const double* dt, Py_ssize_t count, short* blamed) noexcept nogil:
+        """The state that the numbers of all together point to after each of some verdicts."""
+        cdef Py_ssize_t i, q
+        cdef double value, most
+        for q in range(count):
+            if self.terms[q] == self.terms[q]:
+                self.blamed, most = -1, 0.0
+                for i in range(self.n):
+                    value = self.shares[i * _TOGETHER + q]
+                    value = value * value / self.unit[i] if self.unit[i] > 0.0 else 0.0
+                    value = value if value <= _MOST else _MOST
+                    self.share[i] += (value - self.share[i]) * (dt[q] / (self.window + dt[q]))
+                    if self.share[i] > most:
+                        self.blamed, most = i, self.share[i]
+            blamed[q] = <short>self.blamed
 
     cdef void average(self, Py_ssize_t i, const double* dt, Py_ssize_t count) noexcept nogil:
         """Moving average of a state, or its sums upwards and downwards, after each of some verdicts."""
@@ -366,10 +409,11 @@ cdef class Statistics:
         cdef Py_ssize_t begin
         cdef bint raised = False
         cdef unsigned char over, given = True
+        cdef short blamed
         for part, begin in zip(self.parts, self.begins):
             if begin < 0 or begin + part.n > row.shape[0]:
                 raise ValueError("the numbers of the verdict do not fit the states")
-            part.push(&dt, &row[begin], part.n, &given, 1)
+            part.push(&dt, &row[begin], part.n, &given, 1, &blamed)
             part.raises(1, &over)
             raised |= over
         return raised

@@ -17,7 +17,7 @@ from __future__ import annotations
 import operator
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -40,8 +40,8 @@ class Raised:
     """One reason for the alarm.
 
     `label`: of the rule, as of `alarm_rule.labels`; `kind`: of the rule; `horizon`: of the rule, in steps; `state`: the
-    state; of a joint statistic the one of which a statistic of its own is nearest to its threshold, if there is one;
-    empty where no state of this verdict is to blame; `value`: the statistic over its threshold, with its sign; 1 of
+    state; of a joint statistic the one that it points to, see `Statistic`, if there is one; empty where no state of
+    this verdict is to blame; `value`: the statistic over its threshold, with its sign; 1 of
     containment; `span`: the window of the rule in words, if another rule of its kind and horizon has to be told from
     it.
     """
@@ -58,7 +58,7 @@ class Raised:
         """`energy of fan_speed over 40 steps at 1.3 times its threshold`, for example."""
         state = f" of {self.state}" if self.state else ""
         if self.kind in JOINT:
-            state = " of all states" + f" (nearest: {self.state})" * bool(self.state)
+            state = " of all states" + f" (points to {self.state})" * bool(self.state)
         over = f" over {self.horizon} steps" if self.horizon > 1 else ""
         what = f"{self.kind}{state}{over}" + f" ({self.span})" * bool(self.span)
         return what if self.kind == "containment" else f"{what} at {abs(self.value):.3g} times its threshold"
@@ -177,36 +177,34 @@ class Alarm:
                 found[label] = one
         return found
 
-    def raised(self) -> tuple[int, ...]:
-        """Rules that raise the alarm."""
-        return tuple(i for i, part in enumerate(self._parts) if part.alarm) if self.alarm else ()
+    def raised(self) -> tuple[tuple[int, int], ...]:
+        """Rules that raise the alarm, and the state that each points to if it looks at all together, else -1."""
+        if not self.alarm:
+            return ()
+        return tuple((i, getattr(part, "blamed", -1)) for i, part in enumerate(self._parts) if part.alarm)
 
-    def reasons(self, rules: Sequence[int], values: Sequence[float], sizes: Array, flags: Array) -> tuple[Raised, ...]:
+    def reasons(
+        self, rules: Iterable[tuple[int, int]], values: Sequence[float], sizes: Array, flags: Array
+    ) -> tuple[Raised, ...]:
         """Why the alarm is raised at a verdict.
 
-        `sizes` (H, n): utilisation there, for one step and for each horizon; `flags` (n,): 1 for a state that violates
-        its one-step bounds there.
+        `rules`: as `raised` gives them; `sizes` (H, n): utilisation there, for one step and for each horizon; `flags`
+        (n,): 1 for a state that violates its one-step bounds there.
         """
         found, names = list[Raised](), self._model.state_names
-        for i in rules:
+        for i, pointed in rules:
             rule, begin = self.rules[i], self._begins[i]
             if isinstance(rule, AlarmRule):
                 left = flags == 1.0 if rule.horizon == 1 else np.abs(sizes[row_of(rule, self._model)]) > rule.margin
                 blamed = {names[j]: 1.0 for j in np.flatnonzero(left & self._counted)} or {"": 1.0}
             elif rule.kind in JOINT:
-                blamed = {self._nearest_state(values): float(values[begin])}
+                blamed = {names[pointed] if pointed >= 0 else "": float(values[begin])}
             else:
                 own = {j: float(values[begin + j]) for j in np.flatnonzero(self._counted).tolist()}
                 blamed = {names[j]: value for j, value in own.items() if abs(value) > 1.0}
             label, span = self.labels[i], self._spans[i]
             found += [Raised(label, rule.kind, rule.horizon, state, value, span) for state, value in blamed.items()]
         return tuple(found)
-
-    def _nearest_state(self, values: Sequence[float]) -> str:
-        """The state of which a statistic of its own is nearest to its threshold; empty where there is none."""
-        counted = {self._model.state_names[j] for j in np.flatnonzero(self._counted).tolist()}
-        own = (one for rule, _, one in self._known(values) if rule.kind not in JOINT and one.state in counted)
-        return max(own, key=lambda one: one.share, default=Nearest("", 0.0, 1.0)).state
 
     def over(
         self,
@@ -217,20 +215,24 @@ class Alarm:
         judged: NDArray[np.bool_] | None = None,
         each: NDArray[np.bool_] | None = None,
         values: Array | None = None,
+        blamed: NDArray[np.int16] | None = None,
     ) -> NDArray[np.bool_]:
         """Many verdicts, those of each span [start, stop) from a cleared alarm; after each what `push` gives.
 
         `dt` (K,): steps, s; `violated` (K,): as for `push`; `rows`: of the table of `push`, (K, n) each, None for one
         that no rule looks at; `judged` (K,): where there is a verdict, default everywhere; without one the alarm stays
         as it was; `each` (K, rules): takes which rules raise the alarm after each; `values` (K, statistics): takes
-        `values` after each, NaN without a verdict. Returns (K,): the alarm after each; none outside the spans.
+        `values` after each, NaN without a verdict; `blamed` (K, rules): takes the state of each that `raised` gives.
+        Returns (K,): the alarm after each; none outside the spans.
         """
         count = len(dt)
         judged = np.ones(count, dtype=bool) if judged is None else judged
         each = np.zeros((count, len(self.rules)), dtype=bool) if each is None else each
         values = np.empty((count, 0)) if values is None else values
 
-        def push_all(part: Window | Statistic, row: int, after: NDArray[np.bool_], own: Array) -> None:
+        def push_all(
+            part: Window | Statistic, row: int, after: NDArray[np.bool_], own: Array, pointed: NDArray[np.int16] | None
+        ) -> None:
             for start, stop in spans:
                 on, table = slice(start, stop), rows[row]
                 table = None if table is None else table[on]
@@ -238,12 +240,15 @@ class Alarm:
                 if isinstance(part, Window):
                     part.push_all(violated[on], table, judged[on], after[on])
                 else:
-                    part.push_all(dt[on], table, judged[on], after[on], own[on])
+                    part.push_all(
+                        dt[on], table, judged[on], after[on], own[on], None if pointed is None else pointed[on]
+                    )
             part.reset()
 
         owns = np.split(values, self._begins[1:], axis=1)
         long = count >= WORTH_THREADS * len(spans)
-        on_cores(push_all, list(zip(self._parts, self._rows, each.T, owns, strict=True)), long)
+        states = [None] * len(self.rules) if blamed is None else blamed.T
+        on_cores(push_all, list(zip(self._parts, self._rows, each.T, owns, states, strict=True)), long)
         self.alarm = False
         return np.asarray(each.any(axis=1))
 

@@ -474,10 +474,11 @@ class EnvelopeMonitor:
         over = partial(alarms.over, _alarm_spans(transient.t_ns, armed), dt, violated, rows_of, judged)
 
         @cache
-        def statistics() -> Array:
+        def statistics() -> tuple[Array, NDArray[np.int16]]:
             values = np.full((count, len(self.alarms.names)), np.nan)
-            over(values=values)
-            return values
+            blamed = np.full(each.shape, -1, dtype=np.int16)
+            over(values=values, blamed=blamed)
+            return values, blamed
 
         alarm = over(each)
         if why:

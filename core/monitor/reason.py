@@ -167,7 +167,8 @@ def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Stat
     rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.unknown_regime, verdicts.rule_alarms]
     rows += [verdicts.frozen, verdicts.withheld]
     if verdicts.alarm.any():
-        rows += [verdicts.flags == 1.0, np.abs(verdicts.statistics) > 1.0]
+        values, blamed = verdicts.over_thresholds()
+        rows += [verdicts.flags == 1.0, np.abs(values) > 1.0, np.where(verdicts.rule_alarms, blamed, -1)]
         before = np.concatenate([np.full((1, model.n), np.nan), verdicts.transient.x[:-1]])
         rows.append((jumps(model, before, verdicts.transient.x)[0] != 0.0) & (verdicts.flags == 1.0))
         table = np.abs(verdicts.horizon_utilisation)

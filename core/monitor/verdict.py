@@ -349,7 +349,7 @@ class Verdicts:
     repeating : array (N+1, n) of bool
         The state repeats exactly for longer than ever in the fit, and is not frozen.
     over_thresholds : callable
-        Computes `statistics` when they are first asked for.
+        Computes `statistics`, and the states that those of all together point to, when they are first asked for.
     rule_alarms : array (N+1, rules) of bool
         Which rules raise the alarm after each sample.
     alarms : Alarm
@@ -379,7 +379,7 @@ class Verdicts:
     frozen: NDArray[np.bool_]
     withheld: NDArray[np.bool_]
     repeating: NDArray[np.bool_]
-    over_thresholds: Callable[[], Array]
+    over_thresholds: Callable[[], tuple[Array, NDArray[np.int16]]]
     rule_alarms: NDArray[np.bool_]
     alarms: Alarm
     longer_utilisation: Array
@@ -468,8 +468,9 @@ class Verdicts:
         """
         if not self.judged[k]:
             return ()
-        rules = np.flatnonzero(self.rule_alarms[k]).tolist()
-        return self.alarms.reasons(rules, self.statistics[k].tolist(), self.horizon_utilisation[k], self.flags[k])
+        values, blamed = self.over_thresholds()
+        rules = ((i, int(blamed[k, i])) for i in np.flatnonzero(self.rule_alarms[k]).tolist())
+        return self.alarms.reasons(rules, values[k].tolist(), self.horizon_utilisation[k], self.flags[k])
 
     @property
     def state(self) -> Array:
@@ -502,4 +503,4 @@ class Verdicts:
     @property
     def statistics(self) -> Array:
         """Each statistic over its threshold (N+1, S): beyond 1 and -1 it raises the alarm; NaN without a verdict."""
-        return self.over_thresholds()
+        return self.over_thresholds()[0]
