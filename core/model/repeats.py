@@ -297,7 +297,8 @@ USUAL_S = 0.25
 So long must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
 
 LEAST = 3
-"""Steps that a repeat must have while the machine is active, or of a state that noise changes."""
+"""Steps that a repeat must have while the machine is active, of a state that noise changes, or of one that repeated in
+the fit: at a sample a second or an hour a coarse sensor does so for one or two."""
 
 NOISY = 1000
 """Steps that must have shown the noise."""
@@ -328,18 +329,20 @@ class FrozenWatch:
     """Tells frozen states, one transition after another.
 
     `repeats`: those of the fit; `margin`: of the bounds that it will be given; `counted`: states to look at: one that
-    is masked is never frozen; `needs` (n, n): which rows need which states.
+    is masked is never frozen; `needs` (n, n): which rows need which states; `dt`: a usual step, s.
     """
 
     __slots__ = ("_follow", "_frozen", "_needed_by", "_needs", "_on", "repeats")
 
-    def __init__(self, repeats: Repeats, margin: float, counted: Sequence[bool], needs: NDArray[np.bool_]) -> None:
+    def __init__(
+        self, repeats: Repeats, margin: float, counted: Sequence[bool], needs: NDArray[np.bool_], dt: float
+    ) -> None:
         self.repeats, self._needs = repeats, needs
         self._needed_by = [np.flatnonzero(column).tolist() for column in needs.T]
         longest, reached = repeats.longest_repeat_s, np.array([repeats.largest_run, repeats.largest_sum])
         known = np.isfinite(reached)  # of a model that was changed after its fit they are not
         beyond = np.vstack([np.maximum(1.0, FARTHER * np.where(known, reached, 0.0)), repeats.active_beyond])
-        usual = np.where(known[0], np.minimum(FARTHER * longest, USUAL_S), longest)
+        usual = np.where(known[0], np.minimum(FARTHER * longest, max(USUAL_S, (LEAST - 0.5) * dt)), longest)
         noisy = np.where(longest == 0.0, repeats.noisy_steps, 0.0)
         by_noise = np.where(noisy >= NOISY, USUAL_S, np.inf), np.where(noisy >= SLOW_NOISY, SLOW_S, np.inf)
         thresholds = np.vstack([usual, longest, np.where(beyond < LARGEST, beyond, np.inf), *by_noise]).T

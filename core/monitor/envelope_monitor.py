@@ -194,7 +194,8 @@ class EnvelopeMonitor:
         """What tells frozen states; None if the model knows no repeats."""
         if self.model.repeats is None:
             return None
-        return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist(), needs(self.model))
+        dt = self.model.sampling.dt_median or 0.0
+        return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist(), needs(self.model), dt)
 
     @cython.cfunc
     def _forget_repeats(self) -> None:
