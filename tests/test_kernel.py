@@ -196,7 +196,9 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
 # --- repeats ------------------------------------------------------------------------------------------------------
 
 
-def by_the_words(thresholds: Any, least: int, counted: Any, margin: float, steps: list[tuple[Any, ...]]) -> Any:
+def by_the_words(
+    thresholds: Any, least: int, rest: float, counted: Any, margin: float, steps: list[tuple[Any, ...]]
+) -> Any:
     """Codes, sizes and the most of each measure, as the head of `model/repeats.py` says, one state after another."""
     n = len(counted)
     codes, sizes, most = np.zeros((len(steps), n), dtype=np.uint8), np.zeros((len(steps), n)), np.zeros((4, n))
@@ -225,17 +227,18 @@ def by_the_words(thresholds: Any, least: int, counted: Any, margin: float, steps
             if counted[i] and code < 3:
                 left = (abs(after - start) > (upper - lower) / 2 / margin).any()
                 still = n > 1 and (before == after).all()
-                rests, times = after[i] == 0.0, max(1.0, seconds / longest) if longest >= 1.0 else 1.0
+                rests, times = after[i] == 0.0, max(1.0, seconds / longest) if longest >= rest else 1.0
                 enough, shown = len(rates) >= least, len(rates) > 0 and seconds >= slow_s
                 code = 2 if seconds > longest + dt * 1e-9 / 2 else 1
-                if not outside and seconds > usual:
-                    if far > times * run_most and not rests and not still:
+                unusual = seconds > usual
+                if not outside:
+                    if unusual and far > times * run_most and not rests and not still:
                         code, size = 3, far
-                    elif away > times * sum_most and seconds > longest and left and not rests:
+                    elif unusual and away > times * sum_most and seconds > longest and left and not rests:
                         code, size = 4, away
-                    elif enough and activity > max(active, 1.0 if rests else 1.0 / len(rates)):
+                    elif unusual and enough and activity > max(active, 1.0 if rests else 1.0 / len(rates)):
                         code, size = 5, activity
-                    elif (shown or (enough and seconds >= noise_s)) and not rests and not still:
+                    elif (shown or (unusual and enough and seconds >= noise_s)) and not rests and not still:
                         code = 6
             codes[k, i], sizes[k, i] = code, size
     return codes, sizes, most
@@ -258,16 +261,17 @@ def test_repeats_are_told_as_the_words_say() -> None:
         own = rng.normal(size=(count, n)) * 5.0
         often = np.array([0.05, 0.1, 3.0, 6.0, 0.2, 0.1, 0.2]) * rng.choice([0.3, 1.0, np.inf], size=(n, 7))
         counted = rng.uniform(size=n) < 0.9
-        follow = Repeating(often, 3, counted.tolist(), margin)
+        rest = float(rng.choice([1.0, 0.05]))
+        follow = Repeating(often, 3, rest, counted.tolist(), margin)
         given = (follows, t_ns, dt * 1e-9, x[:-1], x[1:], centre - half, centre + half, own, outside)
         codes, sizes = follow.take_all(*given)
         steps = list(zip(follows, t_ns, dt, x[:-1], x[1:], centre - half, centre + half, own, outside, strict=True))
-        wanted, measured, most = by_the_words(often, 3, counted, margin, steps)
+        wanted, measured, most = by_the_words(often, 3, rest, counted, margin, steps)
         assert np.array_equal(codes, wanted)
         np.testing.assert_allclose(sizes, measured, rtol=1e-9)
         np.testing.assert_allclose(follow.most, most, rtol=1e-9)
         seen |= set(codes.ravel().tolist())
-        alone = Repeating(often, 3, counted.tolist(), margin)
+        alone = Repeating(often, 3, rest, counted.tolist(), margin)
         for k, (on, *step) in enumerate(steps):
             if not on:
                 alone.forget()

@@ -24,9 +24,6 @@ cdef enum:
     _NOISE = 6
 
 
-cdef double _REST_S = 1.0  # from so long a repeat on the fit has seen the machine at rest
-
-
 cdef struct Repeat:
     int code  # _FRESH where there is none
     long long begin  # ns
@@ -46,13 +43,13 @@ cdef class Repeating:
     """Follows the repeats of every state, one transition after another, and tells which are frozen.
 
     `thresholds` (n, 7): of each state, as of `model.repeats.FrozenWatch`; `least`: steps that activity and noise need;
-    `counted` (n,): states that may be frozen; `margin`: of the bounds that it will be given; `most` (4, n): the longest
+    `rest`: of a state that repeated so long the fit has seen a rest, s; `counted` (n,): states that may be frozen; `margin`: of the bounds that it will be given; `most` (4, n): the longest
     repeat so far, s, the farthest run, the largest sum and the greatest activity, in half-widths.
     """
 
     cdef readonly object most
     cdef Py_ssize_t n, least
-    cdef double margin
+    cdef double rest, margin
     cdef list _keep
     cdef double* thresholds
     cdef double* start  # (n, n): the states where each repeat began
@@ -63,12 +60,12 @@ cdef class Repeating:
     cdef bytearray _of
     cdef Repeat* of
 
-    def __init__(self, thresholds, Py_ssize_t least, counted, double margin):
+    def __init__(self, thresholds, Py_ssize_t least, double rest, counted, double margin):
         cdef Py_ssize_t n = len(thresholds)
         if np.shape(thresholds) != (n, _THRESHOLDS) or len(counted) != n or not margin > 0.0:
             raise ValueError("the thresholds do not fit the states")
         cdef arrays.array numbers = doubles(thresholds), room = doubles(np.zeros((5 + _MEASURES + n) * n))
-        self.n, self.least, self.margin = n, least, margin
+        self.n, self.least, self.rest, self.margin = n, least, rest, margin
         self.most, self._keep = np.zeros((_MEASURES, n)), [numbers, room]
         self.largest, self.thresholds, self.given = self.most, numbers.data.as_doubles, room.data.as_doubles
         self.measures = self.given + 5 * n
@@ -177,23 +174,22 @@ cdef class Repeating:
         cdef Py_ssize_t n = self.n, j, steps = self.of[i].steps
         cdef const double* found = self.measures + i
         cdef double longest = self.limit(i, 1)
-        cdef double times = fmax(found[0] / longest, 1.0) if longest >= _REST_S else 1.0  # a rest may be longer
+        cdef double times = fmax(found[0] / longest, 1.0) if longest >= self.rest else 1.0  # a rest may be longer
         cdef bint rests = after[i] == 0.0
-        if found[0] <= self.limit(i, 0):
-            return 0
-        if found[n] > times * self.limit(i, 2) and not (rests or parked):
+        cdef bint unusual = found[0] > self.limit(i, 0)
+        if unusual and found[n] > times * self.limit(i, 2) and not (rests or parked):
             self.of[i].size = found[n]
             return _RUN
-        if found[2 * n] > times * self.limit(i, 3) and found[0] > longest and not rests:
+        if unusual and found[2 * n] > times * self.limit(i, 3) and found[0] > longest and not rests:
             for j in range(n):  # some state has left the place that it had when the repeat began
                 if fabs(after[j] - self.start[i * n + j]) > 0.5 * (upper[j] - lower[j]) / self.margin:
                     self.of[i].size = found[2 * n]
                     return _SUM
-        if steps >= self.least and found[3 * n] > fmax(self.limit(i, 4), 1.0 if rests else 1.0 / steps):
+        if unusual and steps >= self.least and found[3 * n] > fmax(self.limit(i, 4), 1.0 if rests else 1.0 / steps):
             self.of[i].size = found[3 * n]
             return _ACTIVE
         if rests or parked:
             return 0
-        if (steps > 0 and found[0] >= self.limit(i, 6)) or (steps >= self.least and found[0] >= self.limit(i, 5)):
+        if steps > 0 and found[0] >= self.limit(i, 6):
             return _NOISE
-        return 0
+        return _NOISE if unusual and steps >= self.least and found[0] >= self.limit(i, 5) else 0

@@ -216,7 +216,7 @@ def repeats_in(model: Any, transient: Any) -> Found:
     steps = transient.transitions()
     windows, noisy = _activity(model, transient, steps)
     some, largest = changes(transient.x, steps.k)
-    follow = Repeating(np.full((model.n, 7), np.inf), LEAST, [False] * model.n, 1.0)
+    follow = Repeating(np.full((model.n, 7), np.inf), LEAST, REST_S, [False] * model.n, 1.0)
     if some.any():
         follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
     most = follow.most
@@ -297,8 +297,10 @@ USUAL_S = 0.25
 So long must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
 
 LEAST = 3
-"""Steps that a repeat must have while the machine is active, of a state that noise changes, or of one that repeated in
-the fit: at a sample a second or an hour a coarse sensor does so for one or two."""
+"""Steps that a repeat must have, but of a slow sensor that noise changes: two equal samples may be chance."""
+
+REST_S, REST = 1.0, 2.5
+"""Seconds and usual steps from which on a repeat of the fit was a machine at rest, and may be longer the next time."""
 
 NOISY = 1000
 """Steps that must have shown the noise."""
@@ -342,11 +344,11 @@ class FrozenWatch:
         longest, reached = repeats.longest_repeat_s, np.array([repeats.largest_run, repeats.largest_sum])
         known = np.isfinite(reached)  # of a model that was changed after its fit they are not
         beyond = np.vstack([np.maximum(1.0, FARTHER * np.where(known, reached, 0.0)), repeats.active_beyond])
-        usual = np.where(known[0], np.minimum(FARTHER * longest, max(USUAL_S, (LEAST - 0.5) * dt)), longest)
+        usual = np.where(known[0], np.maximum(np.minimum(FARTHER * longest, USUAL_S), (LEAST - 0.5) * dt), longest)
         noisy = np.where(longest == 0.0, repeats.noisy_steps, 0.0)
         by_noise = np.where(noisy >= NOISY, USUAL_S, np.inf), np.where(noisy >= SLOW_NOISY, SLOW_S, np.inf)
         thresholds = np.vstack([usual, longest, np.where(beyond < LARGEST, beyond, np.inf), *by_noise]).T
-        self._follow = Repeating(thresholds, LEAST, counted, margin)
+        self._follow = Repeating(thresholds, LEAST, max(REST_S, REST * dt), counted, margin)
         self.forget()
 
     def forget(self) -> None:
