@@ -35,6 +35,8 @@ MATCH, AHEAD = 0.8, 0.05
 """A signature is named from this match on, if it is so far ahead of every other."""
 EXPLAINS, CLOSE = 0.85, 0.05
 """A part is named if it alone explains this share of the pattern, with those that explain nearly as much."""
+OWN = 0.05
+"""Share of the pattern that a bias of a sensor must leave in its own equation: elsewhere others leave the same."""
 LEAST, MOST, APART = 5, 2000, 100
 """Verdicts with an alarm that a name needs; of which a pattern is made; without one, after which it starts over."""
 _LIMIT = 10.0  # of a utilisation: one sample must not be all of a pattern
@@ -154,7 +156,9 @@ class Pattern:
         named = [(j, name) for j, name in enumerate(model.control_names) if j not in remembered]
         found = [Part("actuator", name, share(B[:, j])) for j, name in named]
         for i, name in enumerate(model.state_names):
-            found.append(Part("sensor", name, share(A[:, i])))
+            own = float((A[i, i] / half[i]) ** 2)
+            if own >= OWN * float(np.square(A[:, i] / half).sum()):
+                found.append(Part("sensor", name, share(A[:, i])))
             found.append(Part("equation", name, share(np.eye(model.n)[i])))
         best = max(part.share for part in found)
         return tuple(sorted((p for p in found if p.share >= max(EXPLAINS, best - CLOSE)), key=lambda p: -p.share))
