@@ -79,7 +79,7 @@ def test_a_frozen_state_has_no_signature() -> None:
     x[ONSET:, 1] = x[ONSET, 1]
     verdicts = EnvelopeMonitor(model).check(healthy.replace(x=x))
     assert verdicts.alarm[ONSET + 100 :].all()
-    with pytest.raises(ModelError, match="of the verdicts of its alarm [0-2] have every state, as a frozen one has none"):
+    with pytest.raises(ModelError, match="of its alarm [0-2] have every state, as a frozen one has none"):
         learn_signatures(model, [("stuck", verdicts)])
 
 
