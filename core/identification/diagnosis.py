@@ -73,7 +73,7 @@ _CODE, _NOISE, _BEFORE, _FEW = (
 _QUATERNION = re.compile(r"((?:.*\.)?(?:orientation|rotation|quaternion|quat|q)(?:\.|_?))[xyzw]")
 _REMEDIES = (  # words of a message on the state, or on any signal; what narrows the bounds
     (_FEW, True, "look at the few samples that carry the width, named above"),
-    (_BEFORE, True, "add its value one sample earlier, as said above"),
+    (_BEFORE, True, "add the value of '{}' one sample earlier, as said above"),
     ("`delay:", False, "set the delay that the notes propose"),
     ("sampling is slow", False, "sample faster"),
     ("moves too little", False, "record the controls moving more"),
@@ -584,10 +584,14 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
     """What of a fit's messages would narrow the bounds of a state; "" where they name nothing."""
     named = [m for m in messages if f"'{state}'" in m]
     if any(words in m for words in (_CODE, "wraps around", "change sign together") for m in named):
-        return "it jumps without moving, as said above"
+        return f"'{state}' jumps without moving, as said above"
     if noise := [m for m in named if _NOISE in m]:
-        return f"it moves like noise: {noise[0].rpartition('; ')[2]}"
-    found = [remedy for words, own, remedy in _REMEDIES if any(words in m for m in (named if own else messages))]
+        return f"'{state}' moves like noise: {noise[0].rpartition('; ')[2]}"
+    found = [
+        remedy.format(state)
+        for words, own, remedy in _REMEDIES
+        if any(words in m for m in (named if own else messages))
+    ]
     return ", or ".join(dict.fromkeys([*found, *(["try --additive noise"] if additive == "none" else [])]))
 
 
