@@ -21,7 +21,7 @@ import os
 import re
 import struct
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, ClassVar
@@ -74,19 +74,20 @@ class Foreign(Contents):
 
     converted: ClassVar[bool] = True
 
+    def damaged(self, how: str) -> str:
+        """The sentence for a file that is not whole, with the remedy."""
+        return f"{self.path}: {how}; {_REMEDIES[self.magic].format(self.path.name)}"
+
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
         """Messages of one block as MCAP has them."""
         convert: dict[int, Callable[[bytes], bytes]] = {}
         if self.magic == _BAG:
             convert = {number: self._definition(number).from_ros1 for number in block.channels}
+        asked = block.channels if channels is None else channels
         pieces: list[bytes] = []
         try:
             with _reader(self.path, self.magic) as reader:
-                wanted = [
-                    connection
-                    for connection in reader.connections
-                    if self.numbers[connection.id] in (block.channels if channels is None else channels)
-                ]
+                wanted = [connection for connection in reader.connections if self.numbers[connection.id] in asked]
                 for connection, time, data in reader.messages(wanted, block.start, block.end + 1) if wanted else ():
                     number = self.numbers[connection.id]
                     if _usable(time, data):
@@ -144,35 +145,26 @@ def _scan(path: Path) -> Foreign:
     try:
         with _reader(path, magic) as reader:
             stated = _declare(found, reader, chunks)
-            if magic == _DATABASE and (said := _integrity(reader)) != "ok":
-                found.warnings.append(f"{path}: is damaged ({one_line(said)}); {_remedy(path, magic)}")
+            if magic == _DATABASE:  # an index that lacks rows hides them from whoever reads in order of time
+                wrong = str(reader.dbconn.execute("PRAGMA integrity_check(1)").fetchone()[0])
+                if wrong != "ok":
+                    found.warnings.append(found.damaged(f"is damaged ({one_line(wrong)})"))
             if trouble := _walk(found, reader):
                 of = f"{found.count} of {count(stated, 'message')} before that count"
-                found.warnings.append(f"{path}: is cut or damaged ({trouble}); {of}; {_remedy(path, magic)}")
+                found.warnings.append(found.damaged(f"is cut or damaged ({trouble}); {of}"))
             elif stated != found.count or any(
                 info.msgcount != (found.tally[number].count if number in found.tally else 0)
                 for info in reader.connections
                 for number in [found.numbers[info.id]]
             ):
-                found.warnings.append(
-                    f"{path}: its index counts {count(stated, 'message')}, and {found.count} could be read, each with "
-                    f"its topic and a log time; {_remedy(path, magic)}"
-                )
+                of = f"{found.count} could be read, each with its topic and a log time"
+                found.warnings.append(found.damaged(f"its index counts {count(stated, 'message')}, and {of}"))
     except (BagError, MemoryError):
         raise
     except Exception as error:  # a library raises whatever the bytes lead it to
         what = "ROS 1 bag" if magic == _BAG else "recording of ROS 2"
-        raise BagError(f"{path}: is cut or damaged or no {what} ({one_line(error)}); {_remedy(path, magic)}") from None
+        raise BagError(found.damaged(f"is cut or damaged or no {what} ({one_line(error)})")) from None
     return found
-
-
-def _integrity(reader: Any) -> str:
-    """What SQLite finds wrong first: an index that lacks rows hides them from whoever reads in order of time."""
-    return str(reader.dbconn.execute("PRAGMA integrity_check(1)").fetchone()[0])
-
-
-def _remedy(path: Path, magic: bytes) -> str:
-    return _REMEDIES[magic].format(path.name)
 
 
 def _usable(time: object, data: object) -> bool:
@@ -206,10 +198,8 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
             distribution = next(iter(reader.dbconn.execute("SELECT ros_distro FROM schema")), ("",))[0]
     else:
         if chunks != len(reader.chunks):
-            found.warnings.append(
-                f"{found.path}: holds {count(chunks, 'chunk')}, and its index lists {len(reader.chunks)}; "
-                f"{_remedy(found.path, found.magic)}"
-            )
+            lists = f"its index lists {len(reader.chunks)}"
+            found.warnings.append(found.damaged(f"holds {count(chunks, 'chunk')}, and {lists}"))
         stated = sum(sum(info.connection_counts.values()) for info in reader.chunk_infos)
     schemas: dict[tuple[str, str], int] = {}
     borrowed = ""
@@ -226,9 +216,8 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
             found.schemas[schema] = Schema(schema, data, encoding, kind)
         found.numbers[connection.id] = number
         metadata = {"offered_qos_profiles": qos[connection.id]} if qos.get(connection.id) else {}
-        found.channels[number] = Channel(
-            number, connection.topic, encodings.get(connection.id) or "cdr", metadata, schema
-        )
+        stored = encodings.get(connection.id) or "cdr"
+        found.channels[number] = Channel(number, connection.topic, stored, metadata, schema)
     if borrowed:
         found.warnings.append(
             f"{found.path}: the file does not hold the definitions of all its types; those of {borrowed} are used"
@@ -403,7 +392,7 @@ def metadata_pairs(recording: str | os.PathLike[str]) -> dict[str, str]:
     path = Path(recording)
     folder = path if path.is_dir() else path.parent
     custom = _about(folder).get("custom_data")
-    pairs = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    pairs = {str(key): str(value) for key, value in (custom if isinstance(custom, dict) else {}).items()}
     files = sorted(folder.glob("*.mcap")) if path.is_dir() else [path]
     for name, record in _records(files[0]) if files else []:
         for key, value in record.items():
@@ -415,20 +404,15 @@ def metadata_pairs(recording: str | os.PathLike[str]) -> dict[str, str]:
 def _records(path: Path) -> list[tuple[str, dict[str, str]]]:
     """Name and pairs of each metadata record; every other record is skipped without reading it."""
     found: list[tuple[str, dict[str, str]]] = []
-    try:
-        with open(path, "rb") as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            if stream.read(len(MAGIC)) != MAGIC:
-                return found
-            while len(header := stream.read(RECORD.size)) == RECORD.size:
-                opcode, length = RECORD.unpack(header)
-                if opcode in (0, Opcode.DATA_END, Opcode.FOOTER) or length > size - stream.tell():
-                    break
-                if opcode != Opcode.METADATA or length > _LARGEST:
-                    stream.seek(length, 1)
-                elif (record := parse(Metadata, stream.read(length))) is not None:
-                    found.append((record.name, dict(record.metadata)))
-    except OSError:
-        pass
+    with suppress(OSError), open(path, "rb") as stream:
+        size = path.stat().st_size
+        whole = stream.read(len(MAGIC)) == MAGIC
+        while whole and len(header := stream.read(RECORD.size)) == RECORD.size:
+            opcode, length = RECORD.unpack(header)
+            if opcode in (0, Opcode.DATA_END, Opcode.FOOTER) or length > size - stream.tell():
+                break
+            if opcode != Opcode.METADATA or length > _LARGEST:
+                stream.seek(length, 1)
+            elif (record := parse(Metadata, stream.read(length))) is not None:
+                found.append((record.name, dict(record.metadata)))
     return found

@@ -204,10 +204,8 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
         elif type_name in _jazzy().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
-            raise TypesysError(
-                f"the file holds no definition of {type_name}, nor does ROS 2; convert it to MCAP where its package is "
-                f"installed (`ros2 bag convert`)"
-            )
+            remedy = "convert it to MCAP where its package is installed (`ros2 bag convert`)"
+            raise TypesysError(f"the file holds no definition of {type_name}, nor does ROS 2; {remedy}")
         used: dict[str, int] = {}
         _complete(type_name, types, (), used)
         _hold_bounds({name: types[name] for name in used})
@@ -292,12 +290,10 @@ def _parse(type_name: str, encoding: str, text: str) -> dict[str, Any]:
         raise TypesysError(f"its schema is written in '{encoding}' (ros2msg and ros2idl are read)")
     text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # the parser does not know #include, and the parts follow anyway
     separator = "=" * 80 + "\n"
-    types: dict[str, Any] = {}
     if not text.startswith(f"{separator}IDL: "):
         return dict(get_types_from_idl(text))
-    for part in text.split(separator)[1:]:
-        types |= get_types_from_idl(part.partition("\n")[2])
-    return types
+    parts = (part.partition("\n")[2] for part in text.split(separator)[1:])
+    return {name: of for part in parts for name, of in get_types_from_idl(part).items()}
 
 
 def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], done: dict[str, int]) -> int:

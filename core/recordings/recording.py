@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import printable
-from uncertain_lti.recordings.message_types import RawMessage
+from uncertain_lti.recordings.message_types import Definition, RawMessage
 from uncertain_lti.signals.field_path import FieldPath, TypeFields, has_names, signal_paths
 
 
@@ -162,7 +162,7 @@ def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage])
     zeros = dict.fromkeys(topics, 0)
     longest: dict[str, RawMessage] = {}
     first: dict[str, list[RawMessage]] = {}
-    rest: dict[str, int] = {}
+    most: dict[str, int] = {}
     for raw in messages:
         channel, topic = raw.channel, raw.channel.topic
         if not channel.counted:
@@ -174,9 +174,8 @@ def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage])
             longest[topic] = raw
         if topic not in first:
             definition = channel.definition
-            first[topic], rest[topic] = [], _FIRST * has_names(definition.fields, definition.type_name)
-        if rest[topic]:
-            rest[topic] -= 1
+            first[topic], most[topic] = [], _FIRST * has_names(definition.fields, definition.type_name)
+        if len(first[topic]) < most[topic]:
             first[topic].append(raw)
         if channel.definition.has_header:
             if stamp := channel.definition.stamp_ns(raw.data):
@@ -197,18 +196,18 @@ def _facts(
     longest: RawMessage | None,
     first: Sequence[RawMessage],
 ) -> TopicFacts:
+    def paths(raw: RawMessage, definition: Definition) -> Iterator[str]:
+        return signal_paths(definition.fields, definition.type_name, definition.decode(raw.data))
+
     steps = [b - a for a, b in itertools.pairwise(times)]
     step, bursts = usual_step(median(steps), times[-1] - times[0], len(steps)) if steps else (0.0, False)
     fields: tuple[str, ...] = ()
     elsewhere: dict[str, None] = {}
     if longest:
-        definition = longest.channel.definition
         with suppress(BagError):  # `messages` tells it
-            message = definition.decode(longest.data)
-            fields = tuple(signal_paths(definition.fields, definition.type_name, message))
+            fields = tuple(paths(longest, longest.channel.definition))
             for raw in first:
-                message = definition.decode(raw.data)
-                elsewhere |= dict.fromkeys(signal_paths(definition.fields, definition.type_name, message))
+                elsewhere |= dict.fromkeys(paths(raw, longest.channel.definition))
     return TopicFacts(
         info,
         rate=1e9 / step if step else None,

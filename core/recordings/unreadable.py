@@ -40,9 +40,8 @@ def not_mcap(path: Path, head: bytes) -> BagError:
     if MAGIC.startswith(head):
         return BagError(f"{path}: cut after {len(head)} bytes, before any message; record or copy it again")
     if head.startswith(b"version https://git-lfs"):
-        return BagError(
-            f"{path}: a Git LFS pointer, not the recording itself; fetch it with `git lfs pull` in its repository"
-        )
+        lfs = "fetch it with `git lfs pull` in its repository"
+        return BagError(f"{path}: a Git LFS pointer, not the recording itself; {lfs}")
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         return _compressed(path)
     if head.startswith((b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04")):
@@ -55,11 +54,8 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: a table, and a recording of ROS messages is wanted here; check the path")
     if known := kind_of(path):
         return BagError(f"{path}: this is {known}, and a recording is wanted here; are the arguments swapped?")
-    kind = (
-        "a text file"
-        if all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512])
-        else "no kind of file that is known"
-    )
+    text = all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512])
+    kind = "a text file" if text else "no kind of file that is known"
     return BagError(
         f"{path}: {kind}, while a recording is wanted (MCAP, .db3, .bag, or a table called {', '.join(TABLES)}); check "
         f"the path and its suffix"
@@ -82,6 +78,11 @@ def os_error(path: Path, error: OSError) -> BagError:
     if isinstance(error, FileNotFoundError):
         return missing(path)
     return BagError(f"{path}: cannot be read ({error.strerror or error}); check the disk or copy it again")
+
+
+def changed(path: Path) -> BagError:
+    """The error for a file that is not what it was when it was opened."""
+    return BagError(f"{path}: the file changed while it was read; read it again when it is written")
 
 
 def _compressed(path: Path) -> BagError:
