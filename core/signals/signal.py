@@ -84,10 +84,7 @@ class Signal:
     @property
     def recalls(self) -> bool:
         """Whether the field is a memory; one that is no field path is refused by `check`."""
-        try:
-            return self.memory is not None
-        except SignalError:
-            return False
+        return memory_of(self.field)[0] is not None
 
     def admits(self, value: float) -> bool:
         """Whether a value of the field counts."""
@@ -136,13 +133,20 @@ class Signal:
         raise SignalError(f"{where}: {problem}")
 
 
+def memory_of(field: object) -> tuple[Memory | None, str]:
+    """The memory that a field is, and of what; what is no field path is refused later, by the signal's name."""
+    try:
+        return parse_memory(str(field))
+    except SignalError:
+        return None, ""
+
+
 def _single(value: float) -> float:
     """The nearest number of single precision; the value itself beyond its range."""
     try:
-        rounded: float = struct.unpack("f", struct.pack("f", value))[0]
+        return float(struct.unpack("f", struct.pack("f", value))[0])
     except OverflowError:
         return value
-    return rounded
 
 
 @dataclass(frozen=True)
@@ -250,10 +254,8 @@ def _ignored(value: Any, where: str) -> tuple[float, ...]:
 
 
 def _step(value: Any, where: str) -> Any:
-    if value in ("recorded", "constant"):
-        return value
     try:
-        return checked_number(value, where)
+        return value if value in ("recorded", "constant") else checked_number(value, where)
     except SignalError:
         raise wrong(where, value, STEP_CHOICES) from None
 
@@ -309,7 +311,7 @@ def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
     listed = {(str(e.get("topic")), str(e.get("field")).strip()): e for e in reversed(entries)}
 
     def filled(entry: Any) -> Any:
-        memory, inner = _memory(entry) if isinstance(entry, dict) else (None, "")
+        memory, inner = memory_of(entry.get("field")) if isinstance(entry, dict) else (None, "")
         if memory is None or (of := listed.get((str(entry.get("topic")), inner))) is None:
             return entry
         unit = str(of.get("unit") or "")
@@ -318,14 +320,6 @@ def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
         return own | entry
 
     return {key: [filled(entry) for entry in of_list] for key, of_list in lists.items()}
-
-
-def _memory(entry: Mapping[str, Any]) -> tuple[Memory | None, str]:
-    """The memory that an entry is, and of what field; what is no field path is refused later, by the signal's name."""
-    try:
-        return parse_memory(str(entry.get("field")))
-    except SignalError:
-        return None, ""
 
 
 PLACE = "{}"
@@ -350,6 +344,7 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
         if not isinstance(found.get(key), list):
             continue
         entries: list[Any] = []
+        unique = "state" if key == "structure" else "name"
         for position, entry in enumerate(found[key]):
             if not isinstance(entry, dict) or "for" not in entry:
                 entries.append(entry)
@@ -357,7 +352,6 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
             here = f"{source}: {key}[{position}]"
             members = members_of(entry["for"], f"{here}: for")
             plain = {name: value for name, value in entry.items() if name != "for"}
-            unique = "state" if key == "structure" else "name"
             if len(members) > 1 and PLACE not in str(plain.get(unique, "")):
                 raise SignalError(
                     f"{here}: {unique} is {reprlib.repr(plain.get(unique))}, the same for all of "
@@ -407,7 +401,7 @@ def _own(top: Mapping[str, Any], member: Mapping[str, str]) -> list[dict[str, An
     states, controls = ([e for e in top.get(key) or [] if isinstance(e, dict)] for key in ("states", "controls"))
     names = [str(e.get("name")) for e in (*states, *controls)]
     judged = [e for e in controls if e.get("judged") is True]
-    rows = [str(e.get("name")) for e in (*states, *judged) if _memory(e)[0] is None]
+    rows = [str(e.get("name")) for e in (*states, *judged) if memory_of(e.get("field"))[0] is None]
     return [
         {"state": state, "from": other, "nominal": 0, "half_width": 0}
         for state in rows
