@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import plural
-from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.signal_map import SignalMap, TimeSource
 
 
 class Status(StrEnum):
@@ -197,16 +197,10 @@ def resolve(
             f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
             f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         )
-    max_gap = signals.max_gap
+    max_gap, constant = signals.max_gap, signals.step
     if max_gap is None:
         max_gap = longest_step(instants[clock], min_step_ns, bool(signals.recalled))
-    constant = signals.step
     if constant == "constant":
         constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9
-    return replace(
-        signals,
-        clock=clock,
-        max_gap=max_gap,
-        step=constant,
-        time={t: "header" if time[t] == "header" else "log" for t in signals.topics},
-    )
+    sources: dict[str, TimeSource] = {t: "header" if time[t] == "header" else "log" for t in signals.topics}
+    return replace(signals, clock=clock, max_gap=max_gap, step=constant, time=sources)

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -68,13 +68,12 @@ def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
 
     What the index of a file says is wrong is looked for in the file itself before it is reported: they may differ.
     """
-    if bag.indexed:
-        try:
-            if not _fits(bag, signals):
-                bag.walk()
-        except SignalError:
-            bag.walk()
-    _fits(bag, signals)
+    fits = False
+    with suppress(SignalError):
+        fits = bag.indexed and _fits(bag, signals)
+    if not fits:
+        bag.walk()
+        _fits(bag, signals)
     return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
 
 
@@ -140,10 +139,8 @@ def resolved_by(recordings: Sequence[Times], signals: SignalMap) -> SignalMap:
         stamped, counted = (sum(times[topic][k] for times in recordings) for k in (0, 1))
         chosen = signals.time.get(topic)
         if chosen == "header" and not stamped:
-            raise SignalError(
-                f"{signals.source}: topics: {topic}: time is header, and no message has a stamp; write log, or leave "
-                f"it out"
-            )
+            none = "time is header, and no message has a stamp; write log, or leave it out"
+            raise SignalError(f"{signals.source}: topics: {topic}: {none}")
         sources[topic] = chosen or ("header" if 2 * stamped > counted else "log")
         stamps = sources[topic] == "header"
         instants[topic] = [times[topic][2] if stamps else times[topic][3] for times in recordings]
@@ -307,11 +304,7 @@ def read_as_fitted_with_decisions(
         raise SignalError(
             "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
         )
-    bag = (
-        open_recording(recording, indexed=True, layout=signals.table)
-        if isinstance(recording, (str, os.PathLike))
-        else recording
-    )
+    bag = recording if isinstance(recording, Recording) else open_recording(recording, (), True, signals.table)
     for topic, found in types_of([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
