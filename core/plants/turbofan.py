@@ -205,12 +205,7 @@ STATES = (
     "turbine_exit_total_temperature",
 )
 STATE_UNITS = ("rpm", "rpm", "Pa", "Pa", "K")
-CONTROLS = (
-    "main_fuel_flow",
-    "nozzle_throat_area",
-    "fan_inlet_guide_vane_angle",
-    "compressor_outlet_guide_vane_angle",
-)
+CONTROLS = ("main_fuel_flow", "nozzle_throat_area", "fan_inlet_guide_vane_angle", "compressor_outlet_guide_vane_angle")
 CONTROL_UNITS = ("kg/s", "m^2", "deg", "deg")
 
 
@@ -332,22 +327,16 @@ class Engine:
         T4, w4 = burn(core, T3, fuel, d.combustion_efficiency)
         W4 = core + fuel
 
-        def turbine(
-            P: float, T: float, power: float, efficiency: float, narrow: float
-        ) -> tuple[TurbineMap, float, float]:
+        def turbine(P: float, T: float, power: float, efficiency: float) -> tuple[TurbineMap, float, float]:
             """Map, exit pressure Pa and exit temperature K of a turbine that gives this power, W."""
             h = enthalpy(T, w4)
             drop = power / d.mechanical_efficiency / (W4 * efficiency)
             ratio = pressure_ratio(T, temperature(h - drop, w4), w4)
-            capacity = W4 * sqrt(T) / P / sqrt(1.0 - ratio * ratio)
-            return (
-                TurbineMap(capacity, efficiency, drop, narrow),
-                P * ratio,
-                temperature(h - efficiency * drop, w4),
-            )
+            made = TurbineMap(W4 * sqrt(T) / P / sqrt(1.0 - ratio * ratio), efficiency, drop, narrow=0.3)
+            return made, P * ratio, temperature(h - efficiency * drop, w4)
 
-        self.high_turbine, P45, T45 = turbine(P4, T4, core * work, d.high_turbine_efficiency, 0.3)
-        self.low_turbine, P5, T5 = turbine(P45, T45, d.flow * fan_work, d.low_turbine_efficiency, 0.3)
+        self.high_turbine, P45, T45 = turbine(P4, T4, core * work, d.high_turbine_efficiency)
+        self.low_turbine, P5, T5 = turbine(P45, T45, d.flow * fan_work, d.low_turbine_efficiency)
         self.fan = CompressorMap(
             d.flow, fan_work, d.fan_efficiency, T_STANDARD,
             exponent=1.1, steepening=0.8, slope=1.3, curvature=1.5, closing=0.008, deloading=0.006,
@@ -473,11 +462,10 @@ class GasPathSolver:
         """Matched gas path at spool speeds x[:2] and controls u, to a relative mismatch of 1e-12."""
         path = self._newton(x, u, health) or self._approach(x, u, health)
         if path is None:
-            raise UncertainLTIError(
-                f"turbofan: no matched gas path at fan speed {x[0]:.0f} rpm, compressor speed {x[1]:.0f} rpm, fuel "
-                f"{u[0]:.3f} kg/s, nozzle area {u[1]:.4f} m^2, vanes {u[2]:.1f} and {u[3]:.1f} deg; keep closer to "
-                f"the working line"
-            )
+            speeds = f"fan speed {x[0]:.0f} rpm, compressor speed {x[1]:.0f} rpm"
+            controls = f"fuel {u[0]:.3f} kg/s, nozzle area {u[1]:.4f} m^2, vanes {u[2]:.1f} and {u[3]:.1f} deg"
+            where = f"{speeds}, {controls}; keep closer to the working line"
+            raise UncertainLTIError(f"turbofan: no matched gas path at {where}")
         return path
 
     def _approach(self, x: Sequence[float], u: Sequence[float], health: Health) -> GasPath | None:
