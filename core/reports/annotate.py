@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,11 +132,9 @@ def annotate(
         "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
         "topics": base,
         "states": json.dumps([{"name": s.name, "unit": s.unit} for s in model.signals.states]),
+        **({"model": os.path.basename(model_file)} if model_file else {}),
+        **({"model_sha256": sha256(model_file)} if os.path.isfile(model_file) else {}),
     }
-    if model_file:
-        about["model"] = os.path.basename(model_file)
-        if os.path.isfile(model_file):
-            about["model_sha256"] = sha256(model_file)
     try:
         with whole_file(output) as stream:
             writer = McapWriter(stream, f"uncertain-lti {__version__}", compression)
@@ -149,12 +147,11 @@ def annotate(
             }
             writer.metadata(METADATA, about)
 
-            def copied() -> Iterator[tuple[Path, int]]:
-                for part, renumbered in zip(contents, numbers, strict=True):
-                    for lost in copy(writer, part, renumbered, notes):
-                        yield part.path, lost
-
-            blocks: Iterable[Any] = copied()
+            blocks: Iterable[Any] = (
+                (part.path, lost)
+                for part, renumbered in zip(contents, numbers, strict=True)
+                for lost in copy(writer, part, renumbered, notes)
+            )
             if progress is not None:
                 blocks = progress(blocks, sum(len(part.blocks) for part in contents))
             for path, lost in blocks:

@@ -137,14 +137,9 @@ def html_report(
         ("trust", "How far to trust it", [*trust, Table(("weight", "reason"), reasons, left=(1,))]),
         ("origin", "Where it comes from", _where_from(facts)),
     ]
-    return interactive_page(
-        charts.base_name(facts["model"]["file"] or "model"),
-        plotted,
-        about=f"Alarm: {facts['rule']['words']}{conditions}.",
-        cards=list(_cards(facts)),
-        sections=sections,
-        version=facts["version"],
-    )
+    more: dict[str, Any] = {"about": f"Alarm: {facts['rule']['words']}{conditions}.", "cards": list(_cards(facts))}
+    title = charts.base_name(facts["model"]["file"] or "model")
+    return interactive_page(title, plotted, sections=sections, version=facts["version"], **more)
 
 
 def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
