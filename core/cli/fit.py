@@ -119,7 +119,6 @@ def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
         client = None
         if options.scheduler or options.workers:
             dask: Any = import_module("distributed")
-
             where = options.scheduler or stack.enter_context(_local_cluster(dask, options.workers))
             try:
                 client = stack.enter_context(dask.Client(where, timeout=10))
@@ -137,13 +136,9 @@ def _local_cluster(dask: Any, workers: int) -> Any:
     from uncertain_lti.sampling.reading import children_ignore_ctrl_c
 
     with children_ignore_ctrl_c():
-        return dask.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            dashboard_address=None,
-            silence_logs=logging.CRITICAL,  # of work that is broken off; what goes wrong comes back as an error
-        )
+        quiet = logging.CRITICAL  # of work that is broken off; what goes wrong comes back as an error
+        given = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None, "silence_logs": quiet}
+        return dask.LocalCluster(n_workers=workers, **given)
 
 
 def _asked(options: argparse.Namespace) -> dict[str, Any] | None:
@@ -276,17 +271,15 @@ def run_validate(options: argparse.Namespace) -> Result:
         said = promises(model, panel)
     data = validation.judged_as(model).to_dict() | ({"promises": said} if said else {})
     with options.progress.stage("injecting faults") as step:
-        data["detectable"] = detectable(
-            model, validation.parts, options.within, confidence=options.confidence, progress=step
-        ).to_dict()
+        given = {"confidence": options.confidence, "progress": step}
+        data["detectable"] = detectable(model, validation.parts, options.within, **given).to_dict()
     model = model.replace(validation=data)
-    output = options.output
-    if output is not None:
-        model.save(output)
+    if options.output is not None:
+        model.save(options.output)
     options.say(validation_text(data))
-    if output is not None:
-        options.say(f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
-    return Result(data={"model": output or options.model, "validation": model.to_dict()["validation"]})
+    if options.output is not None:
+        options.say(f"model written to {options.output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
+    return Result(data={"model": options.output or options.model, "validation": model.to_dict()["validation"]})
 
 
 # --- signature -------------------------------------------------------------------------------------------------------
@@ -318,6 +311,7 @@ def run_signature(options: argparse.Namespace) -> Result:
     return Result(data={"model": str(output), "signatures": faults, "named": named, "alike": alike})
 
 
+_OF_THE_FIT = "default: that of the fit; none: single recordings all the same"
 VALIDATE = Command(
     "validate",
     "estimate how far to trust a model, by leaving out what it was fitted to",
@@ -325,13 +319,10 @@ VALIDATE = Command(
         "model",
         helped("bags", f"{RECORDINGS} (default: those the model was fitted to)", nargs="*"),
         "--blocks",
-        helped(
-            "--group", f"{OPTIONS['--group']['help']}; default: that of the fit; none: single recordings all the same"
-        ),
+        helped("--group", f"{OPTIONS['--group']['help']}; {_OF_THE_FIT}"),
         *("--gap", "--confidence"),
         helped(
-            "--false-alarms",
-            "learn the panel again, for at most so many false alarms per hour with 90%% confidence",
+            "--false-alarms", "learn the panel again, for at most so many false alarms per hour with 90%% confidence"
         ),
         "--within",
         helped("--output", "write the model with this validation, and the panel that was learnt, to this file"),
@@ -348,9 +339,7 @@ SIGNATURE = Command(
         "model",
         helped("bags", _LABELLED, metavar="LABEL=BAG"),
         ("--output", {"required": True}),
-        "--force",
-        *RULES,
-        "--json",
+        *("--force", *RULES, "--json"),
     ),
     run_signature,
 )

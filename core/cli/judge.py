@@ -255,10 +255,8 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
     if options.signals:
         from uncertain_lti import read_transients
 
-        reading = options.progress.iterate("reading")
-        runs = read_transients([bag.path for bag in bags], options.signals, progress=reading)
-        for transient in runs:
-            options.progress.note(*transient.notes)
+        runs = read_transients([bag.path for bag in bags], options.signals, options.progress.iterate("reading"))
+        options.progress.note(*(note for transient in runs for note in transient.notes))
         return [plotted_transient(transient, len(runs)) for transient in runs]
     from uncertain_lti.proposal.init import moving_numbers
 

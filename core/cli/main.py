@@ -55,10 +55,8 @@ def run_info(options: argparse.Namespace) -> Result:
     try:
         return Result(text=model_text(model))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise ModelError(
-            f"{options.model}: what it says of its own fit is odd ({type(error).__name__}: {error}); fit it again, "
-            f"or print it with --json"
-        ) from None
+        odd = f"what it says of its own fit is odd ({type(error).__name__}: {error})"
+        raise ModelError(f"{options.model}: {odd}; fit it again, or print it with --json") from None
 
 
 def run_layout(options: argparse.Namespace) -> Result:
@@ -155,9 +153,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return NOT_READ if command in ("check", "report", "plot") else DONE
     except OSError as error:
         drop_output()
-        return _refuse(
-            command, f"the output cannot be written ({error.strerror or error}); make room, or send it elsewhere"
-        )
+        why = error.strerror or error
+        return _refuse(command, f"the output cannot be written ({why}); make room, or send it elsewhere")
 
 
 def _keep_interrupt(unraisable: Any) -> None:
@@ -184,9 +181,8 @@ def _run(command: str, given: Sequence[str]) -> int:
     except OSError as error:
         if error.filename is None:
             raise
-        return _refuse(
-            command, f"{error.filename}: {error.strerror or error}; check the path, its permissions and the disk"
-        )
+        why = error.strerror or error
+        return _refuse(command, f"{error.filename}: {why}; check the path, its permissions and the disk")
     except MemoryError:
         return _refuse(command, "there is not enough memory for this; give fewer or shorter recordings at a time")
     except KeyboardInterrupt:
@@ -249,9 +245,8 @@ class _Parser(argparse.ArgumentParser):
             message += meant(match[1], re.findall(r"[\w-]+", match[2]), 1)
         elif message.startswith("the following arguments are required"):
             words = [word.partition("=")[0] for word in self._given if word.startswith("--")]
-            for word in words:
-                if not any(option.startswith(word) for option in self._option_string_actions):
-                    message += f"; there is no {word}{meant(word, self._option_string_actions, 1)}"
+            odd = [w for w in words if not any(o.startswith(w) for o in self._option_string_actions)]
+            message += "".join(f"; there is no {word}{meant(word, self._option_string_actions, 1)}" for word in odd)
         elif message.startswith("unrecognized arguments: "):
             commands: dict[str, argparse.ArgumentParser]
             commands = dict(*(action.choices for action in self._actions if isinstance(action.choices, dict)))
