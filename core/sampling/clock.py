@@ -193,10 +193,9 @@ def resolve(
     step = medians[clock]
     if step is None:
         count = sum(len(i) for i in instants[clock])
-        raise SignalError(
-            f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
-            f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
-        )
+        remedy = f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
+        none = f"{plural(count, 'message')} without a forward step in time, so no transition"
+        raise SignalError(f"{clock}: {none}; {remedy}")
     max_gap, constant = signals.max_gap, signals.step
     if max_gap is None:
         max_gap = longest_step(instants[clock], min_step_ns, bool(signals.recalled))

@@ -170,20 +170,11 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
     sampler = Sampler(signals)
     (t_ns, x, held), decisions = sampler.push_all(stream.topic, stream.arrival, stream.stamp, stream.values)
     assert signals.max_gap is not None
-    m = len(signals.controls)
-    transient = Transient(
-        t_ns,
-        x,
-        held[:, :m],
-        s=held[:, m:],
-        name=os.fspath(stream.bag.path),
-        signals=signals,
-        max_gap=signals.max_gap,
-        min_step=signals.min_step,
-        counters=sampler.counters,
-        sources=stream.bag.parts,
-        notes=(*stream.bag.warnings, *lags_in_words(stream, signals)),
-    )
+    m, bag = len(signals.controls), stream.bag
+    cut: dict[str, Any] = {"signals": signals, "max_gap": signals.max_gap, "min_step": signals.min_step}
+    read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts}
+    notes = (*bag.warnings, *lags_in_words(stream, signals))
+    transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], name=os.fspath(bag.path), notes=notes, **cut, **read)
     return transient, Decisions(*decisions)
 
 
@@ -203,10 +194,9 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
         since = np.minimum(stream.arrival[own] - stream.arrival[before], step)
         lag = float(np.median(stream.stamp[before] + since - stream.stamp[own]))
         if lag > step > 0:
-            said.append(
-                f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {lag * 1e-9:.3g} s, "
-                f"{lag / step:.3g} steps: each sample has the control that had come, not the one of its instant"
-            )
+            by = f"{lag * 1e-9:.3g} s, {lag / step:.3g} steps"
+            of = "each sample has the control that had come, not the one of its instant"
+            said.append(f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {by}: {of}")
     return said
 
 
@@ -301,29 +291,22 @@ def read_as_fitted_with_decisions(
 ) -> tuple[Transient, Decisions]:
     """`read_as_fitted`, and which message decided each clock message."""
     if any(not s.topic for s in signals.signals):
-        raise SignalError(
-            "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
-        )
+        remedy = "check it with EnvelopeMonitor(model).check(transient)"
+        raise SignalError(f"the model was fitted to arrays and names no topics; {remedy}")
     bag = recording if isinstance(recording, Recording) else open_recording(recording, (), True, signals.table)
     for topic, found in types_of([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
-            raise BagError(
-                f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; "
-                f"check a recording of the same topics"
-            )
+            remedy = "check a recording of the same topics"
+            raise BagError(f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; {remedy}")
     if signals.clock is None or signals.max_gap is None or any(t not in signals.time for t in signals.topics):
-        raise SignalError(
-            f"{signals.source}: it does not say clock, max_gap and time of every topic, so not how to cut samples; "
-            f"fit the model to recordings"
-        )
+        unsaid = "it does not say clock, max_gap and time of every topic, so not how to cut samples"
+        raise SignalError(f"{signals.source}: {unsaid}; fit the model to recordings")
     stream = read_stream(bag, signals, progress)
     stamps = stream.stamp[stream.topic == signals.topics.index(signals.clock)]
     if signals.time[signals.clock] == "header" and not (stamps > 0).any():
-        raise SignalError(
-            f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; fit it to such "
-            f"recordings, with time: log for that topic"
-        )
+        remedy = "fit it to such recordings, with time: log for that topic"
+        raise SignalError(f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; {remedy}")
     return sample(stream, signals)
 
 
@@ -379,9 +362,9 @@ def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]
                 raise BagError(no_topic(bag, topic))
             found = bag.topics[topic].type
             if types.setdefault(topic, found) != found:
+                other = f"{types[topic]} in {bags[0].path}"
                 raise BagError(
-                    f"{bag.path}: {topic} is {found}, and {types[topic]} in {bags[0].path}; "
-                    f"fit recordings of the same types together"
+                    f"{bag.path}: {topic} is {found}, and {other}; fit recordings of the same types together"
                 )
     return types
 
@@ -455,10 +438,8 @@ def _stream(bag: Recording, future: Future[tuple[Any, ...]]) -> Stream:
     try:
         walked, undecoded, *columns = future.result()
     except BrokenProcessPool:
-        raise BagError(
-            f"{bag.path}: the process that read it was ended, perhaps for want of memory; "
-            f"read fewer recordings at once, or fit with --cache"
-        ) from None
+        ended = "the process that read it was ended, perhaps for want of memory"
+        raise BagError(f"{bag.path}: {ended}; read fewer recordings at once, or fit with --cache") from None
     if walked:
         bag.walk()
     bag.restore_notes(bag.reading_notes[0], undecoded)

@@ -214,19 +214,16 @@ class FieldPath:
         known = (*FUNCTIONS, "unwrap", *KINDS)
         while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
             if match[1] not in known:
-                raise SignalError(
-                    f"field '{text}': there is no function '{match[1]}'{meant(match[1], known)}; "
-                    f"there are {', '.join(known)}"
-                )
+                near, there = meant(match[1], known), ", ".join(known)
+                raise SignalError(f"field '{text}': there is no function '{match[1]}'{near}; there are {there}")
             functions.append(match[1])
             inner = match[2].strip()
         if functions[:1] == ["unwrap"]:
             self.unwrap = True
             functions = functions[1:]
         if len(functions) > 1 or not set(functions) <= set(FUNCTIONS):
-            raise SignalError(
-                f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...)), and in lag, diff, rate"
-            )
+            only = "functions nest only as unwrap(roll|pitch|yaw(...)), and in lag, diff, rate"
+            raise SignalError(f"field '{text}': {only}")
         if functions:
             self.function = FUNCTIONS[functions[0]]
         self.steps = self._parse(inner)
@@ -238,10 +235,8 @@ class FieldPath:
             match = _STEP.match(inner, position)
             dotted = inner[position] == "."
             if not match or (match[1] is not None and dotted != bool(steps)) or (match[1] is None and not steps):
-                raise SignalError(
-                    f"field '{self.text}' is not a field path; write for example twist.linear.x, data[0], "
-                    f"position[fan] or yaw(pose.orientation)"
-                )
+                example = "twist.linear.x, data[0], position[fan] or yaw(pose.orientation)"
+                raise SignalError(f"field '{self.text}' is not a field path; write for example {example}")
             kind = {1: "attribute", 2: "index"}.get(match.lastindex or 0, "name")
             key = match[match.lastindex or 0]
             steps.append((kind, int(key) if kind == "index" else key))
@@ -319,10 +314,8 @@ class FieldPath:
                 raise SignalError(f"{here}: index {key} is past the end of an array of {current.array}")
             if kind == "name":
                 if not _are_names(parent.get("name")):
-                    raise SignalError(
-                        f"{here}: '[{key}]' needs an array of strings called 'name' in the same message; "
-                        f"give an index instead, for example [0]"
-                    )
+                    needs = "needs an array of strings called 'name' in the same message"
+                    raise SignalError(f"{here}: '[{key}]' {needs}; give an index instead, for example [0]")
             current = replace(current, array=None)
         self._check_leaf(here, current, type_name, topic, type_fields)
 

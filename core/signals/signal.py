@@ -107,9 +107,8 @@ class Signal:
         elif self.steady != "auto" and not -LARGEST <= self.steady <= LARGEST:
             problem = f"steady is {self.steady}; it must be a finite number or auto, up to {LARGEST:g}"
         elif self.max_hold is not None and not 0 <= self.max_hold <= LONGEST_S:
-            problem = (
-                f"max_hold is {self.max_hold}; it must be 0 s or more, up to {LONGEST_S:g}, or left out for no limit"
-            )
+            least = f"it must be 0 s or more, up to {LONGEST_S:g}, or left out for no limit"
+            problem = f"max_hold is {self.max_hold}; {least}"
         elif not 0 <= self.delay <= LONGEST_DELAY:
             problem = f"delay is {reprlib.repr(self.delay)}; it must be 0 to {LONGEST_DELAY} samples"
         elif self.delay and self.memory:
@@ -117,13 +116,11 @@ class Signal:
         elif self.at not in AT:
             problem = f"at is {reprlib.repr(self.at)}; write departure, arrival or both"
         elif self.at != "departure" and (self.delay or self.memory):
-            problem = (
-                f"at is {self.at}, and it is taken from earlier samples (delay, lag, diff, rate); leave one of them out"
-            )
+            earlier = "it is taken from earlier samples (delay, lag, diff, rate)"
+            problem = f"at is {self.at}, and {earlier}; leave one of them out"
         elif self.judged and (self.delay or self.memory or self.at != "departure"):
-            problem = (
-                "is judged, and delayed, a memory or not at the departure, which leaves nothing to judge; choose one"
-            )
+            nothing = "which leaves nothing to judge"
+            problem = f"is judged, and delayed, a memory or not at the departure, {nothing}; choose one"
         elif self.valid is not None and not self.valid[0] < self.valid[1]:
             problem = f"valid is {list(self.valid)}; write [least, greatest]"
         elif any(math.isnan(code) for code in self.ignore):
@@ -353,10 +350,8 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
             members = members_of(entry["for"], f"{here}: for")
             plain = {name: value for name, value in entry.items() if name != "for"}
             if len(members) > 1 and PLACE not in str(plain.get(unique, "")):
-                raise SignalError(
-                    f"{here}: {unique} is {reprlib.repr(plain.get(unique))}, the same for all of "
-                    f"{shortlist(members, 3)}; write {PLACE} where the member goes, in quotes"
-                )
+                same = f"{unique} is {reprlib.repr(plain.get(unique))}, the same for all of {shortlist(members, 3)}"
+                raise SignalError(f"{here}: {same}; write {PLACE} where the member goes, in quotes")
             for one in members:
                 written = {k: v.replace(PLACE, one) if isinstance(v, str) else v for k, v in plain.items()}
                 entries.append(written)
