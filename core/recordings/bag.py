@@ -77,9 +77,8 @@ class Bag(Recording):
         self._warnings += damage
         if (damage or not self._contents) and not any(part.count for part in self._contents):
             why = self._warnings[0].removeprefix(f"{self.path}: ")
-            raise BagError(
-                f"{self.path}: no message can be read ({why}){'' if '`' in why else '; record or copy it again'}"
-            )
+            remedy = "" if "`" in why else "; record or copy it again"
+            raise BagError(f"{self.path}: no message can be read ({why}){remedy}")
         self._channels = [_channels(part) for part in self._contents]
         self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
         self.topics = self._topics()
@@ -179,10 +178,8 @@ class Bag(Recording):
         self._warnings += [f"{path}: the file is empty; it is left out" for path in empty]
         contents = [survey(path, indexed) for path in paths if path not in empty]
         if not listed and (why := not_one_recording(contents)):
-            raise BagError(
-                f"{self.path}: without a metadata.yaml its files do not look like one recording ({why}); name them "
-                f"one by one: {', '.join(path.name for path in paths)}"
-            )
+            unlike = f"without a metadata.yaml its files do not look like one recording ({why})"
+            raise BagError(f"{self.path}: {unlike}; name them one by one: {', '.join(path.name for path in paths)}")
         return contents
 
     def _topics(self) -> dict[str, TopicInfo]:
@@ -276,10 +273,8 @@ class Bag(Recording):
                 held -= len(raw.data) + _SIZE_OF_AN_ENTRY
                 yield raw
             if held > _MOST_HELD:
-                raise BagError(
-                    f"{self.path}: its messages are so far out of order that more than {_MOST_HELD >> 20} MiB of them "
-                    f"have to wait; put them in order with `mcap sort`"
-                )
+                waiting = f"more than {_MOST_HELD >> 20} MiB of them have to wait; put them in order with `mcap sort`"
+                raise BagError(f"{self.path}: its messages are so far out of order that {waiting}")
 
 
 def _channels(contents: Contents) -> dict[int, RecordedChannel]:

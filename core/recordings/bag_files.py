@@ -109,18 +109,16 @@ def scan_foreign(path: Path) -> Foreign | None:
     with open(path, "rb") as stream:
         head = stream.read(len(_DATABASE))
     if head.startswith(b"#ROSBAG V") and not head.startswith(_BAG):
-        raise BagError(
-            f"{path}: a ROS 1 bag of another version than 2.0; convert it with `rosbag fix` of ROS 1, or record again"
-        )
+        remedy = "convert it with `rosbag fix` of ROS 1, or record again"
+        raise BagError(f"{path}: a ROS 1 bag of another version than 2.0; {remedy}")
     if not head.startswith((_DATABASE, _BAG)):
         return None
     found: Foreign = aside(_scan, path, "ROS 1 bag" if head.startswith(_BAG) else "database of ROS 2")
     log = path.with_name(f"{path.name}-wal")
     if found.magic == _DATABASE and log.exists() and log.stat().st_size:
-        found.warnings.append(
-            f"{path}: messages that were not yet written to it are in {log.name} and are not read; put them in with "
-            f"`sqlite3 {path.name} 'PRAGMA wal_checkpoint'`"
-        )
+        remedy = f"put them in with `sqlite3 {path.name} 'PRAGMA wal_checkpoint'`"
+        unwritten = f"messages that were not yet written to it are in {log.name} and are not read"
+        found.warnings.append(f"{path}: {unwritten}; {remedy}")
     return found
 
 
@@ -312,21 +310,15 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
             instead = f"{listed[0]}: metadata.yaml lists this file, and {found[0].name} is read, which is there instead"
             return found, False, [instead]
         others = f", or name one of those that are there: {file_names(found)}" if found else ""
-        raise BagError(
-            f"{folder}: metadata.yaml lists {file_names(listed)}, and none of them is there; copy them here{others}"
-        )
+        none = f"metadata.yaml lists {file_names(listed)}, and none of them is there"
+        raise BagError(f"{folder}: {none}; copy them here{others}")
     if not found:
         raise no_recording(folder, inside)
-    stems = {pair[0] if (pair := stem_and_index(p)) else p.name for p in found}
-    if len(stems) > 1:
-        raise BagError(
-            f"{folder}: without a metadata.yaml its files cannot be one recording; name them one by one: "
-            f"{file_names(found)}"
-        )
-    warnings = []
-    if (folder / "metadata.yaml").exists():
-        warnings.append(f"{folder}: its metadata.yaml cannot be used; the files were taken by their names")
-    return found, False, warnings
+    if len({pair[0] if (pair := stem_and_index(p)) else p.name for p in found}) > 1:
+        several = "without a metadata.yaml its files cannot be one recording"
+        raise BagError(f"{folder}: {several}; name them one by one: {file_names(found)}")
+    unusable = f"{folder}: its metadata.yaml cannot be used; the files were taken by their names"
+    return found, False, [unusable] * (folder / "metadata.yaml").exists()
 
 
 def survey(path: Path, indexed: bool = False) -> Contents:
@@ -363,11 +355,8 @@ def not_one_recording(parts: Sequence[Contents]) -> str:
 
 def _kinds(contents: Contents) -> set[tuple[str, str]]:
     """(topic, type) of every channel of a file."""
-    schemas = contents.schemas
-    return {
-        (c.topic, full_name(schemas[c.schema_id].name) if c.schema_id and c.schema_id in schemas else "")
-        for c in contents.channels.values()
-    }
+    types = {number: full_name(schema.name) for number, schema in contents.schemas.items() if number}
+    return {(c.topic, types.get(c.schema_id, "")) for c in contents.channels.values()}
 
 
 def _span(contents: Contents) -> tuple[int, int]:
@@ -378,10 +367,8 @@ def _longest_pause(contents: Contents) -> int:
     """Longest time without any message, ns."""
     if contents.indexed:
         contents = survey(contents.path)
-    times: list[int] = []
-    for block in contents.blocks:
-        times += (message[1] for message in messages(contents.records(block)))
-    return max((b - a for a, b in itertools.pairwise(sorted(times))), default=0)
+    times = sorted(message[1] for block in contents.blocks for message in messages(contents.records(block)))
+    return max((b - a for a, b in itertools.pairwise(times)), default=0)
 
 
 _LARGEST = 1 << 20  # bytes of one metadata record that is read

@@ -76,10 +76,9 @@ def find_column(path: object, wanted: str, columns: Sequence[str], what: str) ->
     for name in columns:
         if wanted in (name, field_name(name)):
             return name
-    raise BagError(
-        f"{path}: there is no column '{wanted}', which the signals file names for {what}{meant(wanted, columns)}; "
-        f"columns there: {shortlist(list(columns), 50)}"
-    )
+    near, there = meant(wanted, columns), shortlist(list(columns), 50)
+    none = f"there is no column '{wanted}', which the signals file names for {what}{near}"
+    raise BagError(f"{path}: {none}; columns there: {there}")
 
 
 def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, NDArray[np.int64], str]:
@@ -152,18 +151,14 @@ def _bare(name: str) -> str:
 
 def _grows(column: Column) -> bool:
     """Whether numbers grow from each row to the next."""
-    return (
-        column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2 and bool((column[1:] > column[:-1]).all())
-    )
+    numbers = column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2
+    return numbers and bool((column[1:] > column[:-1]).all())
 
 
 def _days_beside(table: RawTable, column: str) -> str:
     """The one column of days alone, where this one has times of day alone; else nothing."""
-    first = {
-        name: _spelt(next((str(cell) for cell in cells.tolist() if cell), ""))
-        for name, cells in table.columns.items()
-        if cells.dtype.kind == "O"
-    }
+    texts = [(name, cells.tolist()) for name, cells in table.columns.items() if cells.dtype.kind == "O"]
+    first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts}
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
     return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
 
@@ -273,9 +268,8 @@ def _exactly(cell: str, factor: int, value: float) -> int:
 
 
 def _too_late(where: str) -> BagError:
-    return BagError(
-        f"{where}: is past the year 2262 in ns; say what unit it has in the signals file, `table: {{unit: ms}}`"
-    )
+    remedy = "say what unit it has in the signals file, `table: {unit: ms}`"
+    return BagError(f"{where}: is past the year 2262 in ns; {remedy}")
 
 
 def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
@@ -290,13 +284,10 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
             fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
             times[row] = (int(hours) * 60 + int(minutes)) * 60 * 10**9 + int(fraction)
         elif text:
-            given = str(cells[row]).strip()[:40]
-            raise BagError(
-                f"{where}: '{given}' in row {row + 1} is neither a number nor an ISO time such as "
-                f"2026-11-22T06:28:01.25Z; write all of them as one or the other"
-                + ", with a point before decimals"
-                * bool(re.fullmatch(r"-?\d+,\d+", text))
-            )
+            given, point = str(cells[row]).strip()[:40], bool(re.fullmatch(r"-?\d+,\d+", text))
+            neither = "is neither a number nor an ISO time such as 2026-11-22T06:28:01.25Z"
+            remedy = "write all of them as one or the other" + ", with a point before decimals" * point
+            raise BagError(f"{where}: '{given}' in row {row + 1} {neither}; {remedy}")
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     return times, order
@@ -347,10 +338,8 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
         first = next(str(cell).strip() for cell in given if str(cell).strip())
         note = f"'{first[:40]}' is taken for {(taken or even or [''])[0]}"
     if not taken:
-        raise BagError(
-            f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times "
-            f"such as 2026-11-22T06:28:01.25Z"
-        )
+        which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
+        raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
     iso = iter(orders[taken[0]])
     return [cell and next(iso) for cell in cells], note
 
@@ -491,10 +480,8 @@ class Table(Recording):
         steps = path.steps
         column = self.columns_by_field.get(str(steps[0][1]), np.empty(0))
         if not column.size and len(self.times):
-            raise BagError(
-                f"{self.path}: there is no column '{steps[0][1]}'; columns there: "
-                f"{shortlist(list(self.columns_by_field), 50)}"
-            )
+            there = shortlist(list(self.columns_by_field), 50)
+            raise BagError(f"{self.path}: there is no column '{steps[0][1]}'; columns there: {there}")
         if path.function is None and len(steps) == 1:
             return column
         if path.function is None and len(steps) == 2 and steps[1][0] == "index":
@@ -517,10 +504,8 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
     alone = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED and _is_alone(t)]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
-            other._warnings.append(
-                f"{other.path}: is of the time of {alone[0].path}; if each of them is of another signal of one "
-                f"machine, write them as columns of one file"
-            )
+            remedy = "if each of them is of another signal of one machine, write them as columns of one file"
+            other._warnings.append(f"{other.path}: is of the time of {alone[0].path}; {remedy}")
     return tables
 
 

@@ -128,9 +128,8 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
         try:
             for cells in reader:
                 if reader.line_num > before + 1:
-                    raise BagError(
-                        f"{path}: line {shape.skip + before + 1} opens a quote that is not closed in it; mend it"
-                    )
+                    line = shape.skip + before + 1
+                    raise BagError(f"{path}: line {line} opens a quote that is not closed in it; mend it")
                 before = reader.line_num
                 if cells and any(cells):
                     yield shape.skip + reader.line_num, cells
@@ -152,10 +151,8 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
             column.append(cell)
     rows = len(columns[0])
     if odd > max(1, _ODD_SHARE * (odd + rows)) or (odd and not rows):
-        raise BagError(
-            f"{path}: {plural(odd, 'line')} with another number of cells than the {wide} of its header, the first is "
-            f"line {first_odd}; mend the file, or its header"
-        )
+        others = f"{plural(odd, 'line')} with another number of cells than the {wide} of its header"
+        raise BagError(f"{path}: {others}, the first is line {first_odd}; mend the file, or its header")
     if not rows:
         raise BagError(f"{path}: has a header and no line of data; record or copy it again")
     notes = []
@@ -294,15 +291,13 @@ def _read_arrow(path: Path) -> RawTable:
         if path.suffix.lower() == ".parquet":
             rows = pa.parquet.read_metadata(path)
             if rows.num_rows * rows.num_columns * 8 > most_inflated(path.stat().st_size):
-                raise BagError(
-                    f"{path}: states {rows.num_rows} rows of {rows.num_columns} columns, which is more than is read of "
-                    f"a file of its size; write the columns and rows that are needed"
-                )
+                states = f"states {rows.num_rows} rows of {rows.num_columns} columns"
+                remedy = "write the columns and rows that are needed"
+                raise BagError(f"{path}: {states}, which is more than is read of a file of its size; {remedy}")
             table = pa.parquet.read_table(path, memory_map=False)
             if table.num_rows != rows.num_rows:
-                raise BagError(
-                    f"{path}: is damaged: it states {rows.num_rows} rows, and {table.num_rows} are read; copy it again"
-                )
+                states = f"it states {rows.num_rows} rows, and {table.num_rows} are read"
+                raise BagError(f"{path}: is damaged: {states}; copy it again")
         else:
             table = pa.feather.read_table(path, memory_map=False)
         table.validate(full=True)
