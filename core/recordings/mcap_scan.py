@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import bisect
 import struct
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -72,6 +73,8 @@ _IN_SUMMARY: dict[int, Any] = {
 _LEAST_STRETCH = 1 << 14  # bytes
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
 _FIRST_WARNINGS = 3  # of a kind that are reported one by one
+_LIKE_THESE = {"place": "left out as damaged", "chunk": "left out for reasons like these",
+               "definition": "that contradicts an earlier one"}  # fmt: skip
 _LEAST_RECORDS = 1 << 20
 _LARGEST_DEFINITION = 1 << 24  # bytes
 _LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
@@ -103,7 +106,7 @@ class _Scanner:
         self.sums = 0  # checksum of everything before the current record
         self.summary = _Summary(0, True)
         self.known: list[int] = []  # where chunks begin that the summary knows
-        self.warned = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
+        self.warned = Counter[str]()  # warnings of each kind
         self.chunk_warnings: list[str] = []
         self.damaged = False
         self.odd_records = 0
@@ -127,11 +130,7 @@ class _Scanner:
         elif not self.closed:
             self._warn(f"cut after {count(found.count, 'message')} (no footer); read up to the cut")
         found.warnings += self.chunk_warnings
-        for kind, what in (
-            ("place", "left out as damaged"),
-            ("chunk", "left out for reasons like these"),
-            ("definition", "that contradicts an earlier one"),
-        ):
+        for kind, what in _LIKE_THESE.items():
             if (more := self.warned[kind] - _FIRST_WARNINGS) > 0:
                 self._warn(f"{count(more, f'more {kind}')} {what}")
         if self.odd_records:
@@ -163,7 +162,10 @@ class _Scanner:
             ends = opcode == Opcode.DATA_END or opcode == Opcode.FOOTER
             if opcode == 0 or end > following or (ends and following < size):
                 if self.closed or opcode == 0:
-                    self._damage(position, following)
+                    self.damaged = True
+                    if self._first("place"):
+                        rest = "the rest is" if following == size else f"{count(following - position, 'byte')} are"
+                        self._warn(f"damaged at byte {position}; {rest} left out")
                 elif opcode == Opcode.CHUNK:
                     self._chunk(position, begin, self.stream.read(size - begin), cut=True)
                 if following == size:
@@ -193,12 +195,6 @@ class _Scanner:
                     self.sums = crc32(piece, self.sums)
                     left -= len(piece)
             position = end
-
-    def _damage(self, position: int, following: int) -> None:
-        self.damaged = True
-        if self._first("place"):
-            rest = "the rest is" if following == self.found.size else f"{count(following - position, 'byte')} are"
-            self._warn(f"damaged at byte {position}; {rest} left out")
 
     def _warn(self, text: str) -> None:
         self.found.warnings.append(f"{self.found.path}: {text}")

@@ -201,7 +201,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
             raise TypesysError(f"its definition is {len(text)} bytes long")
         if text.strip():
             types = _parse(type_name, encoding, _readable(encoding, text))
-        elif type_name in _jazzy().fielddefs:
+        elif type_name in _store().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
             remedy = "convert it to MCAP where its package is installed (`ros2 bag convert`)"
@@ -221,7 +221,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
 
 def jazzy_text(type_name: str) -> str:
     """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files."""
-    return str(_jazzy().generate_msgdef(type_name, ros_version=2)[0])
+    return distribution_text(type_name, "jazzy")[0]
 
 
 def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
@@ -254,12 +254,8 @@ def undefined(type_name: str, reason: str) -> Definition:
     return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)
 
 
-def _jazzy() -> Typestore:
-    return _store("JAZZY")
-
-
 @functools.cache
-def _store(distribution: str) -> Typestore:
+def _store(distribution: str = "JAZZY") -> Typestore:
     return get_typestore(Stores[f"ROS2_{distribution}"])
 
 
@@ -305,9 +301,9 @@ def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], don
     if len(above) == _DEEPEST:
         raise TypesysError(f"it nests messages more than {_DEEPEST} deep")
     if type_name not in types:
-        if type_name not in _jazzy().fielddefs:
+        if type_name not in _store().fielddefs:
             raise TypesysError(f"{type_name} is used and not defined")
-        types[type_name] = _jazzy().fielddefs[type_name]
+        types[type_name] = _store().fielddefs[type_name]
     constants, fields = types[type_name][:2]
     if not fields:
         fields = [(_NOTHING, (Nodetype.BASE, ("uint8", 0)))]
@@ -346,9 +342,7 @@ def _field_type(description: Any) -> FieldType:
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         array = what[1] if node == Nodetype.ARRAY else 0
         node, what = what[0]
-    if node == Nodetype.NAME:
-        return FieldType("message", what, array)
-    return FieldType(_KINDS[what[0]], what[0], array)
+    return FieldType("message", what, array) if node == Nodetype.NAME else FieldType(_KINDS[what[0]], what[0], array)
 
 
 def _one_line(error: Exception) -> str:

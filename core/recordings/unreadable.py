@@ -56,17 +56,14 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: this is {known}, and a recording is wanted here; are the arguments swapped?")
     text = all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512])
     kind = "a text file" if text else "no kind of file that is known"
-    return BagError(
-        f"{path}: {kind}, while a recording is wanted (MCAP, .db3, .bag, or a table called {', '.join(TABLES)}); check "
-        f"the path and its suffix"
-    )
+    wanted = f"a recording is wanted (MCAP, .db3, .bag, or a table called {', '.join(TABLES)})"
+    return BagError(f"{path}: {kind}, while {wanted}; check the path and its suffix")
 
 
 def missing(path: Path) -> BagError:
     """The error for a path that is not there; names the recordings in the same folder."""
-    there: list[Path] = []
-    if path.parent.is_dir():
-        there = sorted((p for p in path.parent.iterdir() if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
+    inside = path.parent.iterdir() if path.parent.is_dir() else ()
+    there = sorted((p for p in inside if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
     hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
     return BagError(f"{path}: there is no such file or folder{hint}")
 
@@ -101,9 +98,8 @@ def no_recording(folder: Path, inside: list[Path]) -> BagError:
     if folders:
         return BagError(f"{folder}: holds no recording itself; name the folders in it: {file_names(folders)}")
     if tables := [p for p in inside if p.suffix in TABLES]:
-        return BagError(
-            f"{folder}: a folder of tables, each of which is a recording; name them one by one: {file_names(tables)}"
-        )
+        each = f"each of which is a recording; name them one by one: {file_names(tables)}"
+        return BagError(f"{folder}: a folder of tables, {each}")
     return BagError(f"{folder}: there is no {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file in it; check the path")
 
 
@@ -155,9 +151,8 @@ def _main() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     out = os.dup(1)
     os.dup2(2, 1)  # what a library prints
-    found: Any
     try:
-        found = function(path)
+        found: Any = function(path)
     except BagError as error:
         found = error
     except MemoryError:
