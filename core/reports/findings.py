@@ -90,14 +90,9 @@ def findings(
         for verdicts in checked
     ]
     validation = readable_validation(model.validation)
-    kinds = (
-        _fit_reasons(model),
-        _regime_reasons(model, recordings),
-        _validation_reasons(model, validation),
-        _width_reasons(model, recordings),
-        _recording_reasons(model, recordings, validation),
-    )
-    reasons = sorted((reason for kind in kinds for reason in kind), key=lambda reason: WEIGHTS.index(reason[0]))
+    reasons = [*_fit_reasons(model), *_regime_reasons(model, recordings), *_validation_reasons(model, validation)]
+    reasons += [*_width_reasons(model, recordings), *_recording_reasons(model, recordings, validation)]
+    reasons.sort(key=lambda reason: WEIGHTS.index(reason[0]))
     fit = model.fit_summary
     facts: dict[str, Any] = {
         "version": __version__,
