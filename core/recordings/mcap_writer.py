@@ -19,6 +19,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import BinaryIO
 
 from uncertain_lti.base.errors import BagError
@@ -52,13 +53,12 @@ def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
         import lz4.frame  # type: ignore[import-untyped]
 
         return name, lz4.frame.compress
-    if name == "":
-        return "", bytes
-    try:
-        import zstandard
-    except ImportError:
-        return "", bytes
-    return "zstd", zstandard.ZstdCompressor(level=1).compress
+    if name != "":
+        with suppress(ImportError):
+            import zstandard
+
+            return "zstd", zstandard.ZstdCompressor(level=1).compress
+    return "", bytes
 
 
 class McapWriter:
@@ -85,8 +85,7 @@ class McapWriter:
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Number of a schema in the file, which has it or gets it."""
-        body = _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
-        return self._declare(_SCHEMA, body)
+        return self._declare(_SCHEMA, _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data)
 
     def channel(self, schema: int, topic: str, encoding: str = "cdr", metadata: Mapping[str, str] | None = None) -> int:
         """Number of a channel in the file, which has it or gets it; schema 0 is none."""

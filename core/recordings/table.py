@@ -390,37 +390,34 @@ class Table(Recording):
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
         kept = np.arange(len(times)) if rows is None else rows
         known = times[kept] != NO_TIME
-        if not known.all():
-            number = int(np.count_nonzero(~known))
-            self._warnings.append(f"{path}: {plural(number, 'row')} without a time left out")
+        if missing_time := int(np.count_nonzero(~known)):
+            self._warnings.append(f"{path}: {plural(missing_time, 'row')} without a time left out")
             kept = kept[known]
         steps = np.diff(times[kept])
         if (steps < 0).any() and (steps <= 0).all():
             kept = kept[::-1]
             self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
+        names = [name for name in raw.columns if name not in apart]
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
-            columns = {name: raw.columns[name][kept] for name in raw.columns if name not in apart}
-            number, unit = _for_each_time(times[kept], columns)
+            number, unit = _for_each_time(times[kept], {name: raw.columns[name][kept] for name in names})
+            runs = f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
             self._warnings.append(
                 f"{path}: {equal} of {len(kept)} rows have the time of a row before, and only the first of such rows "
-                f"counts: are the {number} rows of a time one for each of {number} units? then "
-                + f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
-                + "write a file for each; else write times with more decimals"
+                f"counts: are the {number} rows of a time one for each of {number} units? then {runs}write a file for "
+                f"each; else write times with more decimals"
             )
         self.times = times[kept]
-        names = [name for name in raw.columns if name not in apart]
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
-        self.columns_by_field: dict[str, Column] = {
-            field: raw.columns[name][here] for field, name in zip(once(map(field_name, names), "_"), names, strict=True)
-        }
+        fields = zip(once(map(field_name, names), "_"), names, strict=True)
+        self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
         first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
-        readable, reason = bool(self.columns_by_field), ""
-        if not readable:
+        reason = ""
+        if not names:
             reason = f"there is no column but the time, '{time}'; choose another file"
-        elif names_signals := _names_signals(self.columns_by_field):
-            readable = False
-            reason = f"column '{names_signals}' names the signal of a row's one number; write a column for each signal"
-        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), file.suffix[1:].lower(), readable, reason, first, last)}
+        elif of := _names_signals(self.columns_by_field):
+            reason = f"column '{of}' names the signal of a row's one number; write a column for each signal"
+        kind = file.suffix[1:].lower()
+        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, reason, first, last)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""
@@ -440,13 +437,9 @@ class Table(Recording):
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Rows, one after the other."""
-        if not self._require(topics):
-            return iter(())
-        names, columns = list(self.columns_by_field), list(self.columns_by_field.values())
-        return (
-            (TOPIC, int(time), SimpleNamespace(**{n: c[row] for n, c in zip(names, columns, strict=True)}))
-            for row, time in enumerate(self.times)
-        )
+        rows = enumerate(self.times if self._require(topics) else ())
+        columns = self.columns_by_field.items()
+        return ((TOPIC, int(time), SimpleNamespace(**{name: c[row] for name, c in columns})) for row, time in rows)
 
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
