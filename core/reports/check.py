@@ -41,7 +41,7 @@ from uncertain_lti.model.domain import jump_words, jumps, outside_in_words
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import back_and_restarts
+from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import Verdicts
@@ -108,13 +108,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "horizons": _horizons(model, verdicts),
         "alarm": bool(verdicts.alarm.any()),
         "alarms": [
-            {
-                **_span(transient, start, stop),
-                "raised": [
-                    {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
-                    for r in verdicts.raised(start)
-                ],
-            }
+            {**_span(transient, start, stop), "raised": [_raised(r) for r in verdicts.raised(start)]}
             for start, stop in runs(verdicts.alarm)
         ],
         "episodes": [_episode(model, verdicts, rows) for rows in islice(_episodes(verdicts), MOST_EPISODES)],
@@ -129,6 +123,10 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     if samples:
         data["verdict_per_sample"] = _per_sample(model, verdicts)
     return data
+
+
+def _raised(r: Raised) -> dict[str, Any]:
+    return {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
 
 
 def outcome(recordings: Sequence[dict[str, Any]]) -> str:

@@ -68,10 +68,8 @@ def model_blocks(model: UncertainLTI) -> list[Block]:
     s, steps, facts = model.signals, model.sampling, model.fit_summary
     blocks: list[Block] = [repr(model)]
     if s.clock:
-        blocks.append(
-            f"clock {s.clock} ({s.time.get(s.clock, '?')} time), step {number(steps.dt_median)} s "
-            f"({number(steps.dt_min)} to {number(steps.dt_max)}), max_gap {number(s.max_gap)} s"
-        )
+        step = f"step {number(steps.dt_median)} s ({number(steps.dt_min)} to {number(steps.dt_max)})"
+        blocks.append(f"clock {s.clock} ({s.time.get(s.clock, '?')} time), {step}, max_gap {number(s.max_gap)} s")
     rows = [
         [f"{kind} {x.name}", x.topic or "-", x.field, number(float(x.steady)), number(float(x.scale)), x.unit or "-"]
         for kind, group in (("state", s.states), ("control", s.controls), ("scheduling", s.scheduling))
@@ -391,11 +389,8 @@ def _size(fault: Mapping[str, Any], value: float | None) -> str:
 def tune_text(data: Mapping[str, Any]) -> str:
     """What `tune` prints: every way that was tried, and what was chosen."""
     header = ("way", "jumps seen, over those of fit", "width/range", "false alarms per hour at most")
-    rows = [
-        [t["way"], number(t["size"]), share(t["width_over_range"], 2), number(t["limit_per_hour"])]
-        for t in data["trials"]
-        if "refused" not in t
-    ]
+    tried = [t for t in data["trials"] if "refused" not in t]
+    rows = [[t["way"], number(t["size"]), share(t["width_over_range"], 2), number(t["limit_per_hour"])] for t in tried]
     refused = [f"  {t['way']}: {t['refused']}" for t in data["trials"] if "refused" in t]
     return text_of([Table(header, rows), *refused, f"chosen: {data['reason']}"])
 
