@@ -109,15 +109,10 @@ class Judged:
             all_of_them = plural(len(self.bags), "recording")
             complain(options.command, f"{len(self.refused)} of {all_of_them} not checked, as said above")
 
-    @property
-    def status(self) -> int:
-        """Exit status of what was judged so far."""
-        return ALARM if self.alarm else BAD_INPUT if self.refused else DONE
-
-    def status_of(self, recordings: Sequence[Mapping[str, Any]]) -> int:
-        """Exit status of what is known of each recording."""
-        nothing = self.status == DONE and any(r["outcome"] == "unknown" for r in recordings)
-        return UNKNOWN if nothing else self.status
+    def status(self, recordings: Sequence[Mapping[str, Any]] = ()) -> int:
+        """Exit status of what was judged so far, and of what is known of each recording."""
+        nothing = UNKNOWN if any(r["outcome"] == "unknown" for r in recordings) else DONE
+        return ALARM if self.alarm else BAD_INPUT if self.refused else nothing
 
 
 def _judged(options: argparse.Namespace) -> Judged:
@@ -155,7 +150,7 @@ def run_check(options: argparse.Namespace) -> Result:
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             messages = plural(made.messages, "message")
             options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
-    status = judged.status_of(results)
+    status = judged.status(results)
     drift = drift_in_words(model, results)
     for text in drift:
         options.say(text)
@@ -185,7 +180,7 @@ def run_report(options: argparse.Namespace) -> Result:
     if output is not None:
         write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
         options.say(f"report written to {output}")
-    return Result(judged.status_of(facts["recordings"]), {**facts, "not_checked": judged.refused})
+    return Result(judged.status(facts["recordings"]), {**facts, "not_checked": judged.refused})
 
 
 # --- plot ------------------------------------------------------------------------------------------------------------
@@ -233,7 +228,7 @@ def run_plot(options: argparse.Namespace) -> Result:
     elif model is not None:
         save(matrices_figure(model), output, 200)
     options.say(f"plot written to {output}")
-    status = DONE if judged is None else judged.status
+    status = DONE if judged is None else judged.status()
     recordings = [str(bag.path) for bag in bags]
     data = {"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status}
     return Result(status, data)
