@@ -373,13 +373,11 @@ def _advance(solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health
     found = solve_ivp(rate, (0.0, DT), x / X, method="DOP853", rtol=1e-9, atol=1e-11, first_step=DT)
     if not found.success:
         raise UncertainLTIError(f"turbofan: the step was not integrated: {found.message}")
-    end: Array = found.y[:, -1] * X
-    return end
+    return np.asarray(found.y[:, -1] * X)
 
 
 def _rounded(x: Array, X: Array) -> Array:
-    step: Array = np.round(x / X / RESOLUTION) * RESOLUTION * X
-    return step
+    return np.asarray(np.round(x / X / RESOLUTION) * RESOLUTION * X)
 
 
 def make_run(
