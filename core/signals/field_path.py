@@ -257,9 +257,7 @@ class FieldPath:
     def read(self, message: Any) -> float:
         """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero."""
         value, lacking = self._look_up(message)
-        if lacking:
-            return math.nan
-        return self.function.of(value) if self.function else as_number(value)
+        return math.nan if lacking else self.function.of(value) if self.function else as_number(value)
 
     def absent(self, message: Any) -> str:
         """What this path looks up and the message has not, in words, with what is there; empty where it has."""

@@ -435,11 +435,8 @@ class SignalMap:
                 at = "" if s.at == "departure" else s.at
                 rows.append([named(s.name, s.unit), kind, s.topic, s.field, *point, hold, str(s.delay or ""), at])
         header = ("signal", "", "topic", "field", "steady", "scale", "max_hold", "delay", "at")
-        below = [
-            f"{name}: {value}"
-            for name in ("clock", "max_gap", "min_step", "max_skew", "step", "additive")
-            if (value := getattr(self, name)) not in (None, 0.0, "recorded")
-        ]
+        said = {name: getattr(self, name) for name in ("clock", "max_gap", "min_step", "max_skew", "step", "additive")}
+        below = [f"{name}: {value}" for name, value in said.items() if value not in (None, 0.0, "recorded")]
         return html_table(f"signals ({self.source})", header, rows, below)
 
     @classmethod
