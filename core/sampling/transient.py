@@ -325,10 +325,8 @@ class Transient:
         with np.errstate(over="ignore", invalid="ignore"):
             if math.isfinite(sum(float(a.sum()) for a in (self.x, self.u, self.s))):  # the usual case, in less time
                 return np.asarray(same)
-        finite_x = np.asarray(np.isfinite(self.x).all(axis=1))
-        finite_u = np.asarray(np.isfinite(self.u).all(axis=1)) & np.isfinite(self.s).all(axis=1)
-        usable: NDArray[np.bool_] = same & finite_x[:-1] & finite_u[:-1] & finite_x[1:]
-        return usable
+        finite_x, finite_u, finite_s = (np.asarray(np.isfinite(z).all(axis=1)) for z in (self.x, self.u, self.s))
+        return np.asarray(same & finite_x[:-1] & finite_u[:-1] & finite_s[:-1] & finite_x[1:])
 
     def transitions(self) -> Transitions:
         """The usable transitions, as arrays in recorded units.
