@@ -45,7 +45,7 @@ from uncertain_lti.recordings.mcap_records import (
 )
 from uncertain_lti.recordings.mcap_scan import outline, scan
 from uncertain_lti.recordings.message_types import Definition, define, distribution_text, ros2_text
-from uncertain_lti.recordings.unreadable import SUFFIXES, aside, file_names, no_recording, one_line, os_error
+from uncertain_lti.recordings.unreadable import SUFFIXES, aside, changed, file_names, no_recording, one_line, os_error
 from uncertain_lti.signals.field_path import full_name
 from uncertain_lti.signals.values import compose, construct
 
@@ -94,9 +94,7 @@ class Foreign(Contents):
                         message = convert[number](bytes(data)) if convert else data
                         pieces.append(message_record(number, len(pieces), time, time, message))
         except Exception as error:  # a library raises whatever the bytes lead it to
-            raise BagError(
-                f"{self.path}: the file changed while it was read ({one_line(error)}); read it again when it is written"
-            ) from None
+            raise changed(self.path, f" ({one_line(error)})") from None
         return b"".join(pieces)
 
     def _definition(self, number: int) -> Definition:
@@ -151,9 +149,8 @@ def _scan(path: Path) -> Foreign:
                 of = f"{found.count} of {count(stated, 'message')} before that count"
                 found.warnings.append(found.damaged(f"is cut or damaged ({trouble}); {of}"))
             elif stated != found.count or any(
-                info.msgcount != (found.tally[number].count if number in found.tally else 0)
+                info.msgcount != (tally.count if (tally := found.tally.get(found.numbers[info.id])) else 0)
                 for info in reader.connections
-                for number in [found.numbers[info.id]]
             ):
                 of = f"{found.count} could be read, each with its topic and a log time"
                 found.warnings.append(found.damaged(f"its index counts {count(stated, 'message')}, and {of}"))
@@ -199,8 +196,7 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
             lists = f"its index lists {len(reader.chunks)}"
             found.warnings.append(found.damaged(f"holds {count(chunks, 'chunk')}, and {lists}"))
         stated = sum(sum(info.connection_counts.values()) for info in reader.chunk_infos)
-    schemas: dict[tuple[str, str], int] = {}
-    borrowed = ""
+    schemas, borrowed = dict[tuple[str, str], int](), ""
     for number, connection in enumerate(reader.connections, start=1):
         kind, text = connection.msgtype, connection.msgdef.data
         if (schema := schemas.get((kind, text), 0)) == 0:
@@ -217,9 +213,8 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
         stored = encodings.get(connection.id) or "cdr"
         found.channels[number] = Channel(number, connection.topic, stored, metadata, schema)
     if borrowed:
-        found.warnings.append(
-            f"{found.path}: the file does not hold the definitions of all its types; those of {borrowed} are used"
-        )
+        lacks = "the file does not hold the definitions of all its types"
+        found.warnings.append(f"{found.path}: {lacks}; those of {borrowed} are used")
     return int(stated)
 
 
@@ -281,8 +276,7 @@ def listed_parts(folder: Path) -> list[Path]:
     if not isinstance(names, list):
         return []
     # Old recorders wrote the path from the folder above.
-    parts = [folder / str(name) for name in names]
-    parts = [part if part.exists() else folder / PurePosixPath(part).name for part in parts]
+    parts = [part if (part := folder / str(n)).exists() else folder / PurePosixPath(str(n)).name for n in names]
     storage = str(about.get("storage_identifier") or "")  # `ros2 bag reindex` may leave it empty
     if storage not in ("", "mcap", "sqlite3"):
         raise BagError(f"{folder}: a recording in '{storage}' storage; convert it to MCAP with ros2 bag convert")

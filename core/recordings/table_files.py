@@ -337,7 +337,7 @@ def _nanoseconds(path: Path, name: str, values: Column) -> Column:
 def _read_mat(path: Path) -> RawTable:
     with open(path, "rb") as stream:
         head = stream.read(128)
-    if head.startswith(b"MATLAB 7.3") or head.startswith(b"\x89HDF"):
+    if head.startswith((b"MATLAB 7.3", b"\x89HDF")):
         raise BagError(f"{path}: a .mat file of version 7.3; write it again with save('{path.name}', '-v7')")
     try:
         from scipy.io import loadmat

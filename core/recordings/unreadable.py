@@ -77,9 +77,9 @@ def os_error(path: Path, error: OSError) -> BagError:
     return BagError(f"{path}: cannot be read ({error.strerror or error}); check the disk or copy it again")
 
 
-def changed(path: Path) -> BagError:
+def changed(path: Path, how: str = "") -> BagError:
     """The error for a file that is not what it was when it was opened."""
-    return BagError(f"{path}: the file changed while it was read; read it again when it is written")
+    return BagError(f"{path}: the file changed while it was read{how}; read it again when it is written")
 
 
 def _compressed(path: Path) -> BagError:
