@@ -234,9 +234,9 @@ def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | Non
         return
     else:
         inside, whole, parts = (validation[key] for key in ("inside", "parts_inside", "parts"))
-        weight = NO if inside < TOO_FEW_INSIDE else CARE if inside < CAUTION_INSIDE else YES
-        if 2 * whole < parts and weight == YES:
-            weight = CARE  # few violations, and yet nearly every run has some: an alarm on one would be a habit
+        # few violations, and yet nearly every run may have some: an alarm on one would be a habit
+        good = inside >= CAUTION_INSIDE and 2 * whole >= parts
+        weight = NO if inside < TOO_FEW_INSIDE else YES if good else CARE
         what, but = "recordings", ""
         if validation["kind"] != "transients":
             what, but = "blocks", "; they are of the same run, so another day may differ"
