@@ -133,7 +133,12 @@ def run_start(options: argparse.Namespace) -> Result:
     if report.data is None:  # no recording could be checked, which is said
         return report
     options.say(findings_text(report.data))
-    then = _on_the_robot(model)
+    then = (
+        "on the robot, with this program installed there (docs/howto/deploy.md):\n"
+        f"  scp {shlex.quote(model)} ROBOT:\n"
+        f"  envelope_monitor --ros-args -p model:={shlex.quote(os.path.basename(model))}\n"
+        "  ros2 topic echo /envelope_monitor/violation"
+    )
     if report.data["rely"]["answer"] == NO:
         then = f"not on the robot yet: mend what is said above, in {signals} or by recording, and start with --force"
     options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{then}")
@@ -145,16 +150,6 @@ def _part(options: argparse.Namespace, words: list[str]) -> Result:
     command = options.build_parser(words[0]).parse_args([*words, "--json"])
     command.progress, command.say, command.say_losses = options.progress, lambda text: None, options.say
     return command.run(command)  # type: ignore[no-any-return]
-
-
-def _on_the_robot(model: str) -> str:
-    file = os.path.basename(model)
-    return (
-        "on the robot, with this program installed there (docs/howto/deploy.md):\n"
-        f"  scp {shlex.quote(model)} ROBOT:\n"
-        f"  envelope_monitor --ros-args -p model:={shlex.quote(file)}\n"
-        "  ros2 topic echo /envelope_monitor/violation"
-    )
 
 
 TOPICS = Command(
