@@ -37,4 +37,4 @@ def read_stream_by_message(bag: Recording, signals: SignalMap) -> Stream:
         values[where].extend([path.read(message) for path in paths[where]])
     arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
     refuse_absent(bag, signals, paths, arrays)
-    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
+    return Stream(np.array(order), np.array(arrival), np.array(stamp), arrays, bag=bag)

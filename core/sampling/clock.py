@@ -100,8 +100,8 @@ def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) 
 
     `instants` (messages,): of each recording, ns.
     """
-    pooled = _pooled(instants, min_step_ns)
-    return int(np.median(pooled)) if pooled.size else None
+    steps = _pooled(instants, min_step_ns)
+    return int(np.median(steps)) if steps.size else None
 
 
 def longest_step(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0, recalls: bool = False) -> float:
@@ -126,8 +126,7 @@ def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.
     forward = steps[steps > 0]
     if (forward >= min_step_ns).all():
         return forward
-    longer = []
-    last = int(instants[0])
+    longer, last = [], int(instants[0])
     for instant in instants.tolist()[1:]:
         if instant - last >= min_step_ns:
             longer.append(instant - last)

@@ -20,7 +20,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ from uncertain_lti.base.arrays import core_count
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.recordings.recording import Progress, Recording
+from uncertain_lti.recordings.recording import Columns, Progress, Recording
 from uncertain_lti.sampling.clock import INVALID, LATE, TOO_OLD, Status, resolve
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.steady_state import resolve_auto
@@ -40,19 +40,13 @@ from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
 
 
 @dataclass
-class Stream:
-    """The wanted field values of one recording in order of arrival.
+class Stream(Columns):
+    """The wanted field values of one recording in order of arrival; a topic's values in the order of `signals.on`.
 
-    `bag`: the recording; `topic` (messages,): positions in `signals.topics`; `arrival` (messages,): log time, ns;
-    `stamp` (messages,): header stamp, ns; -1 for no stamp; `values` (messages of the topic, signals on it): one array
-    per topic, in the order of `signals.on(topic)`.
+    `bag`: the recording.
     """
 
-    bag: Recording
-    topic: NDArray[np.int64]
-    arrival: NDArray[np.int64]
-    stamp: NDArray[np.int64]
-    values: list[NDArray[np.float64]]
+    bag: Recording = field(kw_only=True)
 
 
 def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
@@ -60,7 +54,7 @@ def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = 
     paths = check_paths(bag, signals)
     columns = bag.columns(signals.topics, paths, progress)
     refuse_absent(bag, signals, paths, columns.values)
-    return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
+    return Stream(**vars(columns), bag=bag)
 
 
 def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
@@ -311,21 +305,20 @@ def read_as_fitted_with_decisions(
 
 
 def read_field(
-    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, field: FieldPath
+    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, path: FieldPath
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """A field of any topic, and after which samples of the same recording its values came.
 
     Returns (K,): samples that were decided before each message came; Returns (K,): the values; NaN where a message has
     no such number.
     """
-    if topic not in recording.topics:
-        raise BagError(no_topic(recording, topic))
-    field.check(topic, recording.topics[topic].type, recording.type_fields(topic))
+    require(recording, topic)
+    path.check(topic, recording.topics[topic].type, recording.type_fields(topic))
     clock = signals.clock or ""
     of_clock = [FieldPath(signals.signals[i].field) for i in signals.on(clock)]
-    topics, paths = ([topic], [[field]]) if clock == topic else ([topic, clock], [[field], of_clock])
+    topics, paths = ([topic], [[path]]) if clock == topic else ([topic, clock], [[path], of_clock])
     columns = recording.columns(topics, paths)
-    _refuse_absent(recording, topic, field, columns.values[0][:, 0])
+    _refuse_absent(recording, topic, path, columns.values[0][:, 0])
     of_field = columns.topic == 0
     if clock == topic:  # clock messages before it; it goes with its own
         own, its = recording.columns([clock], [of_clock]).arrival, columns.arrival
@@ -342,15 +335,16 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
     except UncarriedTopicError as error:
         for bag in group_recordings(list(recordings), indexed=True):
             for topic in error.topics:
-                if topic not in bag.topics:
-                    raise BagError(no_topic(bag, topic)) from None
+                require(bag, topic)
         raise
 
 
-def no_topic(bag: Recording, topic: str) -> str:
-    """The sentence for a topic that a recording lacks, with the nearest names and all of them."""
-    there = shortlist(sorted(bag.topics), 50) or "none"
-    return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
+def require(bag: Recording, topic: str) -> None:
+    """Refuse a topic that a recording lacks, with the nearest names and all of them."""
+    if topic not in bag.topics:
+        there = shortlist(sorted(bag.topics), 50) or "none"
+        none = f"there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
+        raise BagError(f"{bag.path}: {none}") from None
 
 
 def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
@@ -358,8 +352,7 @@ def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]
     types: dict[str, str] = {}
     for bag in bags:
         for topic in signals.topics:
-            if topic not in bag.topics:
-                raise BagError(no_topic(bag, topic))
+            require(bag, topic)
             found = bag.topics[topic].type
             if types.setdefault(topic, found) != found:
                 other = f"{types[topic]} in {bags[0].path}"
@@ -436,22 +429,22 @@ def read_streams(
 
 def _stream(bag: Recording, future: Future[tuple[Any, ...]]) -> Stream:
     try:
-        walked, undecoded, *columns = future.result()
+        walked, undecoded, columns = future.result()
     except BrokenProcessPool:
         ended = "the process that read it was ended, perhaps for want of memory"
         raise BagError(f"{bag.path}: {ended}; read fewer recordings at once, or fit with --cache") from None
     if walked:
         bag.walk()
     bag.restore_notes(bag.reading_notes[0], undecoded)
-    return Stream(bag, *columns)
+    return Stream(**columns, bag=bag)
 
 
 def _read(bag: Recording, signals: SignalMap) -> tuple[Any, ...]:
     """In a process of its own: whether the index did not hold, messages left out by topic, and the columns."""
     indexed = bag.indexed
-    stream = read_stream(bag, signals)
-    walked = indexed and not bag.indexed
-    return walked, bag.reading_notes[1], stream.topic, stream.arrival, stream.stamp, stream.values
+    columns = vars(read_stream(bag, signals))
+    del columns["bag"]  # which the other process has
+    return indexed and not bag.indexed, bag.reading_notes[1], columns
 
 
 @contextmanager
