@@ -193,10 +193,8 @@ class Controller:
         u[0] += min(max(limited - u[0], -self.FUEL_RATE * dt), self.FUEL_RATE * dt)
         if u[0] != wanted:  # the integral does not run on while something else holds the fuel
             self._correction -= self.INTEGRAL * dt * error
-        targets = (nozzle_area(pla), *vanes(float(x[0]), float(x[1])))
-        rates = (self.AREA_RATE, self.VANE_RATE, self.VANE_RATE)
-        for j, (target, rate) in enumerate(zip(targets, rates, strict=True), start=1):
-            u[j] += min(max(target - u[j], -rate * dt), rate * dt)
+        most = dt * np.array([self.AREA_RATE, self.VANE_RATE, self.VANE_RATE])
+        u[1:] += np.clip(np.array([nozzle_area(pla), *vanes(float(x[0]), float(x[1]))]) - u[1:], -most, most)
         self._command = u
         return u.copy()
 
