@@ -69,9 +69,9 @@ class FieldReader:
                 message = self.definition.decode(bytes(data[begin[row] : end[row]]))
             except BagError as error:
                 failures.append((row, str(error)))
-                continue
-            values[row] = [path.read(message) for path in self.paths]
-            stamps[row] = header_stamp_ns(message) or NO_STAMP
+            else:
+                values[row] = [path.read(message) for path in self.paths]
+                stamps[row] = header_stamp_ns(message) or NO_STAMP
         return failures
 
 
