@@ -27,8 +27,7 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import YEARS as _YEARS
-from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
+from uncertain_lti.recordings.table_files import YEARS, Column, RawTable, once, read_table
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import UNITS, TableLayout
@@ -245,18 +244,15 @@ def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[
     if not known.any():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     sizes = np.abs(np.where(known, values, 0.0)) * factor
-    if np.median(sizes[known]) <= LATEST:  # the unit is right, and a row beyond is damaged
-        known &= sizes <= LATEST
-    largest = float(sizes[known].max())
-    if largest > LATEST:
+    if np.median(sizes[known]) > LATEST:
         raise _too_late(where)
+    known &= sizes <= LATEST  # the unit is right, and a row beyond is damaged
+    largest = float(sizes[known].max())
     times = np.full(len(values), NO_TIME, dtype=np.int64)
-    if largest > _LARGE and table.exact is not None:
-        cells = table.exact(name)
-        if len(cells) == len(values):
-            times[known] = [_exactly(cells[i], factor, float(values[i])) for i in np.flatnonzero(known).tolist()]
-            return times
     times[known] = np.rint(values[known] * factor).astype(np.int64)
+    cells = table.exact(name) if largest > _LARGE and table.exact is not None else ()
+    if len(cells) == len(values):
+        times[known] = [_exactly(cells[i], factor, float(values[i])) for i in np.flatnonzero(known).tolist()]
     return times
 
 
@@ -296,8 +292,8 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
 def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> int:
     """One instant, ns."""
     text = f"{day}T{(clock or '00:00').replace(',', '.')}"
-    if not _YEARS[0] <= int(day[:4]) <= _YEARS[1]:
-        raise BagError(f"{where}: '{text[:40]}' is before {_YEARS[0]} or after {_YEARS[1]}; mend it")
+    if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
+        raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
     try:
         instant = int(np.datetime64(text, "ns").astype(np.int64))
     except ValueError:
