@@ -323,10 +323,9 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     if (outside := data["outside_domain_share"]) > _vouched(model):
         ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
         why = "; ".join(filter(None, [data["beyond"], *data["unknown"]]))
-        return (
-            f"{outside:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; {ask}"
-            f"fit recordings that reach as far{': ' * bool(why)}{why}"
-        )
+        beyond_fit = f"{outside:.2%} of the verdicts are outside the fitted domain"
+        remedy = f"{ask}fit recordings that reach as far{': ' * bool(why)}{why}"
+        return f"{beyond_fit}, where nothing vouches for the bounds; {remedy}"
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, dict) and alarm.get("worth") == "none":
         return f"the model is {alarm['headline']}"
@@ -334,10 +333,9 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
         return "nothing that is judged moves in it"
     alarmed = verdicts.alarm[verdicts.judged]
     if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
-        return (
-            f"the alarm is up for {alarmed.mean():.0%} of it, from early on: the fault was there before, or this is "
-            f"another machine, in other units, or run as in no recording of the fit"
-        )
+        other = "this is another machine, in other units, or run as in no recording of the fit"
+        up = f"the alarm is up for {alarmed.mean():.0%} of it, from early on"
+        return f"{up}: the fault was there before, or {other}"
     return ""
 
 
@@ -434,18 +432,14 @@ def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
             if len(far):
                 reached = " to ".join(dict.fromkeys(numbers([far.min(), far.max()])))
                 ends = " to ".join(numbers([axis.knots[0], axis.knots[-1]]))
-                found.append(
-                    f"{axis.signal} is beyond its knots, {ends}{unit}, in {plural(len(far), 'verdict')} ({reached})"
-                )
+                often = f"in {plural(len(far), 'verdict')} ({reached})"
+                found.append(f"{axis.signal} is beyond its knots, {ends}{unit}, {often}")
             continue
         there = values[verdicts.unlisted_mode]
-        odd = there[~np.isin(there, axis.modes)]
-        if len(odd):
+        if len(odd := there[~np.isin(there, axis.modes)]):
             listed, strange = shortlist(numbers(axis.modes), 6), shortlist(numbers(np.unique(odd)), 6)
-            found.append(
-                f"the model lists {axis.signal} = {listed}{unit}, and {plural(len(odd), 'sample')} with {strange} "
-                f"{'has' if len(odd) == 1 else 'have'} no verdict"
-            )
+            other = f"{plural(len(odd), 'sample')} with {strange} {'has' if len(odd) == 1 else 'have'} no verdict"
+            found.append(f"the model lists {axis.signal} = {listed}{unit}, and {other}")
     places, weights = model.schedule.corners(s[:, verdicts.unknown_regime])
     counts = [int(((places == r) & (weights > 0)).any(axis=0).sum()) for r in range(model.schedule.blocks)]
     there = [(r, count) for r, count in enumerate(counts) if count and not model.block_data[r].known]
