@@ -28,9 +28,9 @@ from uncertain_lti.cli.command import (
     PUBLISHED,
     RECORDINGS,
     UNKNOWN,
-    Command,
     Result,
     complain,
+    declared,
     helped,
     load_model,
 )
@@ -126,7 +126,15 @@ def _judged(options: argparse.Namespace) -> Judged:
 # --- check -----------------------------------------------------------------------------------------------------------
 
 
-def run_check(options: argparse.Namespace) -> Result:
+_SLOW = "say what took how long"
+
+
+@declared(
+    "check a recording against a model",
+    *(PUBLISHED, "bags", *DEPLOYED, helped("--json", "print JSON with a verdict per sample"), "--write"),
+    verbose=_SLOW,
+)
+def check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.monitor.deployed import drift_in_words
     from uncertain_lti.reports.check import check_data, check_text, outcome
@@ -163,7 +171,16 @@ def run_check(options: argparse.Namespace) -> Result:
 # --- report ----------------------------------------------------------------------------------------------------------
 
 
-def run_report(options: argparse.Namespace) -> Result:
+@declared(
+    "write a page that says whether a model may be relied on, and what happened in recordings",
+    PUBLISHED,
+    helped("bags", f"{RECORDINGS} to check against it"),
+    *DEPLOYED,
+    helped("--output", "page to write (default: report.html; with --json none)", metavar="FILE.html"),
+    helped("--json", "print the same facts as JSON"),
+    verbose=_SLOW,
+)
+def report(options: argparse.Namespace) -> Result:
     """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.reports.findings import findings, findings_text
     from uncertain_lti.reports.pages import html_report, page_target, write_page
@@ -186,7 +203,20 @@ def run_report(options: argparse.Namespace) -> Result:
 # --- plot ------------------------------------------------------------------------------------------------------------
 
 
-def run_plot(options: argparse.Namespace) -> Result:
+_WHAT = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
+_IMAGE = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
+
+
+@declared(
+    "draw a model, recordings, or what happened in recordings by a model",
+    helped("bags", f"{_WHAT}(what happened, and when)", metavar="WHAT"),
+    helped("--signals", "signals file: draw its signals, not every number that moves", required=False),
+    helped("--output", f"{_IMAGE}plot.png)", metavar="FILE"),
+    *DEPLOYED,
+    helped("--json", "print the path, and whether the alarm was raised, as JSON"),
+    verbose=_SLOW,
+)
+def plot(options: argparse.Namespace) -> Result:
     """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.charts import base_name
@@ -264,40 +294,3 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
         note = "Every number that moves, over the time of arrival." + f" Left out: {shortlist(left, 8)}." * bool(left)
         plotted.append(plotted_fields(str(bag.path), fields, note, len(bags)))
     return plotted
-
-
-CHECK = Command(
-    "check",
-    "check a recording against a model",
-    (PUBLISHED, "bags", *DEPLOYED, helped("--json", "print JSON with a verdict per sample"), "--write"),
-    run_check,
-    verbose="say what took how long",
-)
-REPORT = Command(
-    "report",
-    "write a page that says whether a model may be relied on, and what happened in recordings",
-    (
-        PUBLISHED,
-        helped("bags", f"{RECORDINGS} to check against it"),
-        *DEPLOYED,
-        helped("--output", "page to write (default: report.html; with --json none)", metavar="FILE.html"),
-        helped("--json", "print the same facts as JSON"),
-    ),
-    run_report,
-    verbose=CHECK.verbose,
-)
-_WHAT = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
-_IMAGE = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
-PLOT = Command(
-    "plot",
-    "draw a model, recordings, or what happened in recordings by a model",
-    (
-        helped("bags", f"{_WHAT}(what happened, and when)", metavar="WHAT"),
-        helped("--signals", "signals file: draw its signals, not every number that moves", required=False),
-        helped("--output", f"{_IMAGE}plot.png)", metavar="FILE"),
-        *DEPLOYED,
-        helped("--json", "print the path, and whether the alarm was raised, as JSON"),
-    ),
-    run_plot,
-    verbose=CHECK.verbose,
-)

@@ -35,6 +35,7 @@ from uncertain_lti.cli.command import (
     Command,
     Result,
     complain,
+    declared,
     drop_output,
     helped,
     load_model,
@@ -42,7 +43,13 @@ from uncertain_lti.cli.command import (
 )
 
 
-def run_info(options: argparse.Namespace) -> Result:
+@declared(
+    "show what is in a model file",
+    PUBLISHED,
+    helped("--json", "print the file as JSON; of a scheduled model with `regimes`, what each rests on"),
+    quiet="",
+)
+def info(options: argparse.Namespace) -> Result:
     """Print the model."""
     from uncertain_lti.base.text import finite_data
     from uncertain_lti.model.interchange import block_facts
@@ -59,7 +66,12 @@ def run_info(options: argparse.Namespace) -> Result:
         raise ModelError(f"{options.model}: {odd}; fit it again, or print it with --json") from None
 
 
-def run_layout(options: argparse.Namespace) -> Result:
+@declared(
+    "write layouts of viewers for what a model's monitor publishes",
+    *(PUBLISHED, "--foxglove", "--plotjuggler", "--topics", helped("--json", "print the paths as JSON")),
+    quiet="",
+)
+def layout(options: argparse.Namespace) -> Result:
     """Write the layouts that are asked for."""
     from uncertain_lti.reports.layouts import write_layouts
 
@@ -68,7 +80,13 @@ def run_layout(options: argparse.Namespace) -> Result:
     return Result(data=data, text="\n".join(f"layout written to {path}" for path in written))
 
 
-def run_reproduce(options: argparse.Namespace) -> Result:
+@declared(
+    "run the paper's experiment on the nonlinear turbofan",
+    helped("--output", "for figures, models and numbers", default="reproduce-output", metavar="FOLDER"),
+    helped("--json", "print the numbers as JSON"),
+    quiet="print errors only; everything is in the folder",
+)
+def reproduce(options: argparse.Namespace) -> Result:
     """Run the experiment into a folder."""
     from uncertain_lti.plants.reproduce import reproduce
 
@@ -80,7 +98,8 @@ def run_reproduce(options: argparse.Namespace) -> Result:
     return Result(data={"output": options.output, **data})
 
 
-def run_completion(options: argparse.Namespace) -> Result:
+@declared("print what bash or zsh needs to complete commands, options and files", "shell", quiet="")
+def completion(options: argparse.Namespace) -> Result:
     """Print the script of a shell."""
     import shtab  # type: ignore[import-not-found, import-untyped, unused-ignore]
 
@@ -96,30 +115,6 @@ def run_completion(options: argparse.Namespace) -> Result:
     return Result(text=shtab.complete(parser, shell=options.shell))
 
 
-INFO = Command(
-    "info",
-    "show what is in a model file",
-    (PUBLISHED, helped("--json", "print the file as JSON; of a scheduled model with `regimes`, what each rests on")),
-    run_info,
-    quiet="",
-)
-LAYOUT = Command(
-    "layout",
-    "write layouts of viewers for what a model's monitor publishes",
-    (PUBLISHED, "--foxglove", "--plotjuggler", "--topics", helped("--json", "print the paths as JSON")),
-    run_layout,
-    quiet="",
-)
-_FOLDER = {"default": "reproduce-output", "metavar": "FOLDER"}
-REPRODUCE = Command(
-    "reproduce",
-    "run the paper's experiment on the nonlinear turbofan",
-    (helped("--output", "for figures, models and numbers", **_FOLDER), helped("--json", "print the numbers as JSON")),
-    run_reproduce,
-    quiet="print errors only; everything is in the folder",
-)
-_COMPLETION = "print what bash or zsh needs to complete commands, options and files"
-COMPLETION = Command("completion", _COMPLETION, ("shell",), run_completion, quiet="")
 PLAY = Command("play", "publish a recording through rclpy", of_ros="player")
 RECORD = Command("record", "record topics through rclpy", of_ros="recorder")
 WATCH = Command("watch", "show on a page of this machine what a running monitor says", of_ros="watch")
@@ -127,8 +122,8 @@ _DEMO = "fit shipped recordings of a turbofan and watch another, in which a faul
 DEMO = Command("demo", _DEMO, of_ros="demo")
 
 COMMANDS: tuple[Command, ...] = (
-    start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, LAYOUT,
-    fit.VALIDATE, fit.SIGNATURE, INFO, REPRODUCE, PLAY, RECORD, WATCH, DEMO, COMPLETION,
+    start.start, start.topics, start.init, fit.fit, fit.tune, judge.check, judge.report, judge.plot, layout,
+    fit.validate, fit.signature, info, reproduce, PLAY, RECORD, WATCH, DEMO, completion,
 )  # fmt: skip
 """Every command, in the order of the help."""
 
