@@ -31,9 +31,10 @@ def read_stream_by_message(bag: Recording, signals: SignalMap) -> Stream:
         if all(path.absent(message).startswith("there is no '") for path in paths[where]):
             continue  # of another publisher
         order.append(where)
-        arrival.append(in_reach(bag.path, log_time))
+        in_reach(bag.path, log_time)
+        arrival.append(log_time)
         stamp.append(header_stamp_ns(message) or -1)
         values[where].extend([path.read(message) for path in paths[where]])
     arrays = [np.array(v).reshape(-1, len(p)) for v, p in zip(values, paths, strict=True)]
     refuse_absent(bag, signals, paths, arrays)
-    return Stream(bag, np.array(order), np.array(arrival), np.array(stamp), arrays)
+    return Stream(np.array(order), np.array(arrival), np.array(stamp), arrays, bag=bag)

@@ -416,17 +416,25 @@ def test_an_unclosed_quote_is_a_sentence_with_its_line(tmp_path):
 
 def test_rows_without_a_run_are_counted(tmp_path):
     path = write(tmp_path / "a.csv", "time,x,run", "0,1,a", "1,2,", "2,3,", "3,4,b")
-    tables = Table.every_run(path, TableLayout(runs="run"))
+    tables = group_recordings([path], layout=TableLayout(runs="run"))
     assert [t.path.name for t in tables] == ["a.csv[a]", "a.csv[b]"]
     assert any("2 rows without a run left out" in w for t in tables for w in t.warnings)
 
 
 def test_runs_stay_apart(tmp_path):
     path = write(tmp_path / "a.csv", "time,x,run", "0,1,a[1]", "1,2,a(1)")
-    refuses(BagError, r"runs 'a\(1\)' and 'a\(1\)'|would have one name", Table.every_run, path, TableLayout(runs="run"))
+    refuses(
+        BagError,
+        r"runs 'a\(1\)' and 'a\(1\)'|would have one name",
+        group_recordings,
+        [path],
+        layout=TableLayout(runs="run"),
+    )
     long = [12345678901234567 + i for i in (0, 0, 1, 1)]
     path = write(tmp_path / "b.csv", "time,x,run", *(f"{i},{i},{run}" for i, run in enumerate(long)))
-    assert [t.path.name for t in Table.every_run(path, TableLayout(runs="run"))] == [f"b.csv[{r}]" for r in long[::2]]
+    assert [t.path.name for t in group_recordings([path], layout=TableLayout(runs="run"))] == [
+        f"b.csv[{r}]" for r in long[::2]
+    ]
 
 
 @pytest.mark.parametrize("odd", ["\x0c", "\x0b", "\x85", "\u2028"])

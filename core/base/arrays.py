@@ -55,9 +55,7 @@ def core_count() -> int:
 
 def on_cores(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]], worth_threads: bool = True) -> list[T]:
     """function(*arguments) for each, in their order, by threads where what each does takes longer than to begin one."""
-    if not worth_threads:
-        return [function(*some) for some in arguments]
-    return list(one_by_one(function, arguments))
+    return list(one_by_one(function, arguments) if worth_threads else (function(*some) for some in arguments))
 
 
 @contextmanager

@@ -68,12 +68,6 @@ _EXTRAS = {
 """What brings which packages: an extra of setup.py, or every installation."""
 
 
-def _made_by_run() -> bool:
-    """Whether this is the environment that ./run makes for the programs alone."""
-    made_for = Path(sys.prefix, "made-for")
-    return made_for.is_file() and made_for.read_text() == "use\n"
-
-
 def absent(package: str | None) -> str:
     """That a package is not installed, and the remedy; empty where it is none of ours."""
     first = (package or "").partition(".")[0]
@@ -81,7 +75,8 @@ def absent(package: str | None) -> str:
         if first in packages.split():
             ros = "source a ROS 2 Jazzy installation, or " * (extra == "ros")
             what = "pip install " + (f"'.[{extra}]'" if extra else "., or rosdep with its folder rosdep")
-            if _made_by_run():
+            made_for = Path(sys.prefix, "made-for")  # by ./run, for the programs alone
+            if made_for.is_file() and made_for.read_text() == "use\n":
                 what = "./run setup --all"
             return f"the Python package {first} is not installed; {ros}in the checkout: {what}"
     return ""

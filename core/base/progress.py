@@ -93,15 +93,14 @@ class Progress:
         def wrap(items: Iterable[object], total: int) -> Iterator[object]:
             began = time.perf_counter()
             if self.shown:
-                with self._bar(
-                    iterable=items, desc=what, total=total, unit=f" {unit}", unit_scale=True, delay=_DELAY
-                ) as bar:
+                drawn = {"desc": what, "total": total, "unit": f" {unit}", "unit_scale": True, "delay": _DELAY}
+                with self._bar(iterable=items, **drawn) as bar:
                     yield from bar
             else:
-                log = _Log(self, what)
+                log = self._log(what)
                 for number, item in enumerate(items):
                     if number % 1024 == 0 or total < 1024:
-                        log.write(f"{number} of {total} {unit}", number, total)
+                        log(f"{number} of {total} {unit}", number, total)
                     yield item
             self.detail(f"{what}: {total} {unit} in {time.perf_counter() - began:.2f} s")
 
@@ -111,7 +110,7 @@ class Progress:
     def stage(self, what: str) -> Iterator[Callable[[str], None]]:
         """Yields a callable for one line of text per step; a `CountedStep` moves the bar there."""
         began = drawn = time.perf_counter()
-        log = _Log(self, what)
+        log = self._log(what)
         with ExitStack() as stack:
             bar: Any = None
 
@@ -121,7 +120,7 @@ class Progress:
                 now = time.perf_counter()
                 if not self.shown:
                     done, total = (text.number - 1, text.total) if isinstance(text, CountedStep) else (0, 0)
-                    log.write(text, done, total)
+                    log(text, done, total)
                     return
                 if now - began < _DELAY or (bar is not None and now - drawn < _REDRAW):
                     return
@@ -137,6 +136,23 @@ class Progress:
 
             yield step
         self.detail(f"{what}: done in {time.perf_counter() - began:.2f} s")
+
+    def _log(self, what: str) -> Callable[[str, int, int], None]:
+        """Lines on a long part of the work where no terminal is: what is about to be done, and the time left."""
+        began = time.perf_counter()
+        following = began + _FIRST_LINE
+
+        def log(text: str, done: int, total: int) -> None:
+            nonlocal following
+            now = time.perf_counter()
+            if now < following or self.quiet or self.verbose:  # who sees every line anyway
+                return
+            following = now + _LINE
+            if done and " left" not in text:
+                text += f", about {(now - began) / done * (total - done):.0f} s left"
+            self.write(f"{what}: {printable(text)}")
+
+        return log
 
     @contextmanager
     def _bar(self, **options: Any) -> Iterator[Any]:
@@ -172,25 +188,6 @@ class Progress:
             tqdm.write(text, file=stream)
         else:
             print(text, file=stream)
-
-
-class _Log:
-    """Lines on a long part of the work where no terminal is."""
-
-    def __init__(self, progress: Progress, what: str) -> None:
-        self._progress, self._what = progress, what
-        self._began = time.perf_counter()
-        self._next = self._began + _FIRST_LINE
-
-    def write(self, text: str, done: int, total: int) -> None:
-        """A line on what is about to be done, with the time left if so many of all are done, unless one was just."""
-        now = time.perf_counter()
-        if now < self._next or self._progress.quiet or self._progress.verbose:  # who sees every line anyway
-            return
-        self._next = now + _LINE
-        if done and " left" not in text:
-            text += f", about {(now - self._began) / done * (total - done):.0f} s left"
-        self._progress.write(f"{self._what}: {printable(text)}")
 
 
 def _coloured(text: str) -> str:

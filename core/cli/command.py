@@ -297,6 +297,11 @@ class Command:
                 parser.set_defaults(run=module.run)
 
 
+def declared(help: str, *options: Option, **more: str) -> Callable[[Callable[[argparse.Namespace], Result]], Command]:
+    """Declare a function as the command of its name, which runs it."""
+    return lambda run: Command(run.__name__, help, options, run, **more)
+
+
 def run(options: argparse.Namespace) -> int:
     """Run the command of parsed options and print what came of it."""
     options.say = options.say_losses = partial(_print_summary, options)

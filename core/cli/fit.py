@@ -25,8 +25,8 @@ from uncertain_lti.cli.command import (
     OPTIONS,
     RECORDINGS,
     RULES,
-    Command,
     Result,
+    declared,
     helped,
     load_model,
     model_target,
@@ -39,7 +39,17 @@ if TYPE_CHECKING:
 # --- fit -------------------------------------------------------------------------------------------------------------
 
 
-def run_fit(options: argparse.Namespace) -> Result:
+@declared(
+    "fit a model to recordings",
+    helped("bags", f"{RECORDINGS}; parts of a split bag are one recording"),
+    helped("--signals", "signals file (YAML): which field is which signal; not with --update", required=False),
+    "--update",
+    ("--output", {"required": True}),
+    *("--force", "--criterion", "--additive", "--alarm", "--false-alarms", "--schedule", "--horizons", "--widths"),
+    *("--json", "--discard", "--count", "--group", "--cache", "--scheduler", "--workers"),
+    verbose="report every scan of the data, and what took how long",
+)
+def fit(options: argparse.Namespace) -> Result:
     """Fit a model and write it."""
     from uncertain_lti.reports.model_text import fit_text, next_text
 
@@ -88,7 +98,7 @@ def _read(options: argparse.Namespace, signals: str | SignalMap) -> list[Transie
 
 def _updated(options: argparse.Namespace) -> UncertainLTI:
     known = {"bags", "update", "output", "force", "json"}
-    for name in (option if isinstance(option, str) else option[0] for option in FIT.options):
+    for name in (option if isinstance(option, str) else option[0] for option in fit.options):
         word = name.removeprefix("--").replace("-", "_")
         if word not in known and getattr(options, word) not in (None, OPTIONS[name].get("default")):
             raise FitError(f"{name} is given, and an update keeps what the model was fitted with; leave it out")
@@ -119,7 +129,6 @@ def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
         client = None
         if options.scheduler or options.workers:
             dask: Any = import_module("distributed")
-
             where = options.scheduler or stack.enter_context(_local_cluster(dask, options.workers))
             try:
                 client = stack.enter_context(dask.Client(where, timeout=10))
@@ -137,13 +146,9 @@ def _local_cluster(dask: Any, workers: int) -> Any:
     from uncertain_lti.sampling.reading import children_ignore_ctrl_c
 
     with children_ignore_ctrl_c():
-        return dask.LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            host="127.0.0.1",
-            dashboard_address=None,
-            silence_logs=logging.CRITICAL,  # of work that is broken off; what goes wrong comes back as an error
-        )
+        quiet = logging.CRITICAL  # of work that is broken off; what goes wrong comes back as an error
+        given = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None, "silence_logs": quiet}
+        return dask.LocalCluster(n_workers=workers, **given)
 
 
 def _asked(options: argparse.Namespace) -> dict[str, Any] | None:
@@ -178,7 +183,15 @@ def _with_sources(model: UncertainLTI, sources: Iterable[dict[str, Any]], group:
 # --- tune ------------------------------------------------------------------------------------------------------------
 
 
-def run_tune(options: argparse.Namespace) -> Result:
+@declared(
+    "try delays, schedules and lags, and take what sees clearly smaller jumps than fit",
+    helped("bags", f"{RECORDINGS} of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL"),
+    "--signals",
+    helped("--false-alarms", "as in fit (default: what the recordings can show)"),
+    *("--budget", "--group", "--output", "--force", "--json"),
+    verbose="say every way that is tried, and what took how long",
+)
+def tune(options: argparse.Namespace) -> Result:
     """Try the ways, print them, and write the model that was chosen."""
     from uncertain_lti import read_transients, tune
     from uncertain_lti.reports.model_text import alarm_text, headline_text, tune_text
@@ -215,38 +228,26 @@ def _label(text: str) -> str | None:
     return label if given and path and not os.path.exists(text) and os.sep not in label else None
 
 
-FIT = Command(
-    "fit",
-    "fit a model to recordings",
-    (
-        helped("bags", f"{RECORDINGS}; parts of a split bag are one recording"),
-        helped("--signals", "signals file (YAML): which field is which signal; not with --update", required=False),
-        "--update",
-        ("--output", {"required": True}),
-        *("--force", "--criterion", "--additive", "--alarm", "--false-alarms", "--schedule", "--horizons", "--widths"),
-        *("--json", "--discard", "--count", "--group", "--cache", "--scheduler", "--workers"),
-    ),
-    run_fit,
-    verbose="report every scan of the data, and what took how long",
-)
-TUNE = Command(
-    "tune",
-    "try delays, schedules and lags, and take what sees clearly smaller jumps than fit",
-    (
-        helped("bags", f"{RECORDINGS} of the healthy machine; LABEL=BAG is one of a machine with the fault LABEL"),
-        "--signals",
-        helped("--false-alarms", "as in fit (default: what the recordings can show)"),
-        *("--budget", "--group", "--output", "--force", "--json"),
-    ),
-    run_tune,
-    verbose="say every way that is tried, and what took how long",
-)
-
-
 # --- validate --------------------------------------------------------------------------------------------------------
 
 
-def run_validate(options: argparse.Namespace) -> Result:
+_OF_THE_FIT = "default: that of the fit; none: single recordings all the same"
+
+
+@declared(
+    "estimate how far to trust a model, by leaving out what it was fitted to",
+    "model",
+    helped("bags", f"{RECORDINGS} (default: those the model was fitted to)", nargs="*"),
+    "--blocks",
+    helped("--group", f"{OPTIONS['--group']['help']}; {_OF_THE_FIT}"),
+    *("--gap", "--confidence"),
+    helped("--false-alarms", "learn the panel again, for at most so many false alarms per hour with 90%% confidence"),
+    "--within",
+    helped("--output", "write the model with this validation, and the panel that was learnt, to this file"),
+    *("--force", "--json"),
+    verbose="say every fit, and what took how long",
+)
+def validate(options: argparse.Namespace) -> Result:
     """Validate the model and write it with the result, if an output is named."""
     from uncertain_lti import UncertainLTI
     from uncertain_lti.reports.model_text import validation_text
@@ -276,23 +277,29 @@ def run_validate(options: argparse.Namespace) -> Result:
         said = promises(model, panel)
     data = validation.judged_as(model).to_dict() | ({"promises": said} if said else {})
     with options.progress.stage("injecting faults") as step:
-        data["detectable"] = detectable(
-            model, validation.parts, options.within, confidence=options.confidence, progress=step
-        ).to_dict()
+        given = {"confidence": options.confidence, "progress": step}
+        data["detectable"] = detectable(model, validation.parts, options.within, **given).to_dict()
     model = model.replace(validation=data)
-    output = options.output
-    if output is not None:
-        model.save(output)
+    if options.output is not None:
+        model.save(options.output)
     options.say(validation_text(data))
-    if output is not None:
-        options.say(f"model written to {output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
-    return Result(data={"model": output or options.model, "validation": model.to_dict()["validation"]})
+    if options.output is not None:
+        options.say(f"model written to {options.output}; alarm: {'; or '.join(r.words for r in model.alarm)}")
+    return Result(data={"model": options.output or options.model, "validation": model.to_dict()["validation"]})
 
 
 # --- signature -------------------------------------------------------------------------------------------------------
 
 
-def run_signature(options: argparse.Namespace) -> Result:
+_LABELLED = "a fault, and a recording of it in which the alarm is raised; several recordings may have one label"
+
+
+@declared(
+    "learn what known faults look like from labelled recordings",
+    *("model", helped("bags", _LABELLED, metavar="LABEL=BAG"), ("--output", {"required": True})),
+    *("--force", *RULES, "--json"),
+)
+def signature(options: argparse.Namespace) -> Result:
     """Learn the signatures and write the model with them."""
     from uncertain_lti import EnvelopeMonitor
     from uncertain_lti.monitor.likeness import learn_signatures
@@ -316,41 +323,3 @@ def run_signature(options: argparse.Namespace) -> Result:
     alike = [{"labels": [a, b], "match": match} for a, b, match in learnt.alike]
     options.say(f"{signature_text(learnt)}\nmodel written to {output}")
     return Result(data={"model": str(output), "signatures": faults, "named": named, "alike": alike})
-
-
-VALIDATE = Command(
-    "validate",
-    "estimate how far to trust a model, by leaving out what it was fitted to",
-    (
-        "model",
-        helped("bags", f"{RECORDINGS} (default: those the model was fitted to)", nargs="*"),
-        "--blocks",
-        helped(
-            "--group", f"{OPTIONS['--group']['help']}; default: that of the fit; none: single recordings all the same"
-        ),
-        *("--gap", "--confidence"),
-        helped(
-            "--false-alarms",
-            "learn the panel again, for at most so many false alarms per hour with 90%% confidence",
-        ),
-        "--within",
-        helped("--output", "write the model with this validation, and the panel that was learnt, to this file"),
-        *("--force", "--json"),
-    ),
-    run_validate,
-    verbose="say every fit, and what took how long",
-)
-_LABELLED = "a fault, and a recording of it in which the alarm is raised; several recordings may have one label"
-SIGNATURE = Command(
-    "signature",
-    "learn what known faults look like from labelled recordings",
-    (
-        "model",
-        helped("bags", _LABELLED, metavar="LABEL=BAG"),
-        ("--output", {"required": True}),
-        "--force",
-        *RULES,
-        "--json",
-    ),
-    run_signature,
-)

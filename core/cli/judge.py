@@ -28,9 +28,9 @@ from uncertain_lti.cli.command import (
     PUBLISHED,
     RECORDINGS,
     UNKNOWN,
-    Command,
     Result,
     complain,
+    declared,
     helped,
     load_model,
 )
@@ -109,15 +109,10 @@ class Judged:
             all_of_them = plural(len(self.bags), "recording")
             complain(options.command, f"{len(self.refused)} of {all_of_them} not checked, as said above")
 
-    @property
-    def status(self) -> int:
-        """Exit status of what was judged so far."""
-        return ALARM if self.alarm else BAD_INPUT if self.refused else DONE
-
-    def status_of(self, recordings: Sequence[Mapping[str, Any]]) -> int:
-        """Exit status of what is known of each recording."""
-        nothing = self.status == DONE and any(r["outcome"] == "unknown" for r in recordings)
-        return UNKNOWN if nothing else self.status
+    def status(self, recordings: Sequence[Mapping[str, Any]] = ()) -> int:
+        """Exit status of what was judged so far, and of what is known of each recording."""
+        nothing = UNKNOWN if any(r["outcome"] == "unknown" for r in recordings) else DONE
+        return ALARM if self.alarm else BAD_INPUT if self.refused else nothing
 
 
 def _judged(options: argparse.Namespace) -> Judged:
@@ -131,7 +126,15 @@ def _judged(options: argparse.Namespace) -> Judged:
 # --- check -----------------------------------------------------------------------------------------------------------
 
 
-def run_check(options: argparse.Namespace) -> Result:
+_SLOW = "say what took how long"
+
+
+@declared(
+    "check a recording against a model",
+    *(PUBLISHED, "bags", *DEPLOYED, helped("--json", "print JSON with a verdict per sample"), "--write"),
+    verbose=_SLOW,
+)
+def check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.monitor.deployed import drift_in_words
     from uncertain_lti.reports.check import check_data, check_text, outcome
@@ -155,7 +158,7 @@ def run_check(options: argparse.Namespace) -> Result:
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             messages = plural(made.messages, "message")
             options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
-    status = judged.status_of(results)
+    status = judged.status(results)
     drift = drift_in_words(model, results)
     for text in drift:
         options.say(text)
@@ -168,7 +171,16 @@ def run_check(options: argparse.Namespace) -> Result:
 # --- report ----------------------------------------------------------------------------------------------------------
 
 
-def run_report(options: argparse.Namespace) -> Result:
+@declared(
+    "write a page that says whether a model may be relied on, and what happened in recordings",
+    PUBLISHED,
+    helped("bags", f"{RECORDINGS} to check against it"),
+    *DEPLOYED,
+    helped("--output", "page to write (default: report.html; with --json none)", metavar="FILE.html"),
+    helped("--json", "print the same facts as JSON"),
+    verbose=_SLOW,
+)
+def report(options: argparse.Namespace) -> Result:
     """Write the page or print its facts, and return whether the alarm was raised."""
     from uncertain_lti.reports.findings import findings, findings_text
     from uncertain_lti.reports.pages import html_report, page_target, write_page
@@ -185,13 +197,26 @@ def run_report(options: argparse.Namespace) -> Result:
     if output is not None:
         write_page(output, html_report(judged.model, checked, facts, options.progress.iterate("drawing", "sections")))
         options.say(f"report written to {output}")
-    return Result(judged.status_of(facts["recordings"]), {**facts, "not_checked": judged.refused})
+    return Result(judged.status(facts["recordings"]), {**facts, "not_checked": judged.refused})
 
 
 # --- plot ------------------------------------------------------------------------------------------------------------
 
 
-def run_plot(options: argparse.Namespace) -> Result:
+_WHAT = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
+_IMAGE = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
+
+
+@declared(
+    "draw a model, recordings, or what happened in recordings by a model",
+    helped("bags", f"{_WHAT}(what happened, and when)", metavar="WHAT"),
+    helped("--signals", "signals file: draw its signals, not every number that moves", required=False),
+    helped("--output", f"{_IMAGE}plot.png)", metavar="FILE"),
+    *DEPLOYED,
+    helped("--json", "print the path, and whether the alarm was raised, as JSON"),
+    verbose=_SLOW,
+)
+def plot(options: argparse.Namespace) -> Result:
     """Write the plot."""
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.charts import base_name
@@ -233,7 +258,7 @@ def run_plot(options: argparse.Namespace) -> Result:
     elif model is not None:
         save(matrices_figure(model), output, 200)
     options.say(f"plot written to {output}")
-    status = DONE if judged is None else judged.status
+    status = DONE if judged is None else judged.status()
     recordings = [str(bag.path) for bag in bags]
     data = {"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status}
     return Result(status, data)
@@ -255,10 +280,8 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
     if options.signals:
         from uncertain_lti import read_transients
 
-        reading = options.progress.iterate("reading")
-        runs = read_transients([bag.path for bag in bags], options.signals, progress=reading)
-        for transient in runs:
-            options.progress.note(*transient.notes)
+        runs = read_transients([bag.path for bag in bags], options.signals, options.progress.iterate("reading"))
+        options.progress.note(*(note for transient in runs for note in transient.notes))
         return [plotted_transient(transient, len(runs)) for transient in runs]
     from uncertain_lti.proposal.init import moving_numbers
 
@@ -271,40 +294,3 @@ def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Pl
         note = "Every number that moves, over the time of arrival." + f" Left out: {shortlist(left, 8)}." * bool(left)
         plotted.append(plotted_fields(str(bag.path), fields, note, len(bags)))
     return plotted
-
-
-CHECK = Command(
-    "check",
-    "check a recording against a model",
-    (PUBLISHED, "bags", *DEPLOYED, helped("--json", "print JSON with a verdict per sample"), "--write"),
-    run_check,
-    verbose="say what took how long",
-)
-REPORT = Command(
-    "report",
-    "write a page that says whether a model may be relied on, and what happened in recordings",
-    (
-        PUBLISHED,
-        helped("bags", f"{RECORDINGS} to check against it"),
-        *DEPLOYED,
-        helped("--output", "page to write (default: report.html; with --json none)", metavar="FILE.html"),
-        helped("--json", "print the same facts as JSON"),
-    ),
-    run_report,
-    verbose=CHECK.verbose,
-)
-_WHAT = "a model file (an image of its elements), recordings (their signals), or a model file and then recordings "
-_IMAGE = "page (.html, with zoom and hover) or image (.png, .svg, .pdf) to write (default: plot.html, of a model alone "
-PLOT = Command(
-    "plot",
-    "draw a model, recordings, or what happened in recordings by a model",
-    (
-        helped("bags", f"{_WHAT}(what happened, and when)", metavar="WHAT"),
-        helped("--signals", "signals file: draw its signals, not every number that moves", required=False),
-        helped("--output", f"{_IMAGE}plot.png)", metavar="FILE"),
-        *DEPLOYED,
-        helped("--json", "print the path, and whether the alarm was raised, as JSON"),
-    ),
-    run_plot,
-    verbose=CHECK.verbose,
-)

@@ -35,6 +35,7 @@ from uncertain_lti.cli.command import (
     Command,
     Result,
     complain,
+    declared,
     drop_output,
     helped,
     load_model,
@@ -42,7 +43,13 @@ from uncertain_lti.cli.command import (
 )
 
 
-def run_info(options: argparse.Namespace) -> Result:
+@declared(
+    "show what is in a model file",
+    PUBLISHED,
+    helped("--json", "print the file as JSON; of a scheduled model with `regimes`, what each rests on"),
+    quiet="",
+)
+def info(options: argparse.Namespace) -> Result:
     """Print the model."""
     from uncertain_lti.base.text import finite_data
     from uncertain_lti.model.interchange import block_facts
@@ -55,13 +62,16 @@ def run_info(options: argparse.Namespace) -> Result:
     try:
         return Result(text=model_text(model))
     except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError) as error:
-        raise ModelError(
-            f"{options.model}: what it says of its own fit is odd ({type(error).__name__}: {error}); fit it again, "
-            f"or print it with --json"
-        ) from None
+        odd = f"what it says of its own fit is odd ({type(error).__name__}: {error})"
+        raise ModelError(f"{options.model}: {odd}; fit it again, or print it with --json") from None
 
 
-def run_layout(options: argparse.Namespace) -> Result:
+@declared(
+    "write layouts of viewers for what a model's monitor publishes",
+    *(PUBLISHED, "--foxglove", "--plotjuggler", "--topics", helped("--json", "print the paths as JSON")),
+    quiet="",
+)
+def layout(options: argparse.Namespace) -> Result:
     """Write the layouts that are asked for."""
     from uncertain_lti.reports.layouts import write_layouts
 
@@ -70,7 +80,13 @@ def run_layout(options: argparse.Namespace) -> Result:
     return Result(data=data, text="\n".join(f"layout written to {path}" for path in written))
 
 
-def run_reproduce(options: argparse.Namespace) -> Result:
+@declared(
+    "run the paper's experiment on the nonlinear turbofan",
+    helped("--output", "for figures, models and numbers", default="reproduce-output", metavar="FOLDER"),
+    helped("--json", "print the numbers as JSON"),
+    quiet="print errors only; everything is in the folder",
+)
+def reproduce(options: argparse.Namespace) -> Result:
     """Run the experiment into a folder."""
     from uncertain_lti.plants.reproduce import reproduce
 
@@ -82,7 +98,8 @@ def run_reproduce(options: argparse.Namespace) -> Result:
     return Result(data={"output": options.output, **data})
 
 
-def run_completion(options: argparse.Namespace) -> Result:
+@declared("print what bash or zsh needs to complete commands, options and files", "shell", quiet="")
+def completion(options: argparse.Namespace) -> Result:
     """Print the script of a shell."""
     import shtab  # type: ignore[import-not-found, import-untyped, unused-ignore]
 
@@ -98,30 +115,6 @@ def run_completion(options: argparse.Namespace) -> Result:
     return Result(text=shtab.complete(parser, shell=options.shell))
 
 
-INFO = Command(
-    "info",
-    "show what is in a model file",
-    (PUBLISHED, helped("--json", "print the file as JSON; of a scheduled model with `regimes`, what each rests on")),
-    run_info,
-    quiet="",
-)
-LAYOUT = Command(
-    "layout",
-    "write layouts of viewers for what a model's monitor publishes",
-    (PUBLISHED, "--foxglove", "--plotjuggler", "--topics", helped("--json", "print the paths as JSON")),
-    run_layout,
-    quiet="",
-)
-_FOLDER = {"default": "reproduce-output", "metavar": "FOLDER"}
-REPRODUCE = Command(
-    "reproduce",
-    "run the paper's experiment on the nonlinear turbofan",
-    (helped("--output", "for figures, models and numbers", **_FOLDER), helped("--json", "print the numbers as JSON")),
-    run_reproduce,
-    quiet="print errors only; everything is in the folder",
-)
-_COMPLETION = "print what bash or zsh needs to complete commands, options and files"
-COMPLETION = Command("completion", _COMPLETION, ("shell",), run_completion, quiet="")
 PLAY = Command("play", "publish a recording through rclpy", of_ros="player")
 RECORD = Command("record", "record topics through rclpy", of_ros="recorder")
 WATCH = Command("watch", "show on a page of this machine what a running monitor says", of_ros="watch")
@@ -129,8 +122,8 @@ _DEMO = "fit shipped recordings of a turbofan and watch another, in which a faul
 DEMO = Command("demo", _DEMO, of_ros="demo")
 
 COMMANDS: tuple[Command, ...] = (
-    start.START, start.TOPICS, start.INIT, fit.FIT, fit.TUNE, judge.CHECK, judge.REPORT, judge.PLOT, LAYOUT,
-    fit.VALIDATE, fit.SIGNATURE, INFO, REPRODUCE, PLAY, RECORD, WATCH, DEMO, COMPLETION,
+    start.start, start.topics, start.init, fit.fit, fit.tune, judge.check, judge.report, judge.plot, layout,
+    fit.validate, fit.signature, info, reproduce, PLAY, RECORD, WATCH, DEMO, completion,
 )  # fmt: skip
 """Every command, in the order of the help."""
 
@@ -155,9 +148,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return NOT_READ if command in ("check", "report", "plot") else DONE
     except OSError as error:
         drop_output()
-        return _refuse(
-            command, f"the output cannot be written ({error.strerror or error}); make room, or send it elsewhere"
-        )
+        why = error.strerror or error
+        return _refuse(command, f"the output cannot be written ({why}); make room, or send it elsewhere")
 
 
 def _keep_interrupt(unraisable: Any) -> None:
@@ -184,9 +176,8 @@ def _run(command: str, given: Sequence[str]) -> int:
     except OSError as error:
         if error.filename is None:
             raise
-        return _refuse(
-            command, f"{error.filename}: {error.strerror or error}; check the path, its permissions and the disk"
-        )
+        why = error.strerror or error
+        return _refuse(command, f"{error.filename}: {why}; check the path, its permissions and the disk")
     except MemoryError:
         return _refuse(command, "there is not enough memory for this; give fewer or shorter recordings at a time")
     except KeyboardInterrupt:
@@ -249,9 +240,8 @@ class _Parser(argparse.ArgumentParser):
             message += meant(match[1], re.findall(r"[\w-]+", match[2]), 1)
         elif message.startswith("the following arguments are required"):
             words = [word.partition("=")[0] for word in self._given if word.startswith("--")]
-            for word in words:
-                if not any(option.startswith(word) for option in self._option_string_actions):
-                    message += f"; there is no {word}{meant(word, self._option_string_actions, 1)}"
+            odd = [w for w in words if not any(o.startswith(w) for o in self._option_string_actions)]
+            message += "".join(f"; there is no {word}{meant(word, self._option_string_actions, 1)}" for word in odd)
         elif message.startswith("unrecognized arguments: "):
             commands: dict[str, argparse.ArgumentParser]
             commands = dict(*(action.choices for action in self._actions if isinstance(action.choices, dict)))

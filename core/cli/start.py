@@ -20,7 +20,7 @@ from typing import Any
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.cli.command import RECORDINGS, Command, Result, helped, model_target
+from uncertain_lti.cli.command import RECORDINGS, Result, declared, helped, model_target
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000
@@ -29,7 +29,12 @@ _LONGEST_LIST = 100_000
 # --- topics ----------------------------------------------------------------------------------------------------------
 
 
-def run_topics(options: argparse.Namespace) -> Result:
+@declared(
+    "list the topics of a recording, and which fields could be signals",
+    *("bag", "--json"),
+    quiet="print the list and errors only: no notes, no progress",
+)
+def topics(options: argparse.Namespace) -> Result:
     """Print the topics of a recording and what each holds."""
     from uncertain_lti.base.text import number, table
     from uncertain_lti.recordings.formats import open_recording
@@ -66,7 +71,15 @@ def run_topics(options: argparse.Namespace) -> Result:
 # --- init ------------------------------------------------------------------------------------------------------------
 
 
-def run_init(options: argparse.Namespace) -> Result:
+@declared(
+    "propose a signals file for a recording, with reasons, for you to edit",
+    helped("bags", f"{RECORDINGS} of the same machine"),
+    helped("--output", "signals file to write; must not exist yet (default: print it)", metavar="FILE"),
+    *("--states", "--controls", "--like"),
+    helped("--json", "print what is proposed as JSON, with the text of the file"),
+    quiet="print errors only (and without --output the file): no summary, no notes, no progress",
+)
+def init(options: argparse.Namespace) -> Result:
     """Write or print the proposed signals file."""
     from uncertain_lti.base.files import target, written
     from uncertain_lti.proposal.init import propose
@@ -107,7 +120,19 @@ def _proposed(data: Mapping[str, Any]) -> str:
 # --- start -----------------------------------------------------------------------------------------------------------
 
 
-def run_start(options: argparse.Namespace) -> Result:
+_WRITTEN = "write NAME.yaml, which is used as it is if it is there already, NAME.model.json and NAME.html"
+
+
+@declared(
+    "from recordings of the healthy machine to a monitor: init, fit and report in one go",
+    helped("bags", f"{RECORDINGS} of the healthy machine"),
+    "--check",
+    helped("--output", f"{_WRITTEN} (default: machine)", metavar="NAME", default="machine"),
+    "--force",
+    helped("--json", "print what init, fit and report say, as JSON"),
+    verbose="report every scan of the data, and what took how long",
+)
+def start(options: argparse.Namespace) -> Result:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.recordings.formats import group_recordings
     from uncertain_lti.reports.findings import NO, findings_text
@@ -133,7 +158,12 @@ def run_start(options: argparse.Namespace) -> Result:
     if report.data is None:  # no recording could be checked, which is said
         return report
     options.say(findings_text(report.data))
-    then = _on_the_robot(model)
+    then = (
+        "on the robot, with this program installed there (docs/howto/deploy.md):\n"
+        f"  scp {shlex.quote(model)} ROBOT:\n"
+        f"  envelope_monitor --ros-args -p model:={shlex.quote(os.path.basename(model))}\n"
+        "  ros2 topic echo /envelope_monitor/violation"
+    )
     if report.data["rely"]["answer"] == NO:
         then = f"not on the robot yet: mend what is said above, in {signals} or by recording, and start with --force"
     options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{then}")
@@ -145,48 +175,3 @@ def _part(options: argparse.Namespace, words: list[str]) -> Result:
     command = options.build_parser(words[0]).parse_args([*words, "--json"])
     command.progress, command.say, command.say_losses = options.progress, lambda text: None, options.say
     return command.run(command)  # type: ignore[no-any-return]
-
-
-def _on_the_robot(model: str) -> str:
-    file = os.path.basename(model)
-    return (
-        "on the robot, with this program installed there (docs/howto/deploy.md):\n"
-        f"  scp {shlex.quote(model)} ROBOT:\n"
-        f"  envelope_monitor --ros-args -p model:={shlex.quote(file)}\n"
-        "  ros2 topic echo /envelope_monitor/violation"
-    )
-
-
-TOPICS = Command(
-    "topics",
-    "list the topics of a recording, and which fields could be signals",
-    ("bag", "--json"),
-    run_topics,
-    quiet="print the list and errors only: no notes, no progress",
-)
-INIT = Command(
-    "init",
-    "propose a signals file for a recording, with reasons, for you to edit",
-    (
-        helped("bags", f"{RECORDINGS} of the same machine"),
-        helped("--output", "signals file to write; must not exist yet (default: print it)", metavar="FILE"),
-        *("--states", "--controls", "--like"),
-        helped("--json", "print what is proposed as JSON, with the text of the file"),
-    ),
-    run_init,
-    quiet="print errors only (and without --output the file): no summary, no notes, no progress",
-)
-_WRITTEN = "write NAME.yaml, which is used as it is if it is there already, NAME.model.json and NAME.html"
-START = Command(
-    "start",
-    "from recordings of the healthy machine to a monitor: init, fit and report in one go",
-    (
-        helped("bags", f"{RECORDINGS} of the healthy machine"),
-        "--check",
-        helped("--output", f"{_WRITTEN} (default: machine)", metavar="NAME", default="machine"),
-        "--force",
-        helped("--json", "print what init, fit and report say, as JSON"),
-    ),
-    run_start,
-    verbose="report every scan of the data, and what took how long",
-)

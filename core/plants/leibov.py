@@ -19,7 +19,7 @@ import numpy as np
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.signal_map import Signal, SignalMap
+from uncertain_lti.signals.signal_map import Signal, SignalMap, TimeSource
 
 STATE_TOPIC = "/engine/state"
 CONTROL_TOPIC = "/engine/control"
@@ -43,14 +43,9 @@ def leibov2006() -> UncertainLTI:
     Its signals name `position[<state>]` of the topics that the plant node publishes.
     """
     data = json.loads((files(__package__) / "leibov2006.json").read_text(encoding="utf-8"))
-    signals = SignalMap(
-        states=_signals(data["states"], STATE_TOPIC),
-        controls=_signals(data["controls"], CONTROL_TOPIC),
-        clock=STATE_TOPIC,
-        max_gap=2.5 * data["dt"],
-        time={STATE_TOPIC: "header", CONTROL_TOPIC: "header"},
-        source="leibov2006",
-    )
+    states, controls = _signals(data["states"], STATE_TOPIC), _signals(data["controls"], CONTROL_TOPIC)
+    time: dict[str, TimeSource] = {STATE_TOPIC: "header", CONTROL_TOPIC: "header"}
+    signals = SignalMap(states, controls, clock=STATE_TOPIC, max_gap=2.5 * data["dt"], time=time, source="leibov2006")
     return UncertainLTI(data["A"], data["B"], data["dA"], data["dB"], signals=signals)
 
 
@@ -91,11 +86,5 @@ def transient(steps: int, seed: int, fault_at: int | None = None, start_ns: int 
         else:
             elements = nominal + draw * spread
         x[k + 1] = x[k] + DT_NS * 1e-9 * (elements @ np.concatenate([x[k], u[k]]))
-    return Transient(
-        start_ns + DT_NS * np.arange(steps, dtype=np.int64),
-        x,
-        u,
-        name=f"leibov2006, seed {seed}",
-        signals=model.signals,
-        max_gap=model.signals.max_gap,
-    )
+    t_ns, signals = start_ns + DT_NS * np.arange(steps, dtype=np.int64), model.signals
+    return Transient(t_ns, x, u, name=f"leibov2006, seed {seed}", signals=signals, max_gap=signals.max_gap)

@@ -84,9 +84,7 @@ def fit_and_check(name: str, transients: Sequence[Transient], check: Transient, 
 
 
 def reproduce(
-    output: str | os.PathLike[str],
-    say: Callable[[str], None] = print,
-    progress: Callable[[str], None] | None = None,
+    output: str | os.PathLike[str], say: Callable[[str], None] = print, progress: Callable[[str], None] | None = None
 ) -> dict[str, Any]:
     """Run the experiment, write figures, models, `reproduce.txt` and `reproduce.json` to a folder."""
     folder = Path(output)
@@ -105,18 +103,14 @@ def reproduce(
     noisy = [simulate(make_run("pulses", a, NOISE, seed)) for a, seed in ((LARGE, 1), (-LARGE, 2))]
     check, noisy_check = simulate(make_run("check")), simulate(make_run("check", noise=NOISE, seed=4))
     paper, both, wide = f"+{SMALL:.0%} (the paper's)", f"±{SMALL:.0%}", f"±{LARGE:.0%}"
-    wanted = [
-        (name, transients, recording, additive, criterion)
-        for name, transients, recording, additive in (
-            (paper, [up], check, "none"),
-            (both, [up, down], check, "none"),
-            (f"+{LARGE:.0%}", large[:1], check, "none"),
-            (wide, large, check, "none"),
-            (f"{wide}, noise {NOISE:g}", noisy, noisy_check, "none"),
-            (f"{wide}, noise {NOISE:g}", noisy, noisy_check, "noise"),
-        )
-        for criterion in ("qp", "lp")
+    fits = [
+        (paper, [up], check, "none"),
+        (both, [up, down], check, "none"),
+        (f"+{LARGE:.0%}", large[:1], check, "none"),
+        (wide, large, check, "none"),
+        *((f"{wide}, noise {NOISE:g}", noisy, noisy_check, additive) for additive in ("none", "noise")),
     ]
+    wanted = [(*of, criterion) for of in fits for criterion in ("qp", "lp")]
     cases = []
     for number_of, case in enumerate(wanted, start=1):
         step(CountedStep(f"fit {number_of} of {len(wanted)}: {case[0]}", number_of, len(wanted)))
@@ -133,10 +127,8 @@ def reproduce(
     for name, (model, verdicts, _) in (("check", chosen), ("check_paper_pulses", first)):
         save(envelope_figure(model, verdicts), folder / f"{name}.png")
         save(utilisation_figure(model, verdicts), folder / f"{name}_utilisation.png")
-    data = {
-        "cases": [c.numbers for c in cases],
-        "published_eigenvalues": [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()],
-    }
+    published = [[v.real, v.imag] for v in leibov2006().eigenvalues().tolist()]
+    data = {"cases": [c.numbers for c in cases], "published_eigenvalues": published}
     for name, text in (("reproduce.json", json.dumps(data, indent=1)), ("reproduce.txt", "\n\n".join(lines))):
         with whole_file(folder / name) as stream:
             stream.write(f"{text}\n".encode())
@@ -195,12 +187,8 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
     point, plant = operating_point(), engine()
     A = plant.linearise(point.x_s, point.u_s, point.X, point.U)[0]
     sampled = (expm(A * DT) - np.eye(len(A))) / DT
-    every = {
-        "published": leibov2006().A,
-        "engine, linearised": A,
-        "the same over one step": sampled,
-        **{name: model.A for name, model in models.items()},
-    }
+    every = {"published": leibov2006().A, "engine, linearised": A, "the same over one step": sampled}
+    every |= {name: model.A for name, model in models.items()}
     rows = []
     for name, matrix in every.items():
         values = sorted(np.linalg.eigvals(matrix).tolist(), key=lambda v: (-v.real, v.imag))
@@ -214,8 +202,7 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
 def matrix_text(model: UncertainLTI, name: str) -> str:
     """A, B and their half-widths compared with the published ones."""
     parts = []
-    published = leibov2006()
-    for title, m in (("published", published), (name, model)):
+    for title, m in (("published", leibov2006()), (name, model)):
         nominal, half = np.hstack([m.A, m.B]), np.hstack([m.dA, m.dB])
         rows = [
             [SHORT[i], *(f"{a:.2f} ± {d:.2g}" for a, d in zip(nominal[i], half[i], strict=True))] for i in range(m.n)

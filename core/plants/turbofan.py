@@ -205,12 +205,7 @@ STATES = (
     "turbine_exit_total_temperature",
 )
 STATE_UNITS = ("rpm", "rpm", "Pa", "Pa", "K")
-CONTROLS = (
-    "main_fuel_flow",
-    "nozzle_throat_area",
-    "fan_inlet_guide_vane_angle",
-    "compressor_outlet_guide_vane_angle",
-)
+CONTROLS = ("main_fuel_flow", "nozzle_throat_area", "fan_inlet_guide_vane_angle", "compressor_outlet_guide_vane_angle")
 CONTROL_UNITS = ("kg/s", "m^2", "deg", "deg")
 
 
@@ -242,15 +237,10 @@ class DesignPoint:
     compressor_speed: float = 15500.0  # rpm
 
 
-@dataclass(frozen=True)
-class Rotors:
-    """Moments of inertia and sensor lags, chosen for the modes of the paper (see docs/turbofan.md)."""
-
-    low: float = 16.0  # of the fan's spool, kg m^2
-    high: float = 7.25  # of the compressor's
-    compressor_pressure: float = 0.055  # lag of the sensor behind the compressor, s
-    turbine_pressure: float = 0.045  # of those behind the turbine
-    turbine_temperature: float = 0.070
+LOW_INERTIA, HIGH_INERTIA = 16.0, 7.25
+"""Moments of inertia of the spools of fan and compressor, kg m^2, chosen for the paper's modes (docs/turbofan.md)."""
+LAGS = (0.055, 0.045, 0.070)
+"""Of the sensors of the pressures behind compressor and turbine and of the temperature behind that, s, likewise."""
 
 
 @dataclass(frozen=True)
@@ -314,7 +304,6 @@ class Engine:
 
     def __init__(self) -> None:
         d = self.design = DesignPoint()
-        self.rotors = Rotors()
         core = d.flow / (1.0 + d.bypass_ratio)
         bypass = d.flow - core
 
@@ -332,22 +321,16 @@ class Engine:
         T4, w4 = burn(core, T3, fuel, d.combustion_efficiency)
         W4 = core + fuel
 
-        def turbine(
-            P: float, T: float, power: float, efficiency: float, narrow: float
-        ) -> tuple[TurbineMap, float, float]:
+        def turbine(P: float, T: float, power: float, efficiency: float) -> tuple[TurbineMap, float, float]:
             """Map, exit pressure Pa and exit temperature K of a turbine that gives this power, W."""
             h = enthalpy(T, w4)
             drop = power / d.mechanical_efficiency / (W4 * efficiency)
             ratio = pressure_ratio(T, temperature(h - drop, w4), w4)
-            capacity = W4 * sqrt(T) / P / sqrt(1.0 - ratio * ratio)
-            return (
-                TurbineMap(capacity, efficiency, drop, narrow),
-                P * ratio,
-                temperature(h - efficiency * drop, w4),
-            )
+            made = TurbineMap(W4 * sqrt(T) / P / sqrt(1.0 - ratio * ratio), efficiency, drop, narrow=0.3)
+            return made, P * ratio, temperature(h - efficiency * drop, w4)
 
-        self.high_turbine, P45, T45 = turbine(P4, T4, core * work, d.high_turbine_efficiency, 0.3)
-        self.low_turbine, P5, T5 = turbine(P45, T45, d.flow * fan_work, d.low_turbine_efficiency, 0.3)
+        self.high_turbine, P45, T45 = turbine(P4, T4, core * work, d.high_turbine_efficiency)
+        self.low_turbine, P5, T5 = turbine(P45, T45, d.flow * fan_work, d.low_turbine_efficiency)
         self.fan = CompressorMap(
             d.flow, fan_work, d.fan_efficiency, T_STANDARD,
             exponent=1.1, steepening=0.8, slope=1.3, curvature=1.5, closing=0.008, deloading=0.006,
@@ -405,15 +388,9 @@ class Engine:
         P6, T6, w6 = self._mix(W4, P5, T5, w, W16, P16, T13)
         W6 = W4 + W16
         W8, thrust = nozzle(area, P6, T6, w6, P_STANDARD, d.velocity_coefficient)
-        mismatch = np.array(
-            [
-                flow4 / W4 - 1.0,
-                flow45 / W4 - 1.0,
-                mass_flow(self.core_area, P5, T5, w, plane) / W4 - 1.0,
-                (mass_flow(self.bypass_area, P16, T13, 0.0, plane) - W16) / W2,
-                W8 / W6 - 1.0,
-            ]
-        )
+        core = mass_flow(self.core_area, P5, T5, w, plane)
+        bypass = mass_flow(self.bypass_area, P16, T13, 0.0, plane)
+        mismatch = np.array([flow4 / W4 - 1.0, flow45 / W4 - 1.0, core / W4 - 1.0, (bypass - W16) / W2, W8 / W6 - 1.0])
         path = GasPath(
             P3, T4, P5, T5, T6, w6, W2, W25, W4, W16, W8, fuel, thrust,
             fan_power=W2 * (enthalpy(T13, 0.0) - enthalpy(T_STANDARD, 0.0)),
@@ -429,18 +406,12 @@ class Engine:
     ) -> Array:
         """dx/dt (5,) in recorded units per s."""
         path = (solver or GasPathSolver(self)).solve(x, u, health)
-        r, loss = self.rotors, self.design.mechanical_efficiency
-        radian = 2.0 * pi / 60.0
-        low, high = x[0] * radian, x[1] * radian
-        return np.array(
-            [
-                (path.low_turbine_power * loss - path.fan_power) / (r.low * low) / radian,
-                (path.high_turbine_power * loss - path.compressor_power) / (r.high * high) / radian,
-                (path.P3 - x[2]) / r.compressor_pressure,
-                (path.P5 - x[3]) / r.turbine_pressure,
-                (path.T5 - x[4]) / r.turbine_temperature,
-            ]
-        )
+        loss, radian = self.design.mechanical_efficiency, 2.0 * pi / 60.0
+        low, high = LOW_INERTIA * (x[0] * radian), HIGH_INERTIA * (x[1] * radian)
+        fan = (path.low_turbine_power * loss - path.fan_power) / low / radian
+        compressor = (path.high_turbine_power * loss - path.compressor_power) / high / radian
+        sensors = [(now - read) / lag for now, read, lag in zip((path.P3, path.P5, path.T5), x[2:], LAGS, strict=True)]
+        return np.array([fan, compressor, *sensors])
 
     def linearise(self, x: ArrayLike, u: ArrayLike, X: ArrayLike, U: ArrayLike) -> tuple[Array, Array]:
         """A (5, 5) and B (5, 4), 1/s, of deviations from (x, u) over the scales X and U, by central differences."""
@@ -473,11 +444,10 @@ class GasPathSolver:
         """Matched gas path at spool speeds x[:2] and controls u, to a relative mismatch of 1e-12."""
         path = self._newton(x, u, health) or self._approach(x, u, health)
         if path is None:
-            raise UncertainLTIError(
-                f"turbofan: no matched gas path at fan speed {x[0]:.0f} rpm, compressor speed {x[1]:.0f} rpm, fuel "
-                f"{u[0]:.3f} kg/s, nozzle area {u[1]:.4f} m^2, vanes {u[2]:.1f} and {u[3]:.1f} deg; keep closer to "
-                f"the working line"
-            )
+            speeds = f"fan speed {x[0]:.0f} rpm, compressor speed {x[1]:.0f} rpm"
+            controls = f"fuel {u[0]:.3f} kg/s, nozzle area {u[1]:.4f} m^2, vanes {u[2]:.1f} and {u[3]:.1f} deg"
+            where = f"{speeds}, {controls}; keep closer to the working line"
+            raise UncertainLTIError(f"turbofan: no matched gas path at {where}")
         return path
 
     def _approach(self, x: Sequence[float], u: Sequence[float], health: Health) -> GasPath | None:

@@ -169,10 +169,8 @@ class Controller:
     TEMPERATURE_LIMIT = 1.03  # of the design's
 
     def __init__(self, start: Trim) -> None:
-        self._limits = (
-            self.COMPRESSOR_LIMIT * engine().design.compressor_speed,
-            self.TEMPERATURE_LIMIT * float(operating_point().x_s[4]),
-        )
+        hottest = self.TEMPERATURE_LIMIT * float(operating_point().x_s[4])
+        self._limits = self.COMPRESSOR_LIMIT * engine().design.compressor_speed, hottest
         self._command = start.u.copy()
         self._offset = start.x[0] - fan_speed(start.pla)  # a steady state is one of the loop, to the last bit
         self._correction = 0.0  # of the integral, relative fuel, from the steady state
@@ -195,10 +193,8 @@ class Controller:
         u[0] += min(max(limited - u[0], -self.FUEL_RATE * dt), self.FUEL_RATE * dt)
         if u[0] != wanted:  # the integral does not run on while something else holds the fuel
             self._correction -= self.INTEGRAL * dt * error
-        targets = (nozzle_area(pla), *vanes(float(x[0]), float(x[1])))
-        rates = (self.AREA_RATE, self.VANE_RATE, self.VANE_RATE)
-        for j, (target, rate) in enumerate(zip(targets, rates, strict=True), start=1):
-            u[j] += min(max(target - u[j], -rate * dt), rate * dt)
+        most = dt * np.array([self.AREA_RATE, self.VANE_RATE, self.VANE_RATE])
+        u[1:] += np.clip(np.array([nozzle_area(pla), *vanes(float(x[0]), float(x[1]))]) - u[1:], -most, most)
         self._command = u
         return u.copy()
 
@@ -208,17 +204,15 @@ def turbofan_signals() -> SignalMap:
     """States and controls as the plant node publishes them, around PLA 68 deg; `config/signals/turbofan.yaml`."""
     point = operating_point()
 
-    def signals(
-        topic: str, names: tuple[str, ...], units: tuple[str, ...], steady: Array, scale: Array, hold: float | None
-    ) -> tuple[Signal, ...]:
-        rows = zip(names, units, steady.tolist(), scale.tolist(), strict=True)
-        return tuple(
-            Signal(name, topic, f"position[{name}]", s, c, unit, JOINT_STATE, hold) for name, unit, s, c in rows
-        )
+    states = zip(STATES, STATE_UNITS, _rounded(point.x_s, point.X).tolist(), point.X.tolist(), strict=True)
+    controls = zip(CONTROLS, CONTROL_UNITS, point.u_s.tolist(), point.U.tolist(), strict=True)
+
+    def signal(topic: str, name: str, unit: str, steady: float, scale: float, hold: float | None = None) -> Signal:
+        return Signal(name, topic, f"position[{name}]", steady, scale, unit, JOINT_STATE, hold)
 
     return SignalMap(
-        signals(STATE_TOPIC, STATES, STATE_UNITS, _rounded(point.x_s, point.X), point.X, None),
-        signals(CONTROL_TOPIC, CONTROLS, CONTROL_UNITS, point.u_s, point.U, HOLD),
+        tuple(signal(STATE_TOPIC, *row) for row in states),
+        tuple(signal(CONTROL_TOPIC, *row, HOLD) for row in controls),
         clock=STATE_TOPIC,
         max_gap=2.5 * DT,
         time={STATE_TOPIC: "header", CONTROL_TOPIC: "header"},
@@ -259,9 +253,8 @@ class Fault:
         if not 0.0 < self.size < math.inf:
             raise UncertainLTIError(f"turbofan: a fault of size {self.size:g}; it must be a positive number")
         if self.size != 1.0 and self.kind.endswith("stuck"):
-            raise UncertainLTIError(
-                f"turbofan: {self.kind} of size {self.size:g}; what is stuck has no size, leave it 1"
-            )
+            stuck = "what is stuck has no size, leave it 1"
+            raise UncertainLTIError(f"turbofan: {self.kind} of size {self.size:g}; {stuck}")
 
     def health(self, t: float) -> Health:
         """Efficiency factors at one instant."""
@@ -342,9 +335,9 @@ def simulate(run: Run, start_ns: int = START_NS) -> Transient:
     point, rng = operating_point(), np.random.default_rng(run.seed)
     begin, solver = trim(run.lever[0][1]), GasPathSolver(engine())
     controller = Controller(replace(begin, x=_rounded(begin.x, point.X)))
-    x, x_read, u_sent = begin.x.copy(), np.empty((run.samples, 5)), np.empty((run.samples, 4))
+    x, actual = begin.x.copy(), begin.u.copy()
+    x_read, u_sent = np.empty((run.samples, 5)), np.empty((run.samples, 4))
     fault = run.fault or Fault("fan_damage", np.inf)
-    actual = begin.u.copy()
     for k in range(run.samples):
         t = k * DT
         reading = fault.reading(t, x, point.X)
@@ -357,19 +350,13 @@ def simulate(run: Run, start_ns: int = START_NS) -> Transient:
             u_sent[k] = begin.u + point.U * pulses(t, run.amplitude)
         if k + 1 == run.samples:
             break
-        stuck = fault.stuck(t)
-        held, actual = actual, u_sent[k].copy()
+        stuck, held = fault.stuck(t), actual
+        actual = u_sent[k].copy()
         if stuck is not None:
             actual[stuck] = held[stuck]
         x = _advance(solver, x, actual, point.X, fault.health(t))
-    return Transient(
-        start_ns + DT_NS * np.arange(run.samples, dtype=np.int64),
-        x_read,
-        u_sent,
-        name="turbofan",
-        signals=turbofan_signals(),
-        max_gap=turbofan_signals().max_gap,
-    )
+    t_ns, signals = start_ns + DT_NS * np.arange(run.samples, dtype=np.int64), turbofan_signals()
+    return Transient(t_ns, x_read, u_sent, name="turbofan", signals=signals, max_gap=signals.max_gap)
 
 
 def _advance(solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health) -> Array:
@@ -384,13 +371,11 @@ def _advance(solver: GasPathSolver, x: Array, u: Array, X: Array, health: Health
     found = solve_ivp(rate, (0.0, DT), x / X, method="DOP853", rtol=1e-9, atol=1e-11, first_step=DT)
     if not found.success:
         raise UncertainLTIError(f"turbofan: the step was not integrated: {found.message}")
-    end: Array = found.y[:, -1] * X
-    return end
+    return np.asarray(found.y[:, -1] * X)
 
 
 def _rounded(x: Array, X: Array) -> Array:
-    step: Array = np.round(x / X / RESOLUTION) * RESOLUTION * X
-    return step
+    return np.asarray(np.round(x / X / RESOLUTION) * RESOLUTION * X)
 
 
 def make_run(
@@ -407,14 +392,9 @@ def make_run(
         raise UncertainLTIError(f"turbofan: there is no manoeuvre '{manoeuvre}'; there are {', '.join(SAMPLES)}")
     if (manoeuvre == "pulses") != (amplitude != 0.0):
         raise UncertainLTIError("turbofan: an amplitude other than 0 is for pulses, and pulses need one")
-    return Run(
-        samples or SAMPLES[manoeuvre],
-        amplitude if manoeuvre == "pulses" else None,
-        LEVELS if manoeuvre == "levels" else CHECK,
-        noise,
-        seed,
-        Fault(fault, fault_at) if fault else None,
-    )
+    lever = LEVELS if manoeuvre == "levels" else CHECK
+    wrong = Fault(fault, fault_at) if fault else None
+    return Run(samples or SAMPLES[manoeuvre], amplitude or None, lever, noise, seed, wrong)
 
 
 SMALL, LARGE = 0.05, 0.30

@@ -23,21 +23,12 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import natural
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.bag_arrays import ColumnReader, IndexMismatchError, in_reach
-from uncertain_lti.recordings.bag_files import (
-    listed_parts,
-    not_one_recording,
-    parts_of,
-    stem_and_index,
-    survey,
-)
+from uncertain_lti.recordings.bag_files import listed_parts, not_one_recording, parts_of, stem_and_index, survey
 from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages
 from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, undefined
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo, topic_facts
-from uncertain_lti.recordings.unreadable import os_error
+from uncertain_lti.recordings.unreadable import changed, os_error
 from uncertain_lti.signals.field_path import FieldPath, TypeFields, full_name
-
-__all__ = ["Bag", "group_bags"]
-
 
 _MOST_LINES = 100_000  # of definitions that are read in one file
 _MOST_NAMES = 50  # of topics in an error
@@ -86,9 +77,8 @@ class Bag(Recording):
         self._warnings += damage
         if (damage or not self._contents) and not any(part.count for part in self._contents):
             why = self._warnings[0].removeprefix(f"{self.path}: ")
-            raise BagError(
-                f"{self.path}: no message can be read ({why}){'' if '`' in why else '; record or copy it again'}"
-            )
+            remedy = "" if "`" in why else "; record or copy it again"
+            raise BagError(f"{self.path}: no message can be read ({why}){remedy}")
         self._channels = [_channels(part) for part in self._contents]
         self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
         self.topics = self._topics()
@@ -138,16 +128,13 @@ class Bag(Recording):
     ) -> Columns:
         """Numbers at some paths of each topic, read block by block; messages that cannot be decoded are left out."""
         while True:
-            reader = ColumnReader(
-                self.path, self.described(topics), {name: self.topics[name].count for name in topics}, paths
-            )
+            counts = {name: self.topics[name].count for name in topics}
+            reader = ColumnReader(self.path, self.described(topics), counts, paths)
             try:
                 columns = reader.run(progress)
             except IndexMismatchError:
                 if not self.indexed:
-                    raise BagError(
-                        f"{self.path}: the file changed while it was read; read it again when it is written"
-                    ) from None
+                    raise changed(self.path) from None
                 self.walk()
             else:
                 self.leave_out(reader.undecoded)
@@ -159,13 +146,14 @@ class Bag(Recording):
         if progress is not None:
             messages = progress(messages, sum(info.count for info in self.topics.values()))
         facts = topic_facts(self.topics, messages)
-        for fact in facts:
-            note = (
-                f"{self.path}: {fact.info.topic}: {shortlist(list(fact.elsewhere), 6)} come in other messages than "
-                f"{shortlist(list(fact.fields), 6)}, and the states of a model in one; fit a model for each, or "
-                f"publish all together, as joint_state_publisher with source_list does"
-            )
-            self._warnings += [note] * bool(fact.elsewhere and note not in self._warnings)
+        notes = [
+            f"{self.path}: {fact.info.topic}: {shortlist(list(fact.elsewhere), 6)} come in other messages than "
+            f"{shortlist(list(fact.fields), 6)}, and the states of a model in one; fit a model for each, or publish "
+            f"all together, as joint_state_publisher with source_list does"
+            for fact in facts
+            if fact.elsewhere
+        ]
+        self._warnings += [note for note in notes if note not in self._warnings]
         return facts
 
     def raw_messages(self, topics: Iterable[str] | None = None) -> Iterator[RawMessage]:
@@ -185,17 +173,13 @@ class Bag(Recording):
 
     def _folder(self, indexed: bool) -> list[Contents]:
         paths, listed, self._warnings = parts_of(self.path)
-        contents = []
-        for path in paths:
-            if len(paths) > 1 and not path.stat().st_size:  # the part that was open when the power went
-                self._warnings.append(f"{path}: the file is empty; it is left out")
-            else:
-                contents.append(survey(path, indexed))
+        # the part that was open when the power went
+        empty = [path for path in paths if len(paths) > 1 and not path.stat().st_size]
+        self._warnings += [f"{path}: the file is empty; it is left out" for path in empty]
+        contents = [survey(path, indexed) for path in paths if path not in empty]
         if not listed and (why := not_one_recording(contents)):
-            raise BagError(
-                f"{self.path}: without a metadata.yaml its files do not look like one recording ({why}); name them "
-                f"one by one: {', '.join(path.name for path in paths)}"
-            )
+            unlike = f"without a metadata.yaml its files do not look like one recording ({why})"
+            raise BagError(f"{self.path}: {unlike}; name them one by one: {', '.join(path.name for path in paths)}")
         return contents
 
     def _topics(self) -> dict[str, TopicInfo]:
@@ -230,9 +214,8 @@ class Bag(Recording):
             notes.add(channel.definition.note)
             self._channels[part][key] = replace(channel, counted=True)
         self._warnings += [f"{self.path}: {topic}: {note}" for note in sorted(notes) if note]
-        of_kind = tallies[chosen]
-        first = min((tally.first for tally in of_kind), default=None)
-        last = max((tally.last for tally in of_kind), default=None)
+        first = min((tally.first for tally in tallies[chosen]), default=None)
+        last = max((tally.last for tally in tallies[chosen]), default=None)
         readable = not chosen[2]
         if last is not None and last > LATEST:
             self._too_late[topic] = last
@@ -252,15 +235,14 @@ class Bag(Recording):
     def _decoded(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[tuple[str, int, Any]]:
         undecoded: dict[str, tuple[int, str]] = {}
         for raw in self._sorted(parts):
-            channel = raw.channel
             try:
-                message = channel.definition.decode(raw.data)
+                message = raw.channel.definition.decode(raw.data)
             except BagError as error:
-                number, least = undecoded.get(channel.topic, (0, str(error)))
-                undecoded[channel.topic] = number + 1, min(least, str(error))
+                number, least = undecoded.get(raw.topic, (0, str(error)))
+                undecoded[raw.topic] = number + 1, min(least, str(error))
                 self.leave_out(undecoded)
                 continue
-            yield channel.topic, raw.log_time_ns, message
+            yield raw.topic, raw.log_time_ns, message
 
     def _sorted(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[RawMessage]:
         """Messages of these channels of each file in order of log time, ties in file order.
@@ -268,11 +250,12 @@ class Bag(Recording):
         Blocks are read in order of their smallest log time; what is earlier than every block still to be read
         is final.
         """
-        blocks: list[tuple[int, int, int, Block]] = []
-        for part, (contents, wanted) in enumerate(parts):
-            for number, block in enumerate(contents.blocks):
-                if not block.channels.isdisjoint(wanted):
-                    blocks.append((block.start, part, number, block))
+        blocks: list[tuple[int, int, int, Block]] = [
+            (block.start, part, number, block)
+            for part, (contents, wanted) in enumerate(parts)
+            for number, block in enumerate(contents.blocks)
+            if not block.channels.isdisjoint(wanted)
+        ]
         blocks.sort(key=lambda entry: entry[:3])
         pending: list[tuple[int, int, int, int, RawMessage]] = []  # a heap; no two have the same place
         held = 0
@@ -290,10 +273,8 @@ class Bag(Recording):
                 held -= len(raw.data) + _SIZE_OF_AN_ENTRY
                 yield raw
             if held > _MOST_HELD:
-                raise BagError(
-                    f"{self.path}: its messages are so far out of order that more than {_MOST_HELD >> 20} MiB of them "
-                    f"have to wait; put them in order with `mcap sort`"
-                )
+                waiting = f"more than {_MOST_HELD >> 20} MiB of them have to wait; put them in order with `mcap sort`"
+                raise BagError(f"{self.path}: its messages are so far out of order that {waiting}")
 
 
 def _channels(contents: Contents) -> dict[int, RecordedChannel]:
@@ -344,10 +325,7 @@ def group_bags(paths: Sequence[Path], indexed: bool = False) -> list[Bag]:
         if group not in files or path.is_dir():
             order.append(group)
         files.setdefault(group, []).append(path)
-    bags = []
-    for group in order:
-        bags += _group(files[group], indexed)
-    return bags
+    return [bag for group in order for bag in _group(files[group], indexed)]
 
 
 def _group(paths: list[Path], indexed: bool) -> list[Bag]:

@@ -31,7 +31,7 @@ from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan, header_stamp_ns
 from uncertain_lti.recordings.message_types import Definition, RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress
-from uncertain_lti.recordings.unreadable import os_error
+from uncertain_lti.recordings.unreadable import changed, os_error
 from uncertain_lti.signals.field_path import FieldPath
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
@@ -69,20 +69,17 @@ class FieldReader:
                 message = self.definition.decode(bytes(data[begin[row] : end[row]]))
             except BagError as error:
                 failures.append((row, str(error)))
-                continue
-            values[row] = [path.read(message) for path in self.paths]
-            stamps[row] = header_stamp_ns(message) or NO_STAMP
+            else:
+                values[row] = [path.read(message) for path in self.paths]
+                stamps[row] = header_stamp_ns(message) or NO_STAMP
         return failures
 
 
-def in_reach(path: Path, log_time: int) -> int:
+def in_reach(path: Path, log_time: int) -> None:
     """Check that a log time can be kept as a 64-bit integer."""
     if log_time > LATEST:
-        raise BagError(
-            f"{path}: a message has a log time of {log_time} ns, which is past the year 2262; "
-            f"the recorder's clock was wrong, so record again"
-        )
-    return log_time
+        late = f"a message has a log time of {log_time} ns, which is past the year 2262"
+        raise BagError(f"{path}: {late}; the recorder's clock was wrong, so record again")
 
 
 class ColumnReader:
@@ -114,9 +111,7 @@ class ColumnReader:
         """Read all; raises `IndexMismatchError`."""
         steps: Iterable[object] = self._steps()
         if progress is not None:  # which counts messages
-            steps = progress(
-                itertools.chain.from_iterable(itertools.repeat(None, n) for n in self._steps()), self.total
-            )
+            steps = progress(itertools.chain.from_iterable(map(range, self._steps())), self.total)
         for _ in steps:
             pass
         return self._in_order()
@@ -146,10 +141,9 @@ class ColumnReader:
                 read, stamps = np.empty((len(at), values.shape[1])), np.empty(len(at), dtype=np.int64)
                 for row, why in readers[key].read(batch.data, batch.begin[at], batch.end[at], read, stamps):
                     kept[at[row]] = False
-                    name = self.topics[where]
                     if why:
-                        number, least = self.undecoded.get(name, (0, why))
-                        self.undecoded[name] = number + 1, min(least, why)
+                        number, least = self.undecoded.get(self.topics[where], (0, why))
+                        self.undecoded[self.topics[where]] = number + 1, min(least, why)
                 values[mine], stamp[at] = read, stamps
             begin = self.filled_of[where]
             if begin + len(rows) > len(self.values[where]):
@@ -171,17 +165,11 @@ class ColumnReader:
         if (arrival[1:] >= arrival[:-1]).all():
             return Columns(topic, arrival, stamp, values, alone)
         order = np.argsort(arrival, kind="stable")
-        row = np.empty(len(order), dtype=np.int64)
-        for where in range(len(values)):
-            mine = topic == where
-            row[mine] = np.arange(len(values[where]))
-        topic = topic[order]
-        row = row[order]
         for where, read in enumerate(values):
-            mine = row[topic == where]
-            if (mine[1:] < mine[:-1]).any():
-                values[where] = read[mine]
-        return Columns(topic, arrival[order], stamp[order], values, alone)
+            rows = np.argsort(arrival[topic == where], kind="stable")
+            if (rows[1:] < rows[:-1]).any():
+                values[where] = read[rows]
+        return Columns(topic[order], arrival[order], stamp[order], values, alone)
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,8 +210,7 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
 
 
 def _groups(blocks: Sequence[Block]) -> Iterator[list[Block]]:
-    group: list[Block] = []
-    size = 0
+    group, size = list[Block](), 0
     for block in blocks:
         if group and size + block.length > _BATCH:
             yield group
@@ -240,10 +227,8 @@ def _load(contents: Contents, blocks: Sequence[Block], channels: Collection[int]
     try:
         with open(contents.path, "rb", buffering=0) as stream:
             for block in blocks:
-                if contents.converted:
-                    data += contents.records(block, channels)
-                else:
-                    data += _records(contents, block, stream)
+                whole = not contents.converted
+                data += _records(contents, block, stream) if whole else contents.records(block, channels)
                 ends.append(len(data))
     except OSError as error:
         raise os_error(contents.path, error) from None
@@ -259,7 +244,7 @@ def _records(contents: Contents, block: Block, stream: BinaryIO) -> bytes | memo
         if not whole or not _as_stated(contents, block, packed[: block.unchecked], records):
             raise IndexMismatchError
     elif len(records) < block.length:
-        raise BagError(f"{contents.path}: the file changed while it was read; read it again when it is written")
+        raise changed(contents.path)
     return records[: block.length]
 
 
@@ -293,9 +278,7 @@ def _messages(data: bytearray, ends: Sequence[int], wanted: NDArray[np.bool_], c
 
 def _hold_against(contents: Contents, data: bytearray, opcode: int, begin: int, end: int) -> None:
     """A definition in a chunk has to be the one that the summary gives."""
+    known: Mapping[int, Any] = contents.schemas if opcode == Opcode.SCHEMA else contents.channels
     record = parse(Schema if opcode == Opcode.SCHEMA else Channel, bytes(memoryview(data)[begin:end]))
-    known: object = None
-    if record is not None:
-        known = (contents.schemas if opcode == Opcode.SCHEMA else contents.channels).get(record.id)
-    if record is None or record != known:
+    if record is None or record != known.get(record.id):
         raise IndexMismatchError

@@ -21,7 +21,7 @@ import os
 import re
 import struct
 from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, ClassVar
@@ -45,7 +45,7 @@ from uncertain_lti.recordings.mcap_records import (
 )
 from uncertain_lti.recordings.mcap_scan import outline, scan
 from uncertain_lti.recordings.message_types import Definition, define, distribution_text, ros2_text
-from uncertain_lti.recordings.unreadable import SUFFIXES, aside, file_names, no_recording, one_line, os_error
+from uncertain_lti.recordings.unreadable import SUFFIXES, aside, changed, file_names, no_recording, one_line, os_error
 from uncertain_lti.signals.field_path import full_name
 from uncertain_lti.signals.values import compose, construct
 
@@ -74,28 +74,27 @@ class Foreign(Contents):
 
     converted: ClassVar[bool] = True
 
+    def damaged(self, how: str) -> str:
+        """The sentence for a file that is not whole, with the remedy."""
+        return f"{self.path}: {how}; {_REMEDIES[self.magic].format(self.path.name)}"
+
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
         """Messages of one block as MCAP has them."""
         convert: dict[int, Callable[[bytes], bytes]] = {}
         if self.magic == _BAG:
             convert = {number: self._definition(number).from_ros1 for number in block.channels}
+        asked = block.channels if channels is None else channels
         pieces: list[bytes] = []
         try:
             with _reader(self.path, self.magic) as reader:
-                wanted = [
-                    connection
-                    for connection in reader.connections
-                    if self.numbers[connection.id] in (block.channels if channels is None else channels)
-                ]
+                wanted = [connection for connection in reader.connections if self.numbers[connection.id] in asked]
                 for connection, time, data in reader.messages(wanted, block.start, block.end + 1) if wanted else ():
                     number = self.numbers[connection.id]
                     if _usable(time, data):
                         message = convert[number](bytes(data)) if convert else data
                         pieces.append(message_record(number, len(pieces), time, time, message))
         except Exception as error:  # a library raises whatever the bytes lead it to
-            raise BagError(
-                f"{self.path}: the file changed while it was read ({one_line(error)}); read it again when it is written"
-            ) from None
+            raise changed(self.path, f" ({one_line(error)})") from None
         return b"".join(pieces)
 
     def _definition(self, number: int) -> Definition:
@@ -108,18 +107,16 @@ def scan_foreign(path: Path) -> Foreign | None:
     with open(path, "rb") as stream:
         head = stream.read(len(_DATABASE))
     if head.startswith(b"#ROSBAG V") and not head.startswith(_BAG):
-        raise BagError(
-            f"{path}: a ROS 1 bag of another version than 2.0; convert it with `rosbag fix` of ROS 1, or record again"
-        )
+        remedy = "convert it with `rosbag fix` of ROS 1, or record again"
+        raise BagError(f"{path}: a ROS 1 bag of another version than 2.0; {remedy}")
     if not head.startswith((_DATABASE, _BAG)):
         return None
     found: Foreign = aside(_scan, path, "ROS 1 bag" if head.startswith(_BAG) else "database of ROS 2")
     log = path.with_name(f"{path.name}-wal")
     if found.magic == _DATABASE and log.exists() and log.stat().st_size:
-        found.warnings.append(
-            f"{path}: messages that were not yet written to it are in {log.name} and are not read; put them in with "
-            f"`sqlite3 {path.name} 'PRAGMA wal_checkpoint'`"
-        )
+        remedy = f"put them in with `sqlite3 {path.name} 'PRAGMA wal_checkpoint'`"
+        unwritten = f"messages that were not yet written to it are in {log.name} and are not read"
+        found.warnings.append(f"{path}: {unwritten}; {remedy}")
     return found
 
 
@@ -144,35 +141,25 @@ def _scan(path: Path) -> Foreign:
     try:
         with _reader(path, magic) as reader:
             stated = _declare(found, reader, chunks)
-            if magic == _DATABASE and (said := _integrity(reader)) != "ok":
-                found.warnings.append(f"{path}: is damaged ({one_line(said)}); {_remedy(path, magic)}")
+            if magic == _DATABASE:  # an index that lacks rows hides them from whoever reads in order of time
+                wrong = str(reader.dbconn.execute("PRAGMA integrity_check(1)").fetchone()[0])
+                if wrong != "ok":
+                    found.warnings.append(found.damaged(f"is damaged ({one_line(wrong)})"))
             if trouble := _walk(found, reader):
                 of = f"{found.count} of {count(stated, 'message')} before that count"
-                found.warnings.append(f"{path}: is cut or damaged ({trouble}); {of}; {_remedy(path, magic)}")
+                found.warnings.append(found.damaged(f"is cut or damaged ({trouble}); {of}"))
             elif stated != found.count or any(
-                info.msgcount != (found.tally[number].count if number in found.tally else 0)
+                info.msgcount != (tally.count if (tally := found.tally.get(found.numbers[info.id])) else 0)
                 for info in reader.connections
-                for number in [found.numbers[info.id]]
             ):
-                found.warnings.append(
-                    f"{path}: its index counts {count(stated, 'message')}, and {found.count} could be read, each with "
-                    f"its topic and a log time; {_remedy(path, magic)}"
-                )
+                of = f"{found.count} could be read, each with its topic and a log time"
+                found.warnings.append(found.damaged(f"its index counts {count(stated, 'message')}, and {of}"))
     except (BagError, MemoryError):
         raise
     except Exception as error:  # a library raises whatever the bytes lead it to
         what = "ROS 1 bag" if magic == _BAG else "recording of ROS 2"
-        raise BagError(f"{path}: is cut or damaged or no {what} ({one_line(error)}); {_remedy(path, magic)}") from None
+        raise BagError(found.damaged(f"is cut or damaged or no {what} ({one_line(error)})")) from None
     return found
-
-
-def _integrity(reader: Any) -> str:
-    """What SQLite finds wrong first: an index that lacks rows hides them from whoever reads in order of time."""
-    return str(reader.dbconn.execute("PRAGMA integrity_check(1)").fetchone()[0])
-
-
-def _remedy(path: Path, magic: bytes) -> str:
-    return _REMEDIES[magic].format(path.name)
 
 
 def _usable(time: object, data: object) -> bool:
@@ -206,13 +193,10 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
             distribution = next(iter(reader.dbconn.execute("SELECT ros_distro FROM schema")), ("",))[0]
     else:
         if chunks != len(reader.chunks):
-            found.warnings.append(
-                f"{found.path}: holds {count(chunks, 'chunk')}, and its index lists {len(reader.chunks)}; "
-                f"{_remedy(found.path, found.magic)}"
-            )
+            lists = f"its index lists {len(reader.chunks)}"
+            found.warnings.append(found.damaged(f"holds {count(chunks, 'chunk')}, and {lists}"))
         stated = sum(sum(info.connection_counts.values()) for info in reader.chunk_infos)
-    schemas: dict[tuple[str, str], int] = {}
-    borrowed = ""
+    schemas, borrowed = dict[tuple[str, str], int](), ""
     for number, connection in enumerate(reader.connections, start=1):
         kind, text = connection.msgtype, connection.msgdef.data
         if (schema := schemas.get((kind, text), 0)) == 0:
@@ -226,13 +210,11 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
             found.schemas[schema] = Schema(schema, data, encoding, kind)
         found.numbers[connection.id] = number
         metadata = {"offered_qos_profiles": qos[connection.id]} if qos.get(connection.id) else {}
-        found.channels[number] = Channel(
-            number, connection.topic, encodings.get(connection.id) or "cdr", metadata, schema
-        )
+        stored = encodings.get(connection.id) or "cdr"
+        found.channels[number] = Channel(number, connection.topic, stored, metadata, schema)
     if borrowed:
-        found.warnings.append(
-            f"{found.path}: the file does not hold the definitions of all its types; those of {borrowed} are used"
-        )
+        lacks = "the file does not hold the definitions of all its types"
+        found.warnings.append(f"{found.path}: {lacks}; those of {borrowed} are used")
     return int(stated)
 
 
@@ -294,8 +276,7 @@ def listed_parts(folder: Path) -> list[Path]:
     if not isinstance(names, list):
         return []
     # Old recorders wrote the path from the folder above.
-    parts = [folder / str(name) for name in names]
-    parts = [part if part.exists() else folder / PurePosixPath(part).name for part in parts]
+    parts = [part if (part := folder / str(n)).exists() else folder / PurePosixPath(str(n)).name for n in names]
     storage = str(about.get("storage_identifier") or "")  # `ros2 bag reindex` may leave it empty
     if storage not in ("", "mcap", "sqlite3"):
         raise BagError(f"{folder}: a recording in '{storage}' storage; convert it to MCAP with ros2 bag convert")
@@ -323,21 +304,15 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
             instead = f"{listed[0]}: metadata.yaml lists this file, and {found[0].name} is read, which is there instead"
             return found, False, [instead]
         others = f", or name one of those that are there: {file_names(found)}" if found else ""
-        raise BagError(
-            f"{folder}: metadata.yaml lists {file_names(listed)}, and none of them is there; copy them here{others}"
-        )
+        none = f"metadata.yaml lists {file_names(listed)}, and none of them is there"
+        raise BagError(f"{folder}: {none}; copy them here{others}")
     if not found:
         raise no_recording(folder, inside)
-    stems = {pair[0] if (pair := stem_and_index(p)) else p.name for p in found}
-    if len(stems) > 1:
-        raise BagError(
-            f"{folder}: without a metadata.yaml its files cannot be one recording; name them one by one: "
-            f"{file_names(found)}"
-        )
-    warnings = []
-    if (folder / "metadata.yaml").exists():
-        warnings.append(f"{folder}: its metadata.yaml cannot be used; the files were taken by their names")
-    return found, False, warnings
+    if len({pair[0] if (pair := stem_and_index(p)) else p.name for p in found}) > 1:
+        several = "without a metadata.yaml its files cannot be one recording"
+        raise BagError(f"{folder}: {several}; name them one by one: {file_names(found)}")
+    unusable = f"{folder}: its metadata.yaml cannot be used; the files were taken by their names"
+    return found, False, [unusable] * (folder / "metadata.yaml").exists()
 
 
 def survey(path: Path, indexed: bool = False) -> Contents:
@@ -374,11 +349,8 @@ def not_one_recording(parts: Sequence[Contents]) -> str:
 
 def _kinds(contents: Contents) -> set[tuple[str, str]]:
     """(topic, type) of every channel of a file."""
-    schemas = contents.schemas
-    return {
-        (c.topic, full_name(schemas[c.schema_id].name) if c.schema_id and c.schema_id in schemas else "")
-        for c in contents.channels.values()
-    }
+    types = {number: full_name(schema.name) for number, schema in contents.schemas.items() if number}
+    return {(c.topic, types.get(c.schema_id, "")) for c in contents.channels.values()}
 
 
 def _span(contents: Contents) -> tuple[int, int]:
@@ -389,10 +361,8 @@ def _longest_pause(contents: Contents) -> int:
     """Longest time without any message, ns."""
     if contents.indexed:
         contents = survey(contents.path)
-    times: list[int] = []
-    for block in contents.blocks:
-        times += (message[1] for message in messages(contents.records(block)))
-    return max((b - a for a, b in itertools.pairwise(sorted(times))), default=0)
+    times = sorted(message[1] for block in contents.blocks for message in messages(contents.records(block)))
+    return max((b - a for a, b in itertools.pairwise(times)), default=0)
 
 
 _LARGEST = 1 << 20  # bytes of one metadata record that is read
@@ -403,7 +373,7 @@ def metadata_pairs(recording: str | os.PathLike[str]) -> dict[str, str]:
     path = Path(recording)
     folder = path if path.is_dir() else path.parent
     custom = _about(folder).get("custom_data")
-    pairs = {str(key): str(value) for key, value in custom.items()} if isinstance(custom, dict) else {}
+    pairs = {str(key): str(value) for key, value in (custom if isinstance(custom, dict) else {}).items()}
     files = sorted(folder.glob("*.mcap")) if path.is_dir() else [path]
     for name, record in _records(files[0]) if files else []:
         for key, value in record.items():
@@ -415,20 +385,15 @@ def metadata_pairs(recording: str | os.PathLike[str]) -> dict[str, str]:
 def _records(path: Path) -> list[tuple[str, dict[str, str]]]:
     """Name and pairs of each metadata record; every other record is skipped without reading it."""
     found: list[tuple[str, dict[str, str]]] = []
-    try:
-        with open(path, "rb") as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            if stream.read(len(MAGIC)) != MAGIC:
-                return found
-            while len(header := stream.read(RECORD.size)) == RECORD.size:
-                opcode, length = RECORD.unpack(header)
-                if opcode in (0, Opcode.DATA_END, Opcode.FOOTER) or length > size - stream.tell():
-                    break
-                if opcode != Opcode.METADATA or length > _LARGEST:
-                    stream.seek(length, 1)
-                elif (record := parse(Metadata, stream.read(length))) is not None:
-                    found.append((record.name, dict(record.metadata)))
-    except OSError:
-        pass
+    with suppress(OSError), open(path, "rb") as stream:
+        size = path.stat().st_size
+        whole = stream.read(len(MAGIC)) == MAGIC
+        while whole and len(header := stream.read(RECORD.size)) == RECORD.size:
+            opcode, length = RECORD.unpack(header)
+            if opcode in (0, Opcode.DATA_END, Opcode.FOOTER) or length > size - stream.tell():
+                break
+            if opcode != Opcode.METADATA or length > _LARGEST:
+                stream.seek(length, 1)
+            elif (record := parse(Metadata, stream.read(length))) is not None:
+                found.append((record.name, dict(record.metadata)))
     return found

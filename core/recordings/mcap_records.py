@@ -33,10 +33,9 @@ from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
-from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.mcap_writer import McapWriter
-from uncertain_lti.recordings.unreadable import os_error
+from uncertain_lti.recordings.unreadable import changed, os_error
 
 try:
     from isal.isal_zlib import crc32 as crc32
@@ -128,7 +127,7 @@ class Contents:
             raise os_error(self.path, error) from None
         records, _ = inflate(block.compression, memoryview(stored), block.length)
         if len(records) < block.length:
-            raise BagError(f"{self.path}: the file changed while it was read; read it again when it is written")
+            raise changed(self.path)
         return bytes(records[: block.length])
 
 
@@ -270,7 +269,7 @@ def _record(writer: McapWriter, contents: Contents, place: int) -> str:
     except OSError as error:
         raise os_error(contents.path, error) from None
     if len(body) < size:
-        raise BagError(f"{contents.path}: the file changed while it was read; read it again when it is written")
+        raise changed(contents.path)
     if opcode == Opcode.ATTACHMENT:
         if (a := parse(Attachment, body)) is None:
             return f"an attachment at byte {place} is damaged"

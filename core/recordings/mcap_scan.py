@@ -32,6 +32,7 @@ from __future__ import annotations
 
 import bisect
 import struct
+from collections import Counter
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -72,6 +73,8 @@ _IN_SUMMARY: dict[int, Any] = {
 _LEAST_STRETCH = 1 << 14  # bytes
 _BARE_BLOCK = 1 << 22  # bytes; so much of a file without chunks is read at once
 _FIRST_WARNINGS = 3  # of a kind that are reported one by one
+_LIKE_THESE = {"place": "left out as damaged", "chunk": "left out for reasons like these",
+               "definition": "that contradicts an earlier one"}  # fmt: skip
 _LEAST_RECORDS = 1 << 20
 _LARGEST_DEFINITION = 1 << 24  # bytes
 _LARGEST_DEFINITIONS = 1 << 26  # bytes, all of a file
@@ -103,7 +106,7 @@ class _Scanner:
         self.sums = 0  # checksum of everything before the current record
         self.summary = _Summary(0, True)
         self.known: list[int] = []  # where chunks begin that the summary knows
-        self.warned = {"place": 0, "chunk": 0, "definition": 0}  # warnings of each kind
+        self.warned = Counter[str]()  # warnings of each kind
         self.chunk_warnings: list[str] = []
         self.damaged = False
         self.odd_records = 0
@@ -113,7 +116,7 @@ class _Scanner:
         self.stretch = _LEAST_STRETCH  # bytes outside chunks that are read at once
 
     def run(self) -> Contents:
-        found, path = self.found, self.found.path
+        found = self.found
         self.closed = self._at(found.size - len(MAGIC), len(MAGIC)) == MAGIC and found.size >= 2 * len(MAGIC)
         self._summary()
         ended = self._data_section()
@@ -123,29 +126,21 @@ class _Scanner:
         orphans = [channel for channel in found.tally if channel not in found.channels]
         lost = sum(found.tally.pop(channel).count for channel in orphans)
         if ended and not self.closed:
-            found.warnings.append(
-                f"{path}: no footer at its end; all its {count(found.count, 'message')} could be read"
-            )
+            self._warn(f"no footer at its end; all its {count(found.count, 'message')} could be read")
         elif not self.closed:
-            found.warnings.append(f"{path}: cut after {count(found.count, 'message')} (no footer); read up to the cut")
+            self._warn(f"cut after {count(found.count, 'message')} (no footer); read up to the cut")
         found.warnings += self.chunk_warnings
-        for kind, what in (
-            ("place", "left out as damaged"),
-            ("chunk", "left out for reasons like these"),
-            ("definition", "that contradicts an earlier one"),
-        ):
+        for kind, what in _LIKE_THESE.items():
             if (more := self.warned[kind] - _FIRST_WARNINGS) > 0:
-                found.warnings.append(f"{path}: {count(more, f'more {kind}')} {what}")
+                self._warn(f"{count(more, f'more {kind}')} {what}")
         if self.odd_records:
-            found.warnings.append(
-                f"{path}: {count(self.odd_records, 'record')} that cannot be read left out; "
-                f"the recorder or the disk damaged the file"
-            )
+            odd = count(self.odd_records, "record")
+            self._warn(f"{odd} that cannot be read left out; the recorder or the disk damaged the file")
         if lost:
-            found.warnings.append(f"{path}: {count(lost, 'message')} of channels that are nowhere described left out")
+            self._warn(f"{count(lost, 'message')} of channels that are nowhere described left out")
         stated = self.summary.statistics.message_count if self.summary.statistics else 0
         if stated > found.count:
-            found.warnings.append(f"{path}: its summary counts {count(stated, 'message')}, {found.count} could be read")
+            self._warn(f"its summary counts {count(stated, 'message')}, {found.count} could be read")
         return found
 
     # --- the data section -----------------------------------------------------------------------------------
@@ -167,7 +162,10 @@ class _Scanner:
             ends = opcode == Opcode.DATA_END or opcode == Opcode.FOOTER
             if opcode == 0 or end > following or (ends and following < size):
                 if self.closed or opcode == 0:
-                    self._damage(position, following)
+                    self.damaged = True
+                    if self._first("place"):
+                        rest = "the rest is" if following == size else f"{count(following - position, 'byte')} are"
+                        self._warn(f"damaged at byte {position}; {rest} left out")
                 elif opcode == Opcode.CHUNK:
                     self._chunk(position, begin, self.stream.read(size - begin), cut=True)
                 if following == size:
@@ -178,10 +176,7 @@ class _Scanner:
             if ends:
                 record = parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None
                 if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
-                    self.found.warnings.append(
-                        f"{self.found.path}: the checksum of the file is wrong, so a number in it may be; copy it "
-                        f"again if you can"
-                    )
+                    self._warn("the checksum of the file is wrong, so a number in it may be; copy it again if you can")
                 return True
             if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
                 position = self._bare(position, end, following)
@@ -201,11 +196,8 @@ class _Scanner:
                     left -= len(piece)
             position = end
 
-    def _damage(self, position: int, following: int) -> None:
-        self.damaged = True
-        if self._first("place"):
-            rest = "the rest is" if following == self.found.size else f"{count(following - position, 'byte')} are"
-            self.found.warnings.append(f"{self.found.path}: damaged at byte {position}; {rest} left out")
+    def _warn(self, text: str) -> None:
+        self.found.warnings.append(f"{self.found.path}: {text}")
 
     def _first(self, kind: str) -> bool:
         """Whether a warning of this kind is one of the first, which are reported one by one."""
@@ -232,62 +224,60 @@ class _Scanner:
         self.odd_records += found.short
 
     def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
+        """Take a chunk, or leave it out; what little a cut leaves of a chunk's beginning is reported with the cut."""
+        why = self._why_not(begin, content, cut)
+        if why and not cut:
+            self.damaged = True
+            if self._first("chunk"):
+                where = str(position)
+                if len(content) >= CHUNK.size:
+                    first, last, *_ = CHUNK.unpack_from(content)
+                    where += f" (log time {seconds(first)} to {seconds(last)} s)"
+                path = self.found.path
+                self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
+
+    def _why_not(self, begin: int, content: bytes, cut: bool) -> str:
+        """Take a chunk, unless there is a reason against it."""
         if len(content) < CHUNK.size:
-            self._leave_out(position, "its record is too short", cut)
-            return
-        first, last, stated, checksum, name_length = CHUNK.unpack_from(content)
-        where = f"{position} (log time {seconds(first)} to {seconds(last)} s)"
+            return "its record is too short"
+        _, _, stated, checksum, name_length = CHUNK.unpack_from(content)
         data_begin = CHUNK.size + name_length + 8
         if len(content) < data_begin:
-            self._leave_out(where, "its sizes contradict each other", cut)
-            return
+            return "its sizes contradict each other"
         compression = content[CHUNK.size : CHUNK.size + name_length].decode(errors="replace")
         (length,) = struct.unpack_from("<Q", content, data_begin - 8)
         data = memoryview(content)[data_begin : data_begin + length]
         if not cut and (data_begin + length != len(content) or (not compression and length != stated)):
-            self._leave_out(where, "its sizes contradict each other")
-            return
+            return "its sizes contradict each other"
         if compression and stated > LARGEST_CHUNK and not cut:
-            self._leave_out(
-                where,
+            return (
                 f"it states {count(stated, 'byte')} decompressed, and at most {LARGEST_CHUNK >> 20} MiB are taken: "
-                f"write smaller ones with `mcap compress {self.found.path.name} -o smaller.mcap`",
+                f"write smaller ones with `mcap compress {self.found.path.name} -o smaller.mcap`"
             )
-            return
         stated = min(stated, max(LARGEST_CHUNK, len(data)))
         if compression and stated > self.bytes_left:
-            self._leave_out(where, f"with it the file is over {LARGEST_RATIO} times its size when decompressed", cut)
-            return
+            return f"with it the file is over {LARGEST_RATIO} times its size when decompressed"
         records, trouble = inflate(compression, data, stated)
         self.bytes_left -= len(records) if compression else 0
         if cut:
             records = records[:stated]
-        else:
-            if not trouble and len(records) != stated:
-                trouble = f"it holds {'more' if len(records) > stated else 'less'} than it states"
-            if not trouble and checksum not in (0, crc32(records)):
-                trouble = "its checksum is wrong"
-            if trouble:
-                self._leave_out(where, trouble)
-                return
+        elif trouble:
+            return trouble
+        elif len(records) != stated:
+            return f"it holds {'more' if len(records) > stated else 'less'} than it states"
+        elif checksum not in (0, crc32(records)):
+            return "its checksum is wrong"
         found = walk_records(records, 0, len(records), self.records_left + 1 if compression else len(records))
         if compression:
-            self.records_left -= found.number
-            if self.records_left < 0:
+            if found.number > self.records_left:
                 self.records_left = 0
-                self._leave_out(where, "with it the file holds more records than bytes", cut)
-                return
+                return "with it the file holds more records than bytes"
+            self.records_left -= found.number
         self._take(records, found)
         self.odd_records += found.stop < len(records) and not cut
         if len(found.channel):
             self._block(begin + data_begin, len(data), compression, found.stop, _tally(found))
-
-    def _leave_out(self, where: object, why: str, cut: bool = False) -> None:
-        if not cut:  # what little a cut leaves of a chunk's beginning is reported with the cut
-            self.damaged = True
-            if self._first("chunk"):
-                path = self.found.path
-                self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
+        return ""
 
     def _block(self, offset: int, size: int, compression: str, length: int, tally: dict[int, Tally]) -> None:
         start, end = min(entry.first for entry in tally.values()), max(entry.last for entry in tally.values())
@@ -300,24 +290,20 @@ class _Scanner:
                 self.found.tally[channel] = more
 
     def _definition(self, opcode: int, content: bytes | memoryview) -> None:
-        record = None
-        if len(content) <= _LARGEST_DEFINITION:
-            record = parse(Schema if opcode == Opcode.SCHEMA else Channel, content)
-        if record is None:
-            self.odd_records += 1
-            return
-        table: dict[int, Any] = self.found.schemas if isinstance(record, Schema) else self.found.channels
-        if (known := table.get(record.id)) is None:
+        is_schema = opcode == Opcode.SCHEMA
+        table: dict[int, Any] = self.found.schemas if is_schema else self.found.channels
+        fits = len(content) <= _LARGEST_DEFINITION
+        record = parse(Schema if is_schema else Channel, content) if fits else None
+        known = record and table.get(record.id)
+        if record and not known:
             self.definitions_left -= len(content)
-            if self.definitions_left >= 0:
-                table[record.id] = record
-            else:
-                self.odd_records += 1
+        if record is None or (not known and self.definitions_left < 0):
+            self.odd_records += 1
+        elif not known:
+            table[record.id] = record
         elif known != record and not self.damaged and self._first("definition"):
-            what = "schema" if isinstance(record, Schema) else f"channel ({record.topic})"
-            self.found.warnings.append(
-                f"{self.found.path}: {what} {record.id} is defined twice, differently; the first one counts"
-            )
+            what = "schema" if is_schema else f"channel ({record.topic})"
+            self._warn(f"{what} {record.id} is defined twice, differently; the first one counts")
 
     def _summary(self) -> None:
         """What the summary of a closed file states, and where chunks begin that it knows, if its checksum holds."""
@@ -325,7 +311,7 @@ class _Scanner:
         if stated is None:
             return
         if not stated.whole:
-            self.found.warnings.append(f"{self.found.path}: the checksum of its summary is wrong; read without it")
+            self._warn("the checksum of its summary is wrong; read without it")
             return
         self.summary = stated
         places = (chunk.chunk_start_offset for chunk in stated.chunks)

@@ -19,6 +19,7 @@ import struct
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import BinaryIO
 
 from uncertain_lti.base.errors import BagError
@@ -52,13 +53,12 @@ def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
         import lz4.frame  # type: ignore[import-untyped]
 
         return name, lz4.frame.compress
-    if name == "":
-        return "", bytes
-    try:
-        import zstandard
-    except ImportError:
-        return "", bytes
-    return "zstd", zstandard.ZstdCompressor(level=1).compress
+    if name != "":
+        with suppress(ImportError):
+            import zstandard
+
+            return "zstd", zstandard.ZstdCompressor(level=1).compress
+    return "", bytes
 
 
 class McapWriter:
@@ -72,21 +72,18 @@ class McapWriter:
         self._stream, self._at, self._sum = stream, 0, 0
         self._name, self._compress = _compressor(compression)
         self._numbers: dict[object, int] = {}  # of schemas and channels, by what they say
-        self._summary: dict[int, list[bytes]] = {_SCHEMA: [], _CHANNEL: [], _STATISTICS: []}
-        self._summary |= {_CHUNK_INDEX: [], _ATTACHMENT_INDEX: [], _METADATA_INDEX: []}
+        groups = (_SCHEMA, _CHANNEL, _STATISTICS, _CHUNK_INDEX, _ATTACHMENT_INDEX, _METADATA_INDEX)
+        self._summary: dict[int, list[bytes]] = {opcode: [] for opcode in groups}
         self._counts: Counter[int] = Counter()
-        self._parts: list[bytes] = []
-        self._length = 0
+        self._parts, self._length = list[bytes](), 0
         self._index: dict[int, bytearray] = {}
-        self._first: int | None = None
-        self._last = 0
-        self._begin_of_chunk, self._end_of_chunk = 0, 0
+        self._first, self._last = 1 << 64, 0
+        self._span = 0, 0  # first and last log time of the chunk
         self._write(MAGIC + _record(_HEADER, _text("ros2") + _text(library)))
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
         """Number of a schema in the file, which has it or gets it."""
-        body = _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data
-        return self._declare(_SCHEMA, body)
+        return self._declare(_SCHEMA, _text(name) + _text(encoding) + struct.pack("<I", len(data)) + data)
 
     def channel(self, schema: int, topic: str, encoding: str = "cdr", metadata: Mapping[str, str] | None = None) -> int:
         """Number of a channel in the file, which has it or gets it; schema 0 is none."""
@@ -95,12 +92,10 @@ class McapWriter:
 
     def message(self, channel: int, log_time: int, data: bytes) -> None:
         """Add one message."""
-        if not self._parts:
-            self._begin_of_chunk = log_time
-        self._end_of_chunk = log_time
-        entry = INDEX_ENTRY.pack(log_time, self._length)
-        self._index.setdefault(channel, bytearray()).extend(entry)
-        sequence = self._counts[channel] + len(self._index[channel]) // INDEX_ENTRY.size - 1
+        self._span = self._span[0] if self._parts else log_time, log_time
+        entries = self._index.setdefault(channel, bytearray())
+        sequence = self._counts[channel] + len(entries) // INDEX_ENTRY.size
+        entries += INDEX_ENTRY.pack(log_time, self._length)
         head = MESSAGE_HEAD.pack(_MESSAGE, 22 + len(data), channel, sequence, log_time, log_time)
         self._parts += (head, data)
         self._length += len(head) + len(data)
@@ -132,7 +127,7 @@ class McapWriter:
         counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
         kinds = (_SCHEMA, _CHANNEL, _ATTACHMENT_INDEX, _METADATA_INDEX, _CHUNK_INDEX)
         statistics = struct.pack("<QHIIII", sum(self._counts.values()), *(len(self._summary[kind]) for kind in kinds))
-        statistics += struct.pack("<QQI", self._first or 0, self._last, len(counts)) + counts
+        statistics += struct.pack("<QQI", self._first if counts else 0, self._last, len(counts)) + counts
         self._summary[_STATISTICS].append(_record(_STATISTICS, statistics))
         summary, offsets = self._at, b""
         self._sum = 0
@@ -166,13 +161,12 @@ class McapWriter:
         if self._parts:
             parts, index = self._parts, self._index
             self._parts, self._length, self._index = [], 0, {}
-            self._write_chunk(b"".join(parts), index, (self._begin_of_chunk, self._end_of_chunk))
+            self._write_chunk(b"".join(parts), index, self._span)
 
     def _write_chunk(self, records: bytes, index: Mapping[int, bytes | bytearray], span: tuple[int, int]) -> None:
         name, data = self._name, self._compress(records)
         times = struct.pack("<QQ", *span)
-        self._first = span[0] if self._first is None else min(self._first, span[0])
-        self._last = max(self._last, span[1])
+        self._first, self._last = min(self._first, span[0]), max(self._last, span[1])
         head = times + struct.pack("<QI", len(records), zlib.crc32(records)) + _text(name)
         head += struct.pack("<Q", len(data))
         start, length = self._at, len(head) + len(data)

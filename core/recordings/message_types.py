@@ -201,13 +201,11 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
             raise TypesysError(f"its definition is {len(text)} bytes long")
         if text.strip():
             types = _parse(type_name, encoding, _readable(encoding, text))
-        elif type_name in _jazzy().fielddefs:
+        elif type_name in _store().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
-            raise TypesysError(
-                f"the file holds no definition of {type_name}, nor does ROS 2; convert it to MCAP where its package is "
-                f"installed (`ros2 bag convert`)"
-            )
+            remedy = "convert it to MCAP where its package is installed (`ros2 bag convert`)"
+            raise TypesysError(f"the file holds no definition of {type_name}, nor does ROS 2; {remedy}")
         used: dict[str, int] = {}
         _complete(type_name, types, (), used)
         _hold_bounds({name: types[name] for name in used})
@@ -223,7 +221,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
 
 def jazzy_text(type_name: str) -> str:
     """Definition of a type of ROS 2 Jazzy and of all it uses, as in .msg files."""
-    return str(_jazzy().generate_msgdef(type_name, ros_version=2)[0])
+    return distribution_text(type_name, "jazzy")[0]
 
 
 def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
@@ -256,12 +254,8 @@ def undefined(type_name: str, reason: str) -> Definition:
     return Definition(type_name, {}, get_typestore(Stores.EMPTY), reason)
 
 
-def _jazzy() -> Typestore:
-    return _store("JAZZY")
-
-
 @functools.cache
-def _store(distribution: str) -> Typestore:
+def _store(distribution: str = "JAZZY") -> Typestore:
     return get_typestore(Stores[f"ROS2_{distribution}"])
 
 
@@ -292,12 +286,10 @@ def _parse(type_name: str, encoding: str, text: str) -> dict[str, Any]:
         raise TypesysError(f"its schema is written in '{encoding}' (ros2msg and ros2idl are read)")
     text = re.sub(r"(?m)^[ \t]*#.*$", "", text)  # the parser does not know #include, and the parts follow anyway
     separator = "=" * 80 + "\n"
-    types: dict[str, Any] = {}
     if not text.startswith(f"{separator}IDL: "):
         return dict(get_types_from_idl(text))
-    for part in text.split(separator)[1:]:
-        types |= get_types_from_idl(part.partition("\n")[2])
-    return types
+    parts = (part.partition("\n")[2] for part in text.split(separator)[1:])
+    return {name: of for part in parts for name, of in get_types_from_idl(part).items()}
 
 
 def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], done: dict[str, int]) -> int:
@@ -309,9 +301,9 @@ def _complete(type_name: str, types: dict[str, Any], above: tuple[str, ...], don
     if len(above) == _DEEPEST:
         raise TypesysError(f"it nests messages more than {_DEEPEST} deep")
     if type_name not in types:
-        if type_name not in _jazzy().fielddefs:
+        if type_name not in _store().fielddefs:
             raise TypesysError(f"{type_name} is used and not defined")
-        types[type_name] = _jazzy().fielddefs[type_name]
+        types[type_name] = _store().fielddefs[type_name]
     constants, fields = types[type_name][:2]
     if not fields:
         fields = [(_NOTHING, (Nodetype.BASE, ("uint8", 0)))]
@@ -350,9 +342,7 @@ def _field_type(description: Any) -> FieldType:
     if node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
         array = what[1] if node == Nodetype.ARRAY else 0
         node, what = what[0]
-    if node == Nodetype.NAME:
-        return FieldType("message", what, array)
-    return FieldType(_KINDS[what[0]], what[0], array)
+    return FieldType("message", what, array) if node == Nodetype.NAME else FieldType(_KINDS[what[0]], what[0], array)
 
 
 def _one_line(error: Exception) -> str:

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import printable
-from uncertain_lti.recordings.message_types import RawMessage
+from uncertain_lti.recordings.message_types import Definition, RawMessage
 from uncertain_lti.signals.field_path import FieldPath, TypeFields, has_names, signal_paths
 
 
@@ -152,63 +152,57 @@ _FIRST = 50  # messages of a topic that are looked at for the names of its entri
 _BURSTS = 10  # times that the mean step is longer than the median one where messages come in bursts
 
 
+class _Seen:
+    """What was seen of one topic: log times, those less the stamps, stamps of 0, its longest and its first messages."""
+
+    def __init__(self) -> None:
+        self.times, self.offsets, self.zeros = array("Q"), array("d"), 0
+        self.longest: RawMessage | None = None
+        self.first: list[RawMessage] = []
+        self.most = 0  # of the first
+
+
 def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage]) -> list[TopicFacts]:
     """Facts about every topic of a recording; reads its messages once, and decodes one of each topic.
 
     Field paths are taken from the longest message of a topic, so that its arrays have their lengths.
     """
-    times: dict[str, array[int]] = {topic: array("Q") for topic in topics}
-    offsets: dict[str, array[float]] = {topic: array("d") for topic in topics}
-    zeros = dict.fromkeys(topics, 0)
-    longest: dict[str, RawMessage] = {}
-    first: dict[str, list[RawMessage]] = {}
-    rest: dict[str, int] = {}
+    every = {topic: _Seen() for topic in topics}
     for raw in messages:
-        channel, topic = raw.channel, raw.channel.topic
-        if not channel.counted:
+        if not raw.channel.counted:
             continue
-        times[topic].append(raw.log_time_ns)
-        if channel.definition.reason:
+        seen, definition = every[raw.topic], raw.channel.definition
+        seen.times.append(raw.log_time_ns)
+        if definition.reason:
             continue
-        if topic not in longest or len(raw.data) > len(longest[topic].data):
-            longest[topic] = raw
-        if topic not in first:
-            definition = channel.definition
-            first[topic], rest[topic] = [], _FIRST * has_names(definition.fields, definition.type_name)
-        if rest[topic]:
-            rest[topic] -= 1
-            first[topic].append(raw)
-        if channel.definition.has_header:
-            if stamp := channel.definition.stamp_ns(raw.data):
-                offsets[topic].append((raw.log_time_ns - stamp) * 1e-9)
+        if seen.longest is None:
+            seen.most = _FIRST * has_names(definition.fields, definition.type_name)
+        if seen.longest is None or len(raw.data) > len(seen.longest.data):
+            seen.longest = raw
+        if len(seen.first) < seen.most:
+            seen.first.append(raw)
+        if definition.has_header:
+            if stamp := definition.stamp_ns(raw.data):
+                seen.offsets.append((raw.log_time_ns - stamp) * 1e-9)
             else:
-                zeros[topic] += 1
-    return [
-        _facts(info, times[topic], offsets[topic], zeros[topic], longest.get(topic), first.get(topic, ()))
-        for topic, info in topics.items()
-    ]
+                seen.zeros += 1
+    return [_facts(info, every[topic]) for topic, info in topics.items()]
 
 
-def _facts(
-    info: TopicInfo,
-    times: array[int],
-    offsets: array[float],
-    zeros: int,
-    longest: RawMessage | None,
-    first: Sequence[RawMessage],
-) -> TopicFacts:
+def _facts(info: TopicInfo, seen: _Seen) -> TopicFacts:
+    def paths(raw: RawMessage, definition: Definition) -> Iterator[str]:
+        return signal_paths(definition.fields, definition.type_name, definition.decode(raw.data))
+
+    times, offsets, zeros = seen.times, seen.offsets, seen.zeros
     steps = [b - a for a, b in itertools.pairwise(times)]
     step, bursts = usual_step(median(steps), times[-1] - times[0], len(steps)) if steps else (0.0, False)
     fields: tuple[str, ...] = ()
     elsewhere: dict[str, None] = {}
-    if longest:
-        definition = longest.channel.definition
+    if seen.longest:
         with suppress(BagError):  # `messages` tells it
-            message = definition.decode(longest.data)
-            fields = tuple(signal_paths(definition.fields, definition.type_name, message))
-            for raw in first:
-                message = definition.decode(raw.data)
-                elsewhere |= dict.fromkeys(signal_paths(definition.fields, definition.type_name, message))
+            fields = tuple(paths(seen.longest, seen.longest.channel.definition))
+            for raw in seen.first:
+                elsewhere |= dict.fromkeys(paths(raw, seen.longest.channel.definition))
     return TopicFacts(
         info,
         rate=1e9 / step if step else None,

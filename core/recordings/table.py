@@ -27,8 +27,7 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import YEARS as _YEARS
-from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
+from uncertain_lti.recordings.table_files import YEARS, Column, RawTable, once, read_table
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import UNITS, TableLayout
@@ -76,55 +75,51 @@ def find_column(path: object, wanted: str, columns: Sequence[str], what: str) ->
     for name in columns:
         if wanted in (name, field_name(name)):
             return name
-    raise BagError(
-        f"{path}: there is no column '{wanted}', which the signals file names for {what}{meant(wanted, columns)}; "
-        f"columns there: {shortlist(list(columns), 50)}"
-    )
+    near, there = meant(wanted, columns), shortlist(list(columns), 50)
+    none = f"there is no column '{wanted}', which the signals file names for {what}{near}"
+    raise BagError(f"{path}: {none}; columns there: {there}")
 
 
 def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, NDArray[np.int64], str]:
-    """Instants of the rows.
+    """Column of the time, instants of the rows, and what was taken for granted.
 
     Returns (rows,): ns; `NO_TIME` where a row has none.
     """
-    names = list(table.columns)
-    words = ""
     if layout.time is not None:
-        column = find_column(path, layout.time, names, "the time")
+        column, words = find_column(path, layout.time, list(table.columns), "the time"), ""
     else:
         column, words = _likely(path, table)
+    said = [words]
     values = table.columns[column]
     where = f"{path}: column '{column}'"
     if values.ndim != 1:
         raise BagError(f"{where}: has several numbers a row, so it is no time; name another, `table: {{time: COLUMN}}`")
     if values.dtype.kind == "M":
-        return column, values.astype("datetime64[ns]").astype(np.int64), words
-    if values.dtype.kind == "O":
+        times = values.astype("datetime64[ns]").astype(np.int64)
+    elif values.dtype.kind == "O":
         cells = values.tolist()
         if layout.time is None and (days := _days_beside(table, column)):
             cells = [f"{day} {cell}".strip() for day, cell in zip(table.columns[days].tolist(), cells, strict=True)]
-            words = f"its days are those of column '{days}'"
+            said.append(f"its days are those of column '{days}'")
         times, order = _of_text(where, cells)
-        words = " and ".join(part for part in (words, order) if part)
-        return column, times, f"column '{column}': {words}" if words else ""
-    if layout.unit is None and _compact(values):
+        said.append(order)
+    elif layout.unit is None and _compact(values):
         times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
-        return column, times, words
-    unit = layout.unit or _unit(column, values, table.units.get(column, ""))
-    days = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
-    if layout.unit is None and (unit != "s" or days):
-        words = f"{words}{' and ' if words else ''}its numbers are taken for {unit}{days}"
-    return column, _of_numbers(where, table, column, UNITS[unit]), f"column '{column}': {words}" if words else ""
+    else:
+        unit = layout.unit or _unit(column, values, table.units.get(column, ""))
+        days = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
+        if layout.unit is None and (unit != "s" or days):
+            said.append(f"its numbers are taken for {unit}{days}")
+        times = _of_numbers(where, table, column, UNITS[unit])
+    words = " and ".join(filter(None, said))
+    return column, times, f"column '{column}': {words}" if words else ""
 
 
 def _likely(path: object, table: RawTable) -> tuple[str, str]:
     """The column that is a time by its name, or by what is in it."""
     names = list(table.columns)
-    called = []
-    for pattern in _NAMES:
-        for name in names:
-            if re.fullmatch(pattern, _bare(name)) and table.columns[name].ndim == 1:
-                called.append(name)
+    plain = [name for name in names if table.columns[name].ndim == 1]
+    called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
     still = [name for name in called if _stands_still(table.columns[name])]
     called = [name for name in called if name not in still]
     if likely := [name for name in called if _may_be(table.columns[name])] or called:
@@ -155,18 +150,14 @@ def _bare(name: str) -> str:
 
 def _grows(column: Column) -> bool:
     """Whether numbers grow from each row to the next."""
-    return (
-        column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2 and bool((column[1:] > column[:-1]).all())
-    )
+    numbers = column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2
+    return numbers and bool((column[1:] > column[:-1]).all())
 
 
 def _days_beside(table: RawTable, column: str) -> str:
     """The one column of days alone, where this one has times of day alone; else nothing."""
-    first = {
-        name: _spelt(next((str(cell) for cell in cells.tolist() if cell), ""))
-        for name, cells in table.columns.items()
-        if cells.dtype.kind == "O"
-    }
+    texts = [(name, cells.tolist()) for name, cells in table.columns.items() if cells.dtype.kind == "O"]
+    first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts}
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
     return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
 
@@ -177,19 +168,13 @@ def _stands_still(column: Column) -> bool:
 
 def _may_be(column: Column) -> bool:
     """Numbers, instants, or text that reads as one."""
-    if column.dtype.kind != "O":
-        return True
-    return _is_instant(next((str(cell) for cell in column if cell), ""))
+    text = _spelt(next((str(cell) for cell in column if cell), "")) if column.dtype.kind == "O" else ""
+    return column.dtype.kind != "O" or bool(_ISO.match(text) or _CLOCK.match(text) or _DAY.fullmatch(text))
 
 
 def _goes_forward(column: Column) -> bool:
     """Whether it may be a time beside another that cannot be read: a temperature is none."""
     return column.dtype.kind not in "iuf" or bool(abs(np.mean(np.sign(np.diff(column)))) > 0.8)
-
-
-def _is_instant(text: str) -> bool:
-    text = _spelt(text)
-    return bool(_ISO.match(text) or _CLOCK.match(text) or _DAY.fullmatch(text))
 
 
 def _spelt(text: str) -> str:
@@ -259,18 +244,15 @@ def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[
     if not known.any():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     sizes = np.abs(np.where(known, values, 0.0)) * factor
-    if np.median(sizes[known]) <= LATEST:  # the unit is right, and a row beyond is damaged
-        known &= sizes <= LATEST
-    largest = float(sizes[known].max())
-    if largest > LATEST:
+    if np.median(sizes[known]) > LATEST:
         raise _too_late(where)
+    known &= sizes <= LATEST  # the unit is right, and a row beyond is damaged
+    largest = float(sizes[known].max())
     times = np.full(len(values), NO_TIME, dtype=np.int64)
-    if largest > _LARGE and table.exact is not None:
-        cells = table.exact(name)
-        if len(cells) == len(values):
-            times[known] = [_exactly(cells[i], factor, float(values[i])) for i in np.flatnonzero(known).tolist()]
-            return times
     times[known] = np.rint(values[known] * factor).astype(np.int64)
+    cells = table.exact(name) if largest > _LARGE and table.exact is not None else ()
+    if len(cells) == len(values):
+        times[known] = [_exactly(cells[i], factor, float(values[i])) for i in np.flatnonzero(known).tolist()]
     return times
 
 
@@ -282,52 +264,47 @@ def _exactly(cell: str, factor: int, value: float) -> int:
 
 
 def _too_late(where: str) -> BagError:
-    return BagError(
-        f"{where}: is past the year 2262 in ns; say what unit it has in the signals file, `table: {{unit: ms}}`"
-    )
+    remedy = "say what unit it has in the signals file, `table: {unit: ms}`"
+    return BagError(f"{where}: is past the year 2262 in ns; {remedy}")
 
 
 def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
     """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted."""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
-    iso, order = _as_iso(where, [_spelt(str(cell)) for cell in cells], cells)
-    plain: list[str] = []
-    rows: list[int] = []
-    shifts: list[int] = []
-    for row, cell in enumerate(iso):
-        text = str(cell).strip()
-        if not text:
-            continue
+    spelt, order = _as_iso(where, [_spelt(str(cell)) for cell in cells], cells)
+    for row, text in enumerate(spelt):
         if match := _ISO.match(text):
-            day, clock, zone = match.groups()
-            plain.append(f"{day}T{(clock or '00:00').replace(',', '.')}")
-            rows.append(row)
-            shifts.append(_shift(where, zone))
+            times[row] = _of_iso(where, *match.groups())
         elif match := _CLOCK.match(text):
             hours, minutes, seconds = match.groups()
             fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
             times[row] = (int(hours) * 60 + int(minutes)) * 60 * 10**9 + int(fraction)
-        else:
-            given = str(cells[row]).strip()[:40]
-            raise BagError(
-                f"{where}: '{given}' in row {row + 1} is neither a number nor an ISO time such as "
-                f"2026-11-22T06:28:01.25Z; write all of them as one or the other"
-                + ", with a point before decimals"
-                * bool(re.fullmatch(r"-?\d+,\d+", text))
-            )
-    if plain:
-        for text in plain:
-            if not _YEARS[0] <= int(text[:4]) <= _YEARS[1]:
-                raise BagError(f"{where}: '{text[:40]}' is before {_YEARS[0]} or after {_YEARS[1]}; mend it")
-        try:
-            parsed = np.array(plain, dtype="datetime64[ns]").astype(np.int64)
-        except ValueError:
-            bad = next(text for text in plain if not _parses(text))
-            raise BagError(f"{where}: '{bad[:40]}' is no day or time that there is; mend it") from None
-        times[rows] = parsed - np.array(shifts, dtype=np.int64)
+        elif text:
+            given, point = str(cells[row]).strip()[:40], bool(re.fullmatch(r"-?\d+,\d+", text))
+            neither = "is neither a number nor an ISO time such as 2026-11-22T06:28:01.25Z"
+            remedy = "write all of them as one or the other" + ", with a point before decimals" * point
+            raise BagError(f"{where}: '{given}' in row {row + 1} {neither}; {remedy}")
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     return times, order
+
+
+def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> int:
+    """One instant, ns."""
+    text = f"{day}T{(clock or '00:00').replace(',', '.')}"
+    if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
+        raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
+    try:
+        instant = int(np.datetime64(text, "ns").astype(np.int64))
+    except ValueError:
+        raise BagError(f"{where}: '{text[:40]}' is no day or time that there is; mend it") from None
+    if not zone or zone in ("Z", "UTC"):
+        return instant
+    hours, minutes = int(zone[1:3]), int(zone[-2:])
+    if hours > _LARGEST_ZONE or minutes > 59:
+        raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
+    before_utc = (hours * 60 + minutes) * 60 * 10**9
+    return instant + before_utc if zone[0] == "-" else instant - before_utc
 
 
 def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
@@ -335,9 +312,8 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
 
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
     """
-    texts = [str(cell).strip() for cell in cells if str(cell).strip()]
-    found = [m for m in map(_DAY.fullmatch, texts) if m is not None]
-    if not found or len(found) < len(texts):
+    found = [match for cell in cells if cell if (match := _DAY.fullmatch(cell))]
+    if not found or len(found) < sum(map(bool, cells)):
         return cells, ""
     orders = {}
     tried = [("day, month, year", 1, 2, 3), ("month, day, year", 2, 1, 3)]
@@ -358,39 +334,19 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
         first = next(str(cell).strip() for cell in given if str(cell).strip())
         note = f"'{first[:40]}' is taken for {(taken or even or [''])[0]}"
     if not taken:
-        raise BagError(
-            f"{where}: '{found[0][0][:40]}' and the others do not say which is day and which is month; write times "
-            f"such as 2026-11-22T06:28:01.25Z"
-        )
+        which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
+        raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
     iso = iter(orders[taken[0]])
-    return [next(iso) if str(cell).strip() else cell for cell in cells], note
+    return [cell and next(iso) for cell in cells], note
 
 
 def _is_even(texts: Sequence[str]) -> bool:
     """Whether no step between these instants is much longer than the usual one."""
-    if not all(map(_parses, texts)):
-        return False
-    steps = np.diff(np.array([text.replace(",", ".") for text in texts], dtype="datetime64[ms]").astype(np.int64))
-    return len(steps) > 1 and bool(steps.max() <= 2 * np.median(steps))
-
-
-def _parses(text: str) -> bool:
     try:
-        np.datetime64(text, "ns")
+        steps = np.diff(np.array(texts, dtype="datetime64[ms]").astype(np.int64))
     except ValueError:
         return False
-    return True
-
-
-def _shift(where: str, zone: str | None) -> int:
-    """Nanoseconds by which a zone is before UTC."""
-    if not zone or zone in ("Z", "UTC"):
-        return 0
-    sign = -1 if zone[0] == "-" else 1
-    digits = zone[1:].replace(":", "")
-    if int(digits[:2]) > _LARGEST_ZONE or int(digits[2:]) > 59:
-        raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
-    return sign * (int(digits[:2]) * 60 + int(digits[2:])) * 60 * 10**9
+    return len(steps) > 1 and bool(steps.max() <= 2 * np.median(steps))
 
 
 TOPIC = "/table"
@@ -400,7 +356,6 @@ TYPE = "table"
 
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
-_SECOND = 10**9
 _DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
@@ -422,84 +377,43 @@ class Table(Recording):
     `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run.
     """
 
-    def __init__(self, path: Path, layout: TableLayout | None = None) -> None:
+    def __init__(self, path: Path, layout: TableLayout | None = None, run: _Run | None = None) -> None:
         layout = layout or TableLayout()
-        file, run = _file_and_run(path)
-        if run is not None and layout.runs is None:
-            raise BagError(f"{path}: names a run; say in the signals file which column does, `table: {{runs: COLUMN}}`")
-        raw = _read(file)
-        runs = None if run is None else _runs(file, raw, layout)
-        if runs is not None and run not in runs:
-            raise BagError(f"{path}: there is no run '{run}' in {file}; there are {shortlist(list(runs), 12)}")
-        timed = instants(file, raw, layout)
-        self._take(path, file, layout, raw, timed, None if runs is None or run is None else runs[run])
-
-    @classmethod
-    def every_run(cls, path: Path, layout: TableLayout | None = None) -> list[Table]:
-        """Every run of a file; the file itself where the layout names no column for them."""
-        layout = layout or TableLayout()
-        file, run = _file_and_run(path)
-        if run is not None or layout.runs is None:
-            return [cls(path, layout)]
-        raw = _read(file)
-        column, times, words = instants(file, raw, layout)
-        tables = []
-        for name, rows in _runs(file, raw, layout).items():
-            table = cls.__new__(cls)
-            table._take(file.with_name(f"{file.name}[{name}]"), file, layout, raw, (column, times, words), rows)
-            tables.append(table)
-            raw.notes, words = [], ""  # once are enough
-        if not tables:
-            raise BagError(f"{file}: column '{layout.runs}' is empty in every row, so it names no run")
-        return tables
-
-    def _take(
-        self,
-        path: Path,
-        file: Path,
-        layout: TableLayout,
-        raw: RawTable,
-        timed: tuple[str, NDArray[np.int64], str],
-        rows: NDArray[np.intp] | None,
-    ) -> None:
+        file, raw, (time, times, words), rows = run or _one_run(path, layout)
         self.path, self.parts, self.layout = path, (file,), layout
         self.size = file.stat().st_size
-        time, times, words = timed
         self._warnings = [f"{file}: {note}" for note in [*raw.notes, *([words] if words else [])]]
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
         kept = np.arange(len(times)) if rows is None else rows
         known = times[kept] != NO_TIME
-        if not known.all():
-            number = int(np.count_nonzero(~known))
-            self._warnings.append(f"{path}: {plural(number, 'row')} without a time left out")
+        if missing_time := int(np.count_nonzero(~known)):
+            self._warnings.append(f"{path}: {plural(missing_time, 'row')} without a time left out")
             kept = kept[known]
         steps = np.diff(times[kept])
         if (steps < 0).any() and (steps <= 0).all():
             kept = kept[::-1]
             self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
+        names = [name for name in raw.columns if name not in apart]
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
-            columns = {name: raw.columns[name][kept] for name in raw.columns if name not in apart}
-            number, unit = _for_each_time(times[kept], columns)
+            number, unit = _for_each_time(times[kept], {name: raw.columns[name][kept] for name in names})
+            runs = f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
             self._warnings.append(
                 f"{path}: {equal} of {len(kept)} rows have the time of a row before, and only the first of such rows "
-                f"counts: are the {number} rows of a time one for each of {number} units? then "
-                + f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
-                + "write a file for each; else write times with more decimals"
+                f"counts: are the {number} rows of a time one for each of {number} units? then {runs}write a file for "
+                f"each; else write times with more decimals"
             )
         self.times = times[kept]
-        names = [name for name in raw.columns if name not in apart]
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
-        self.columns_by_field: dict[str, Column] = {
-            field: raw.columns[name][here] for field, name in zip(once(map(field_name, names), "_"), names, strict=True)
-        }
+        fields = zip(once(map(field_name, names), "_"), names, strict=True)
+        self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
         first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
-        readable, reason = bool(self.columns_by_field), ""
-        if not readable:
+        reason = ""
+        if not names:
             reason = f"there is no column but the time, '{time}'; choose another file"
-        elif names_signals := _names_signals(self.columns_by_field):
-            readable = False
-            reason = f"column '{names_signals}' names the signal of a row's one number; write a column for each signal"
-        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), file.suffix[1:].lower(), readable, reason, first, last)}
+        elif of := _names_signals(self.columns_by_field):
+            reason = f"column '{of}' names the signal of a row's one number; write a column for each signal"
+        kind = file.suffix[1:].lower()
+        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, reason, first, last)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""
@@ -519,13 +433,9 @@ class Table(Recording):
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Rows, one after the other."""
-        if not self._require(topics):
-            return iter(())
-        names, columns = list(self.columns_by_field), list(self.columns_by_field.values())
-        return (
-            (TOPIC, int(time), SimpleNamespace(**{n: c[row] for n, c in zip(names, columns, strict=True)}))
-            for row, time in enumerate(self.times)
-        )
+        rows = enumerate(self.times if self._require(topics) else ())
+        columns = self.columns_by_field.items()
+        return ((TOPIC, int(time), SimpleNamespace(**{name: c[row] for name, c in columns})) for row, time in rows)
 
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
@@ -549,23 +459,18 @@ class Table(Recording):
         """Rate, gaps and columns."""
         steps = np.diff(self.times)
         step = float(np.median(steps)) if len(steps) else 0.0
-        fields = []
-        for name, column in self.columns_by_field.items():
-            if _field_type(column).kind == "number":
-                fields.append(name if column.ndim == 1 else f"{name}[0..{column.shape[1] - 1}]")
+        numbers = [(name, c) for name, c in self.columns_by_field.items() if _field_type(c).kind == "number"]
+        fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in numbers)
         gap = float(steps.max()) * 1e-9 if len(steps) else None
-        rate = _SECOND / step if step > 0 else None
-        return [TopicFacts(self.topics[TOPIC], rate, gap, tuple(fields), "none", None)]
+        return [TopicFacts(self.topics[TOPIC], 1e9 / step if step > 0 else None, gap, fields, "none", None)]
 
     def _values(self, path: FieldPath) -> Any:
         """What `FieldPath.read` gives for every row."""
         steps = path.steps
         column = self.columns_by_field.get(str(steps[0][1]), np.empty(0))
         if not column.size and len(self.times):
-            raise BagError(
-                f"{self.path}: there is no column '{steps[0][1]}'; columns there: "
-                f"{shortlist(list(self.columns_by_field), 50)}"
-            )
+            there = shortlist(list(self.columns_by_field), 50)
+            raise BagError(f"{self.path}: there is no column '{steps[0][1]}'; columns there: {there}")
         if path.function is None and len(steps) == 1:
             return column
         if path.function is None and len(steps) == 2 and steps[1][0] == "index":
@@ -575,9 +480,8 @@ class Table(Recording):
 
     def _require(self, topics: Iterable[str]) -> list[str]:
         wanted = list(topics)
-        for topic in wanted:
-            if topic != TOPIC:
-                raise BagError(f"{self.path}: there is no topic {topic}; a table has one, {TOPIC}")
+        if other := next((topic for topic in wanted if topic != TOPIC), None):
+            raise BagError(f"{self.path}: there is no topic {other}; a table has one, {TOPIC}")
         if wanted and not self.topics[TOPIC].readable:
             raise BagError(f"{self.path}: cannot be used: {self.topics[TOPIC].reason}")
         return wanted
@@ -585,14 +489,12 @@ class Table(Recording):
 
 def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:
     """Every run of some files; those that hold one signal each of the same time get a warning."""
-    tables = [run for path in paths for run in Table.every_run(path, layout)]
+    tables = [run for path in paths for run in _every_run(path, layout or TableLayout())]
     alone = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED and _is_alone(t)]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
-            other._warnings.append(
-                f"{other.path}: is of the time of {alone[0].path}; if each of them is of another signal of one "
-                f"machine, write them as columns of one file"
-            )
+            remedy = "if each of them is of another signal of one machine, write them as columns of one file"
+            other._warnings.append(f"{other.path}: is of the time of {alone[0].path}; {remedy}")
     return tables
 
 
@@ -622,6 +524,40 @@ def _file_and_run(path: Path) -> tuple[Path, str | None]:
     return path.with_name(match["file"]), match["run"]
 
 
+_Run = tuple[Path, RawTable, tuple[str, NDArray[np.int64], str], NDArray[np.intp] | None]
+"""A file, what it holds, its `instants`, and the rows of one run in it; None for all."""
+
+
+def _one_run(path: Path, layout: TableLayout) -> _Run:
+    file, run = _file_and_run(path)
+    if run is not None and layout.runs is None:
+        raise BagError(f"{path}: names a run; say in the signals file which column does, `table: {{runs: COLUMN}}`")
+    raw, rows = _read(file), None
+    if run is not None:
+        runs = _runs(file, raw, layout)
+        if run not in runs:
+            raise BagError(f"{path}: there is no run '{run}' in {file}; there are {shortlist(list(runs), 12)}")
+        rows = runs[run]
+    return file, raw, instants(file, raw, layout), rows
+
+
+def _every_run(path: Path, layout: TableLayout) -> list[Table]:
+    """Every run of a file; the file itself where the layout names no column for them."""
+    file, run = _file_and_run(path)
+    if run is not None or layout.runs is None:
+        return [Table(path, layout)]
+    raw = _read(file)
+    column, times, words = instants(file, raw, layout)
+    tables = []
+    for name, rows in _runs(file, raw, layout).items():
+        timed = column, times, words
+        tables.append(Table(file.with_name(f"{file.name}[{name}]"), layout, (file, raw, timed, rows)))
+        raw.notes, words = [], ""  # once are enough
+    if not tables:
+        raise BagError(f"{file}: column '{layout.runs}' is empty in every row, so it names no run")
+    return tables
+
+
 def _read(file: Path) -> RawTable:
     if not file.exists():
         raise missing(file)
@@ -631,28 +567,28 @@ def _read(file: Path) -> RawTable:
 def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[np.intp]]:
     """Rows of each run, by its value in the column, in order of first rows."""
     assert layout.runs is not None
-    column = raw.columns[find_column(file, layout.runs, list(raw.columns), "the runs")]
+    of = find_column(file, layout.runs, list(raw.columns), "the runs")
+    column = raw.columns[of]
     if column.ndim != 1:
         raise BagError(f"{file}: column '{layout.runs}' has several numbers a row, so it names no run")
     keys = column.astype(str)
     if column.dtype.kind == "f":
         keys = np.asarray([repr(value).removesuffix(".0") for value in column.tolist()])
         if raw.exact is not None and len(column) and bool((np.abs(column) >= _INEXACT).any()):
-            keys = np.asarray(raw.exact(find_column(file, layout.runs, list(raw.columns), "the runs")))
+            keys = np.asarray(raw.exact(of))
     names, first, rows = np.unique(keys, return_index=True, return_inverse=True)
     if len(names) > _MOST_RUNS:
         raise BagError(f"{file}: column '{layout.runs}' has {len(names)} values, so it names no runs; choose another")
-    order = np.argsort(rows, kind="stable")
-    pieces = np.split(order, np.cumsum(np.bincount(rows, minlength=len(names)))[:-1])
+    of_each = np.split(np.argsort(rows, kind="stable"), np.cumsum(np.bincount(rows, minlength=len(names)))[:-1])
     found: dict[str, NDArray[np.intp]] = {}
     for i in np.argsort(first, kind="stable").tolist():
-        name = str(names[i]).translate(_IN_A_NAME)
+        name, own = str(names[i]).translate(_IN_A_NAME), of_each[i]
         if name in _NO_RUN:
-            raw.notes.append(f"{plural(len(pieces[i]), 'row')} without a run left out")
+            raw.notes.append(f"{plural(len(own), 'row')} without a run left out")
         elif name in found:
             raise BagError(f"{file}: runs '{names[i]}' and '{name}' would have one name; rename one of them")
         else:
-            found[name] = pieces[i]
+            found[name] = own
     return found
 
 

@@ -16,7 +16,8 @@ import re
 import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -68,9 +69,10 @@ def read_table(path: Path) -> RawTable:
     try:
         if not path.stat().st_size:
             raise BagError(f"{path}: the file is empty; record or copy it again")
-        return _READERS[path.suffix.lower()](path)
+        read: RawTable = _READERS[path.suffix.lower()](path)
     except OSError as error:
         raise os_error(path, error) from None
+    return read
 
 
 # --- CSV -----------------------------------------------------------------------------------------------------
@@ -100,21 +102,14 @@ def _read_csv(path: Path) -> RawTable:
     lines = re.split(r"\r\n|\r|\n", head.decode(encoding, errors="replace"))[:_LOOK_LINES]
     shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
     names = _unique(shape.names)
-    exact = partial(_texts, path, encoding, shape, names)
-    try:
-        with open(path, encoding=encoding, errors="replace", newline="") as text:
-            values = np.loadtxt(
-                text, delimiter=shape.delimiter, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2
-            )
-    except (ValueError, OverflowError):
-        return _read_cells(path, encoding, shape, names)
+    units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
+    values = np.empty((0, 0))
+    with suppress(ValueError, OverflowError), open(path, encoding=encoding, errors="replace", newline="") as text:
+        values = np.loadtxt(text, delimiter=shape.delimiter, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2)
     if values.shape[1] != len(names) or not len(values):
-        return _read_cells(path, encoding, shape, names)
-    return RawTable(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), [], exact, _units(shape, names))
-
-
-def _units(shape: _Shape, names: Sequence[str]) -> dict[str, str]:
-    return {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
+        return replace(_read_cells(path, encoding, shape, names), units=units)
+    exact = partial(_texts, path, encoding, shape, names)
+    return RawTable(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), [], exact, units)
 
 
 def _texts(path: Path, encoding: str, shape: _Shape, names: Sequence[str], name: str) -> Sequence[str]:
@@ -133,9 +128,8 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
         try:
             for cells in reader:
                 if reader.line_num > before + 1:
-                    raise BagError(
-                        f"{path}: line {shape.skip + before + 1} opens a quote that is not closed in it; mend it"
-                    )
+                    line = shape.skip + before + 1
+                    raise BagError(f"{path}: line {line} opens a quote that is not closed in it; mend it")
                 before = reader.line_num
                 if cells and any(cells):
                     yield shape.skip + reader.line_num, cells
@@ -147,10 +141,8 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     """Cell by cell: text, instants, missing numbers, decimal commas, lines with too few cells."""
     columns: list[list[str]] = [[] for _ in names]
     wide = len(names)
-    first_odd = odd = 0
-    last_line = 0
+    first_odd = odd = line = 0
     for line, cells in _rows(path, encoding, shape):
-        last_line = line
         if len(cells) != wide and not (len(cells) == wide + 1 and not cells[-1].strip()):
             odd += 1
             first_odd = first_odd or line
@@ -159,15 +151,13 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
             column.append(cell)
     rows = len(columns[0])
     if odd > max(1, _ODD_SHARE * (odd + rows)) or (odd and not rows):
-        raise BagError(
-            f"{path}: {plural(odd, 'line')} with another number of cells than the {wide} of its header, the first is "
-            f"line {first_odd}; mend the file, or its header"
-        )
+        others = f"{plural(odd, 'line')} with another number of cells than the {wide} of its header"
+        raise BagError(f"{path}: {others}, the first is line {first_odd}; mend the file, or its header")
     if not rows:
         raise BagError(f"{path}: has a header and no line of data; record or copy it again")
     notes = []
     if odd:
-        cut = " (the file ends in it)" if odd == 1 and first_odd == last_line else ""
+        cut = " (the file ends in it)" if odd == 1 and first_odd == line else ""
         notes.append(f"{plural(odd, 'line')} with another number of cells left out, the first is line {first_odd}{cut}")
     found: dict[str, Column] = {}
     noted: dict[str, list[str]] = {}
@@ -179,24 +169,18 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
             noted.setdefault(note, []).append(name)
     for note, of in noted.items():
         notes.append(f"column{'s' * (len(of) > 1)} {shortlist([repr(name) for name in of], 6)}: {note}")
-    table = RawTable(found, notes, units=_units(shape, names))
     texts = dict(zip(names, columns, strict=True))
-    table.exact = lambda name: [cell.strip() for cell in texts[name]]
-    return table
+    return RawTable(found, notes, lambda name: [cell.strip() for cell in texts[name]])
 
 
 def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
     """Numbers where most cells are some, else text; and what was done."""
     plain = [cell.strip() for cell in cells]
     if not any("_" in cell for cell in cells):  # `1_0` is 10 to Python alone
-        try:
+        with suppress(ValueError):
             return np.array([float(cell) for cell in cells]), ""
-        except ValueError:
-            pass
-        try:
+        with suppress(ValueError):
             return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
-        except ValueError:
-            pass
     numbers = np.full(len(plain), np.nan)
     # in quotes between commas they may part thousands, which nothing but other cells tells
     decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _THOUSANDS.match(cell) for cell in plain)
@@ -218,8 +202,10 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
             first = first or cell
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
         return np.array(plain, dtype=object), ""
-    notes = [f"{plural(odd, 'cell')} that {'is' if odd == 1 else 'are'} no number (such as '{first[:40]}') left out"]
-    return numbers, (notes[0] if odd else "") or ("decimal commas read as points" if comma else "")
+    if odd:
+        said = f"that {'is' if odd == 1 else 'are'} no number (such as '{first[:40]}') left out"
+        return numbers, f"{plural(odd, 'cell')} {said}"
+    return numbers, "decimal commas read as points" * bool(comma)
 
 
 def _unique(names: Iterable[str]) -> list[str]:
@@ -305,20 +291,16 @@ def _read_arrow(path: Path) -> RawTable:
         if path.suffix.lower() == ".parquet":
             rows = pa.parquet.read_metadata(path)
             if rows.num_rows * rows.num_columns * 8 > most_inflated(path.stat().st_size):
-                raise BagError(
-                    f"{path}: states {rows.num_rows} rows of {rows.num_columns} columns, which is more than is read of "
-                    f"a file of its size; write the columns and rows that are needed"
-                )
+                states = f"states {rows.num_rows} rows of {rows.num_columns} columns"
+                remedy = "write the columns and rows that are needed"
+                raise BagError(f"{path}: {states}, which is more than is read of a file of its size; {remedy}")
             table = pa.parquet.read_table(path, memory_map=False)
             if table.num_rows != rows.num_rows:
-                raise BagError(
-                    f"{path}: is damaged: it states {rows.num_rows} rows, and {table.num_rows} are read; copy it again"
-                )
+                states = f"it states {rows.num_rows} rows, and {table.num_rows} are read"
+                raise BagError(f"{path}: is damaged: {states}; copy it again")
         else:
             table = pa.feather.read_table(path, memory_map=False)
         table.validate(full=True)
-    except BagError:
-        raise
     except (pa.ArrowException, ValueError, OSError) as error:
         raise BagError(f"{path}: is damaged or no {path.suffix} file ({one_line(error)}); copy it again") from None
     found: dict[str, Any] = {}
@@ -355,7 +337,7 @@ def _nanoseconds(path: Path, name: str, values: Column) -> Column:
 def _read_mat(path: Path) -> RawTable:
     with open(path, "rb") as stream:
         head = stream.read(128)
-    if head.startswith(b"MATLAB 7.3") or head.startswith(b"\x89HDF"):
+    if head.startswith((b"MATLAB 7.3", b"\x89HDF")):
         raise BagError(f"{path}: a .mat file of version 7.3; write it again with save('{path.name}', '-v7')")
     try:
         from scipy.io import loadmat
@@ -368,12 +350,6 @@ def _read_mat(path: Path) -> RawTable:
     except Exception as error:  # whatever the bytes lead its reader to
         raise BagError(f"{path}: is damaged or no .mat file ({one_line(error)}); copy it again") from None
     return _of_arrays(path, {name: value for name, value in variables.items() if not name.startswith("__")})
-
-
-def _read_mat_aside(path: Path) -> RawTable:
-    """Damage may break its reader down."""
-    read: RawTable = aside(_read_mat, path, ".mat file")
-    return read
 
 
 def _read_npz(path: Path) -> RawTable:
@@ -417,11 +393,9 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
             array = _nanoseconds(path, name, array)
         elif array.dtype.kind in "US":
             array = array.astype(str).astype(object)
-        elif array.dtype.kind == "O" and array.ndim == 1 and len(array) and all(isinstance(v, str) for v in array):
-            pass
         elif array.dtype.kind in "bf":
             array = array.astype(np.float64)
-        elif array.dtype.kind not in "iu":
+        elif array.dtype.kind not in "iu" and not _is_text(array):
             notes.append(f"'{name}' left out, it is no array of numbers")
             continue
         if array.ndim in (1, 2) and array.shape[0] > 1:
@@ -431,11 +405,14 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
     return _of_one_length(path, found, notes)
 
 
+def _is_text(array: NDArray[Any]) -> bool:
+    return array.dtype.kind == "O" and array.ndim == 1 and len(array) > 0 and all(isinstance(v, str) for v in array)
+
+
 def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) -> RawTable:
     """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
-    lengths = Counter(len(column) for column in found.values() if column.ndim == 1)
-    if not lengths:
-        lengths = Counter(len(column) for column in found.values())
+    vectors = [len(column) for column in found.values() if column.ndim == 1]
+    lengths = Counter(vectors or map(len, found.values()))
     if not lengths:
         there = "; ".join(notes[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
@@ -455,11 +432,11 @@ def _wants(path: Path, package: str) -> str:
     return f"{path}: it cannot be read: {absent(package)}"
 
 
-_READERS: Mapping[str, Callable[[Path], RawTable]] = {
+_READERS: Mapping[str, Callable[[Path], Any]] = {
     ".csv": _read_csv,
     ".tsv": _read_csv,
     ".parquet": _read_arrow,
     ".feather": _read_arrow,
-    ".mat": _read_mat_aside,
+    ".mat": lambda path: aside(_read_mat, path, ".mat file"),  # damage may break its reader down
     ".npz": _read_npz,
 }

@@ -40,9 +40,8 @@ def not_mcap(path: Path, head: bytes) -> BagError:
     if MAGIC.startswith(head):
         return BagError(f"{path}: cut after {len(head)} bytes, before any message; record or copy it again")
     if head.startswith(b"version https://git-lfs"):
-        return BagError(
-            f"{path}: a Git LFS pointer, not the recording itself; fetch it with `git lfs pull` in its repository"
-        )
+        lfs = "fetch it with `git lfs pull` in its repository"
+        return BagError(f"{path}: a Git LFS pointer, not the recording itself; {lfs}")
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         return _compressed(path)
     if head.startswith((b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04")):
@@ -55,22 +54,16 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: a table, and a recording of ROS messages is wanted here; check the path")
     if known := kind_of(path):
         return BagError(f"{path}: this is {known}, and a recording is wanted here; are the arguments swapped?")
-    kind = (
-        "a text file"
-        if all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512])
-        else "no kind of file that is known"
-    )
-    return BagError(
-        f"{path}: {kind}, while a recording is wanted (MCAP, .db3, .bag, or a table called {', '.join(TABLES)}); check "
-        f"the path and its suffix"
-    )
+    text = all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512])
+    kind = "a text file" if text else "no kind of file that is known"
+    wanted = f"a recording is wanted (MCAP, .db3, .bag, or a table called {', '.join(TABLES)})"
+    return BagError(f"{path}: {kind}, while {wanted}; check the path and its suffix")
 
 
 def missing(path: Path) -> BagError:
     """The error for a path that is not there; names the recordings in the same folder."""
-    there: list[Path] = []
-    if path.parent.is_dir():
-        there = sorted((p for p in path.parent.iterdir() if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
+    inside = path.parent.iterdir() if path.parent.is_dir() else ()
+    there = sorted((p for p in inside if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
     hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
     return BagError(f"{path}: there is no such file or folder{hint}")
 
@@ -82,6 +75,11 @@ def os_error(path: Path, error: OSError) -> BagError:
     if isinstance(error, FileNotFoundError):
         return missing(path)
     return BagError(f"{path}: cannot be read ({error.strerror or error}); check the disk or copy it again")
+
+
+def changed(path: Path, how: str = "") -> BagError:
+    """The error for a file that is not what it was when it was opened."""
+    return BagError(f"{path}: the file changed while it was read{how}; read it again when it is written")
 
 
 def _compressed(path: Path) -> BagError:
@@ -100,9 +98,8 @@ def no_recording(folder: Path, inside: list[Path]) -> BagError:
     if folders:
         return BagError(f"{folder}: holds no recording itself; name the folders in it: {file_names(folders)}")
     if tables := [p for p in inside if p.suffix in TABLES]:
-        return BagError(
-            f"{folder}: a folder of tables, each of which is a recording; name them one by one: {file_names(tables)}"
-        )
+        each = f"each of which is a recording; name them one by one: {file_names(tables)}"
+        return BagError(f"{folder}: a folder of tables, {each}")
     return BagError(f"{folder}: there is no {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file in it; check the path")
 
 
@@ -154,9 +151,8 @@ def _main() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     out = os.dup(1)
     os.dup2(2, 1)  # what a library prints
-    found: Any
     try:
-        found = function(path)
+        found: Any = function(path)
     except BagError as error:
         found = error
     except MemoryError:

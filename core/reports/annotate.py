@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.files import sha256, try_to_write, whole_file
+from uncertain_lti.base.files import sha256, try_to_write, written
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, VerdictRecords, names_of, text_message
@@ -132,38 +132,30 @@ def annotate(
         "alarm": f"{rule.violations} of {rule.window}, margin {rule.margin!r}",
         "topics": base,
         "states": json.dumps([{"name": s.name, "unit": s.unit} for s in model.signals.states]),
+        **({"model": os.path.basename(model_file)} if model_file else {}),
+        **({"model_sha256": sha256(model_file)} if os.path.isfile(model_file) else {}),
     }
-    if model_file:
-        about["model"] = os.path.basename(model_file)
-        if os.path.isfile(model_file):
-            about["model_sha256"] = sha256(model_file)
-    try:
-        with whole_file(output) as stream:
-            writer = McapWriter(stream, f"uncertain-lti {__version__}", compression)
-            numbers = [declare(writer, part) for part in contents]
-            there = names_of(model.state_names, model.steps, verdicts.statistic_names)
-            channels = {
-                output.name: writer.channel(_schema(writer, contents, output.type), f"{base}/{output.name}")
-                for output in RECORDED
-                if there[output.of]
-            }
-            writer.metadata(METADATA, about)
-
-            def copied() -> Iterator[tuple[Path, int]]:
-                for part, renumbered in zip(contents, numbers, strict=True):
-                    for lost in copy(writer, part, renumbered, notes):
-                        yield part.path, lost
-
-            blocks: Iterable[Any] = copied()
-            if progress is not None:
-                blocks = progress(blocks, sum(len(part.blocks) for part in contents))
-            for path, lost in blocks:
-                left_out[path] += lost
-            _write_verdicts(writer, channels, model, verdicts, decisions)
-            writer.finish()
-    except OSError as error:
-        why = error.strerror or error
-        raise BagError(f"{output}: cannot be written: {why}; make room or choose another place") from None
+    with written(output, BagError) as stream:
+        writer = McapWriter(stream, f"uncertain-lti {__version__}", compression)
+        numbers = [declare(writer, part) for part in contents]
+        there = names_of(model.state_names, model.steps, verdicts.statistic_names)
+        channels = {
+            output.name: writer.channel(_schema(writer, contents, output.type), f"{base}/{output.name}")
+            for output in RECORDED
+            if there[output.of]
+        }
+        writer.metadata(METADATA, about)
+        blocks: Iterable[Any] = (
+            (part.path, lost)
+            for part, renumbered in zip(contents, numbers, strict=True)
+            for lost in copy(writer, part, renumbered, notes)
+        )
+        if progress is not None:
+            blocks = progress(blocks, sum(len(part.blocks) for part in contents))
+        for path, lost in blocks:
+            left_out[path] += lost
+        _write_verdicts(writer, channels, model, verdicts, decisions)
+        writer.finish()
     for path, number in left_out.items():
         if number:
             notes.append(f"{path}: {count(number, 'message')} that cannot be converted to CDR not copied")

@@ -28,6 +28,7 @@ from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.alarm import Raised
 from uncertain_lti.monitor.verdict import Verdicts
 
 PIXELS = 1200
@@ -240,12 +241,11 @@ def alarm_chart(model: UncertainLTI, verdicts: Verdicts, columns: Columns, most:
 def alarm_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tuple[Panel, Array]:
     """The alarm's score over its threshold, and what each state had to do with it (n,)."""
     score, states = scores(model, verdicts, columns)
-    note = ""
+    raised: Sequence[Raised] = ()
     if columns.alarm.any():
         first = int(columns.starts[columns.alarm.argmax()])
         raised = verdicts.raised(first + int(verdicts.alarm[first:].argmax()))
-        note = raised[0].words if raised else note
-    return score_panel(columns, score, note), states
+    return score_panel(columns, score, raised[0].words if raised else ""), states
 
 
 def score_panel(columns: Columns, score: Array, note: str = "") -> Panel:

@@ -41,7 +41,7 @@ from uncertain_lti.model.domain import jump_words, jumps, outside_in_words
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import back_and_restarts
+from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import Verdicts
@@ -88,6 +88,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     With samples, a verdict per sample in recorded units (`flags`: 0 contained, 1 violated, null no verdict).
     """
     transient, judged = verdicts.transient, int(verdicts.judged.sum())
+    violated, outside = int(verdicts.violated.sum()), int(verdicts.outside_domain.sum())
     data: dict[str, Any] = {
         "recording": transient.name,
         "t_ns": int(transient.t_ns[0]),
@@ -95,10 +96,10 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "seconds": _span(transient, 0, len(transient))["seconds"],
         "verdicts": judged,
         "no_verdict": _not_judged(verdicts),
-        "violated": int(verdicts.violated.sum()),
-        "inside": _inside(int(verdicts.violated.sum()), judged),
-        "outside_domain": int(verdicts.outside_domain.sum()),
-        "outside_domain_share": int(verdicts.outside_domain.sum()) / judged if judged else None,
+        "violated": violated,
+        "inside": _inside(violated, judged),
+        "outside_domain": outside,
+        "outside_domain_share": outside / judged if judged else None,
         "beyond": _beyond(model, verdicts),
         "unknown_regime": int(verdicts.unknown_regime.sum()),
         "unknown": unknown_in_words(model, verdicts),
@@ -107,13 +108,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "horizons": _horizons(model, verdicts),
         "alarm": bool(verdicts.alarm.any()),
         "alarms": [
-            {
-                **_span(transient, start, stop),
-                "raised": [
-                    {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
-                    for r in verdicts.raised(start)
-                ],
-            }
+            {**_span(transient, start, stop), "raised": [_raised(r) for r in verdicts.raised(start)]}
             for start, stop in runs(verdicts.alarm)
         ],
         "episodes": [_episode(model, verdicts, rows) for rows in islice(_episodes(verdicts), MOST_EPISODES)],
@@ -124,11 +119,14 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "notes": list(transient.notes),
     }
     data["reason"] = _why_unknown(model, verdicts, data)
-    found = (data["alarm"], bool(data["reason"]), data["violated"], True)
-    data["outcome"] = next(outcome for outcome, there in zip(OUTCOMES, found, strict=True) if there)
+    data["outcome"] = OUTCOMES[[data["alarm"], bool(data["reason"]), bool(violated), True].index(True)]
     if samples:
         data["verdict_per_sample"] = _per_sample(model, verdicts)
     return data
+
+
+def _raised(r: Raised) -> dict[str, Any]:
+    return {"rule": r.label, "state": r.state, "horizon": r.horizon, "value": r.value, "words": r.words}
 
 
 def outcome(recordings: Sequence[dict[str, Any]]) -> str:
@@ -153,8 +151,8 @@ def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]
     change, largest = jumps(model, np.concatenate([np.full((1, model.n), np.nan), x[:-1]]), x)
     states = {}
     for i, name in enumerate(model.state_names):
-        there = ~np.isnan(verdicts.flags[:, i])
-        bad, own = np.flatnonzero(verdicts.flags[:, i] == 1.0), int(there.sum())
+        there = np.flatnonzero(~np.isnan(verdicts.flags[:, i]))
+        bad, own = np.flatnonzero(verdicts.flags[:, i] == 1.0), len(there)
         width = (verdicts.upper - verdicts.lower)[verdicts.judged, i]
         mean = float(np.nanmean(width)) if own else None
         values = x[np.isfinite(x[:, i]), i]
@@ -168,7 +166,7 @@ def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]
             "range": span,
             "width_to_range": mean / span if span and mean is not None else None,
             "worst": _worst(verdicts, i, bad),
-            "largest": abs(_worst(verdicts, i, np.flatnonzero(there))["utilisation"] or 0.0),
+            "largest": abs(_worst(verdicts, i, there)["utilisation"] or 0.0),
             "unit": model.signals.states[i].unit,
             "jump": _jump(verdicts, name, bad, change[:, i], float(largest[i])),
         }
@@ -198,16 +196,13 @@ def _horizons(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
     """What became of the windows of each horizon."""
     found = []
     for j, steps in enumerate(model.steps, 1):
-        table = verdicts.horizon_utilisation[:, j]
-        count = int((~np.isnan(table).all(axis=1)).sum())
+        table, states = verdicts.horizon_utilisation[:, j], {}
         with np.errstate(invalid="ignore"):
             left = np.abs(table) > 1.0
-        outside = int(left.any(axis=1).sum())
-        rows = [np.flatnonzero(of) for of in left.T]
-        states = {
-            name: {"outside": len(of), "first": _instant(verdicts.transient, int(of[0])) if len(of) else None}
-            for name, of in zip(model.state_names, rows, strict=True)
-        }
+        for name, rows in zip(model.state_names, map(np.flatnonzero, left.T), strict=True):
+            first = _instant(verdicts.transient, int(rows[0])) if len(rows) else None
+            states[name] = {"outside": len(rows), "first": first}
+        count, outside = int((~np.isnan(table).all(axis=1)).sum()), int(left.any(axis=1).sum())
         inside = _inside(outside, count)
         found.append({"steps": steps, "windows": count, "outside": outside, "inside": inside, "states": states})
     return found
@@ -323,17 +318,14 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
         why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
         return f"only {judged} of {steps} steps could be judged{why}"
     if verdicts.armed is not None and not (verdicts.armed & verdicts.judged).any():
-        return (
-            "the alarm was armed at no verdict: --enable did not hold, or --grace was not over; give others, or check "
-            "a recording in which the machine is in use"
-        )
+        remedy = "give others, or check a recording in which the machine is in use"
+        return f"the alarm was armed at no verdict: --enable did not hold, or --grace was not over; {remedy}"
     if (outside := data["outside_domain_share"]) > _vouched(model):
         ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
         why = "; ".join(filter(None, [data["beyond"], *data["unknown"]]))
-        return (
-            f"{outside:.2%} of the verdicts are outside the fitted domain, where nothing vouches for the bounds; {ask}"
-            f"fit recordings that reach as far{': ' * bool(why)}{why}"
-        )
+        beyond_fit = f"{outside:.2%} of the verdicts are outside the fitted domain"
+        remedy = f"{ask}fit recordings that reach as far{': ' * bool(why)}{why}"
+        return f"{beyond_fit}, where nothing vouches for the bounds; {remedy}"
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, dict) and alarm.get("worth") == "none":
         return f"the model is {alarm['headline']}"
@@ -341,10 +333,9 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
         return "nothing that is judged moves in it"
     alarmed = verdicts.alarm[verdicts.judged]
     if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
-        return (
-            f"the alarm is up for {alarmed.mean():.0%} of it, from early on: the fault was there before, or this is "
-            f"another machine, in other units, or run as in no recording of the fit"
-        )
+        other = "this is another machine, in other units, or run as in no recording of the fit"
+        up = f"the alarm is up for {alarmed.mean():.0%} of it, from early on"
+        return f"{up}: the fault was there before, or {other}"
     return ""
 
 
@@ -441,24 +432,18 @@ def unknown_in_words(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
             if len(far):
                 reached = " to ".join(dict.fromkeys(numbers([far.min(), far.max()])))
                 ends = " to ".join(numbers([axis.knots[0], axis.knots[-1]]))
-                found.append(
-                    f"{axis.signal} is beyond its knots, {ends}{unit}, in {plural(len(far), 'verdict')} ({reached})"
-                )
+                often = f"in {plural(len(far), 'verdict')} ({reached})"
+                found.append(f"{axis.signal} is beyond its knots, {ends}{unit}, {often}")
             continue
         there = values[verdicts.unlisted_mode]
-        odd = there[~np.isin(there, axis.modes)]
-        if len(odd):
+        if len(odd := there[~np.isin(there, axis.modes)]):
             listed, strange = shortlist(numbers(axis.modes), 6), shortlist(numbers(np.unique(odd)), 6)
-            found.append(
-                f"the model lists {axis.signal} = {listed}{unit}, and {plural(len(odd), 'sample')} with {strange} "
-                f"{'has' if len(odd) == 1 else 'have'} no verdict"
-            )
+            other = f"{plural(len(odd), 'sample')} with {strange} {'has' if len(odd) == 1 else 'have'} no verdict"
+            found.append(f"the model lists {axis.signal} = {listed}{unit}, and {other}")
     places, weights = model.schedule.corners(s[:, verdicts.unknown_regime])
-    met = []
-    for r, data in enumerate(model.block_data):
-        count = int(((places == r) & (weights > 0)).any(axis=0).sum())
-        if count and not data.known:
-            met.append(f"{model.block_name(r)} ({plural(count, 'verdict')})")
+    counts = [int(((places == r) & (weights > 0)).any(axis=0).sum()) for r in range(model.schedule.blocks)]
+    there = [(r, count) for r, count in enumerate(counts) if count and not model.block_data[r].known]
+    met = [f"{model.block_name(r)} ({plural(count, 'verdict')})" for r, count in there]
     return found + [f"no recording visited {shortlist(met, 6)}"] * bool(met)
 
 

@@ -237,13 +237,10 @@ def coverage_figure(model: UncertainLTI, checked: Verdicts | Sequence[Verdicts])
         Not written yet; see `save`.
     """
     checked = [checked] if isinstance(checked, Verdicts) else list(checked)
-    judged = np.array([[float(v.judged.sum())] for v in checked])
     bad = np.array([[v.violated.sum(), *(v.flags == 1.0).sum(axis=0)] for v in checked], dtype=np.float64)
     own = np.array([[v.judged.sum(), *(~np.isnan(v.flags)).sum(axis=0)] for v in checked], dtype=np.float64)
     shares = np.divide(100.0 * bad, own, out=np.full(bad.shape, np.nan), where=own > 0)
-    rows = [
-        f"{_short(charts.base_name(v.transient.name), 40)}  ({int(n)})" for v, (n,) in zip(checked, judged, strict=True)
-    ]
+    rows = [f"{_short(charts.base_name(v.transient.name), 40)}  ({int(v.judged.sum())})" for v in checked]
     columns = ["any state", *(_short(name) for name in model.state_names)]
     title = "recording (verdicts), and the share of them that was violated [%]"
     return _heat_maps([_Grid(title, rows, columns, shares, "share", (1,))], "grey: no verdict")

@@ -90,14 +90,9 @@ def findings(
         for verdicts in checked
     ]
     validation = readable_validation(model.validation)
-    kinds = (
-        _fit_reasons(model),
-        _regime_reasons(model, recordings),
-        _validation_reasons(model, validation),
-        _width_reasons(model, recordings),
-        _recording_reasons(model, recordings, validation),
-    )
-    reasons = sorted((reason for kind in kinds for reason in kind), key=lambda reason: WEIGHTS.index(reason[0]))
+    reasons = [*_fit_reasons(model), *_regime_reasons(model, recordings), *_validation_reasons(model, validation)]
+    reasons += [*_width_reasons(model, recordings), *_recording_reasons(model, recordings, validation)]
+    reasons.sort(key=lambda reason: WEIGHTS.index(reason[0]))
     fit = model.fit_summary
     facts: dict[str, Any] = {
         "version": __version__,
@@ -239,9 +234,9 @@ def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | Non
         return
     else:
         inside, whole, parts = (validation[key] for key in ("inside", "parts_inside", "parts"))
-        weight = NO if inside < TOO_FEW_INSIDE else CARE if inside < CAUTION_INSIDE else YES
-        if 2 * whole < parts and weight == YES:
-            weight = CARE  # few violations, and yet nearly every run has some: an alarm on one would be a habit
+        # few violations, and yet nearly every run may have some: an alarm on one would be a habit
+        good = inside >= CAUTION_INSIDE and 2 * whole >= parts
+        weight = NO if inside < TOO_FEW_INSIDE else YES if good else CARE
         what, but = "recordings", ""
         if validation["kind"] != "transients":
             what, but = "blocks", "; they are of the same run, so another day may differ"

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from importlib.resources import files
 from typing import Any, NamedTuple
 from xml.sax.saxutils import quoteattr
 
@@ -28,7 +27,7 @@ from uncertain_lti.base.files import target
 from uncertain_lti.base.text import named
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, OUTPUTS, Output
-from uncertain_lti.reports.pages import write_page
+from uncertain_lti.reports.pages import asset, write_page
 from uncertain_lti.signals.signal_map import Signal
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
@@ -125,8 +124,7 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
         tabs[-1][1].append(("alarm", [(f"{base}/{_ALARM.name}/data", VIOLATED)]))
     made = Environment(trim_blocks=True, keep_trailing_newline=True)
     made.filters["attribute"] = _attribute
-    text = files("uncertain_lti.reports").joinpath("assets", "plotjuggler.xml").read_text(encoding="utf-8")
-    return made.from_string(text).render(tabs=tabs)
+    return made.from_string(asset("plotjuggler.xml")).render(tabs=tabs)
 
 
 def write_layouts(

@@ -47,21 +47,15 @@ def fit_text(model: UncertainLTI) -> str:
         blocks += schedule_blocks(choice)
     if choice := facts.get("horizon_choice"):
         blocks += horizon_blocks(choice)
-    gap = facts.get("optimality_gap")
-    blocks += [
-        f"criterion {CRITERIA[facts['criterion']]}; additive: {facts['additive']}; "
-        f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, optimality gap "
-        f"{'not known' if gap is None else f'{gap:.1e}'}",
-        *_widths(model),
-        *_dynamics(model),
-    ]
+    gap = "not known" if (gap := facts.get("optimality_gap")) is None else f"{gap:.1e}"
+    of = f"{plural(facts['transitions'], 'transition')}, {facts['violations']} outside, optimality gap {gap}"
+    blocks.append(f"criterion {CRITERIA[facts['criterion']]}; additive: {facts['additive']}; {of}")
+    blocks += [*_widths(model), *_dynamics(model)]
     if "discarded" in facts:
         before = ", ".join(map(number, facts["with_discarded"]["mean_width_recorded"]))
         gone = [f"{d['file']} t = {d['t']:.4f} s" for d in facts["discarded"]]
-        blocks.append(
-            f"discarded {plural(len(gone), 'transition')} (mean width with them: {before}): "
-            f"{shortlist(gone, MOST_SHOWN)}"
-        )
+        width = f"{plural(len(gone), 'transition')} (mean width with them: {before})"
+        blocks.append(f"discarded {width}: {shortlist(gone, MOST_SHOWN)}")
     blocks += [f"note: {message}" for message in facts.get("messages", [])]
     blocks.append(alarm_text(model))
     if model.validation:
@@ -74,10 +68,8 @@ def model_blocks(model: UncertainLTI) -> list[Block]:
     s, steps, facts = model.signals, model.sampling, model.fit_summary
     blocks: list[Block] = [repr(model)]
     if s.clock:
-        blocks.append(
-            f"clock {s.clock} ({s.time.get(s.clock, '?')} time), step {number(steps.dt_median)} s "
-            f"({number(steps.dt_min)} to {number(steps.dt_max)}), max_gap {number(s.max_gap)} s"
-        )
+        step = f"step {number(steps.dt_median)} s ({number(steps.dt_min)} to {number(steps.dt_max)})"
+        blocks.append(f"clock {s.clock} ({s.time.get(s.clock, '?')} time), {step}, max_gap {number(s.max_gap)} s")
     rows = [
         [f"{kind} {x.name}", x.topic or "-", x.field, number(float(x.steady)), number(float(x.scale)), x.unit or "-"]
         for kind, group in (("state", s.states), ("control", s.controls), ("scheduling", s.scheduling))
@@ -91,8 +83,8 @@ def model_blocks(model: UncertainLTI) -> list[Block]:
         words = rule.words
         if isinstance(rule, AlarmRule):
             over = "" if rule.horizon == 1 else f" over {rule.horizon} steps"
-            last = plural(rule.window, "verdict")
-            words = f"{rule.violations} of the last {last} violated{over}; margin {number(rule.margin)}"
+            last = f"of the last {plural(rule.window, 'verdict')} violated{over}"
+            words = f"{rule.violations} {last}; margin {number(rule.margin)}"
         blocks.append(f"alarm: {words}")
     if model.signatures:
         blocks.append(f"signatures of faults: {', '.join(signature.label for signature in model.signatures)}")
@@ -178,8 +170,7 @@ def _widths(model: UncertainLTI) -> list[Block]:
         spans = ((model.domain.x_max - model.domain.x_min) * model.operating_point.X).tolist()
         rows = []
         for signal, width, most, span in zip(model.signals.states, mean, largest, spans, strict=True):
-            known = math.isfinite(span) and span > 0
-            of = [number(span), share(width / span, 2)] if known else ["-", "-"]
+            of = [number(span), share(width / span, 2)] if 0 < span < math.inf else ["-", "-"]
             rows.append([named(signal.name, signal.unit), number(width), number(most), *of])
         header = ("one-step envelope", "mean width", "largest", "range", "width/range")
         blocks.append(Table(header, rows, most=200))
@@ -205,19 +196,16 @@ def blocks_in_words(model: UncertainLTI) -> list[str]:
     if model.schedule is None:
         return []
     found, of, name = [], model.schedule.blocks, model.block_name
-    data = list(enumerate(model.block_data))
-    unknown = [name(r) for r, d in data if not d.known]
-    tied = [f"{name(r)} (as {name(d.tied_to)})" for r, d in data if d.known and d.tied_to is not None]
+    unknown = [name(r) for r, d in enumerate(model.block_data) if not d.known]
     if unknown:
-        found.append(
-            f"no recording visited {plural(len(unknown), 'regime')} of {of}, and no bound there can be trusted: "
-            f"{shortlist(unknown, 6)}; record the machine there, or leave the knots out"
-        )
-    if tied:
+        none = f"no recording visited {plural(len(unknown), 'regime')} of {of}, and no bound there can be trusted"
+        found.append(f"{none}: {shortlist(unknown, 6)}; record the machine there, or leave the knots out")
+    known = [(name(r), d.tied_to) for r, d in enumerate(model.block_data) if d.known]
+    if tied := [f"{block} (as {name(to)})" for block, to in known if to is not None]:
         whose = "its" if len(tied) == 1 else "their"
         few = f"{plural(len(tied), 'regime')} of {of} had too little data for elements of {whose} own"
         found.append(f"{few}: {shortlist(tied, 6)}")
-    if any(d.transitions is None for _, d in data):
+    if any(d.transitions is None for d in model.block_data):
         found.append("the model file does not say how much data each regime had")
     return found
 
@@ -273,15 +261,11 @@ def validation_blocks(data: Mapping[str, Any]) -> list[Block]:
     ]
     if data["inside"] is not None:
         low, high = data["inside_interval"]
-        blocks.append(
-            f"inside all bounds: {data['inside']:.3%} of the verdicts "
-            f"({percent} interval {low:.3%} to {high:.3%}{under})"
-        )
+        of = f"{percent} interval {low:.3%} to {high:.3%}{under}"
+        blocks.append(f"inside all bounds: {data['inside']:.3%} of the verdicts ({of})")
         low, high = data["parts_inside_interval"]
-        blocks.append(
-            f"whole {what}s inside all bounds: {data['parts_inside']:d} of {data['parts']:d} "
-            f"({percent} interval {low:.1%} to {high:.1%}{under})"
-        )
+        of = f"{percent} interval {low:.1%} to {high:.1%}{under}"
+        blocks.append(f"whole {what}s inside all bounds: {data['parts_inside']:d} of {data['parts']:d} ({of})")
         if groups := data["groups"]:
             blocks.append(f"whole groups inside all bounds: {groups['inside']} of {groups['count']}")
         rows = [_alarm_row(alarm) for alarm in data["false_alarms"]]
@@ -317,11 +301,8 @@ def left_out_text(data: Mapping[str, Any]) -> str:
         return f"not validated, so how it does on other recordings is unknown: {data['not_done']}"
     ratio = max((s["left_out_to_full"] for s in data["states"].values()), default=math.nan)
     inside = "no verdict" if data["inside"] is None else f"{data['inside']:.3%} of the verdicts inside"
-    line = (
-        f"left out one {_unit(data)} at a time ({_how_many(data)}): {inside}, "
-        f"{plural(data['parts_inside'], f'whole {_part(data)}')}, widths at most {ratio:.3g} times those above; more: "
-        f"uncertain-lti validate"
-    )
+    whole = f"{plural(data['parts_inside'], f'whole {_part(data)}')}, widths at most {ratio:.3g} times those above"
+    line = f"left out one {_unit(data)} at a time ({_how_many(data)}): {inside}, {whole}; more: uncertain-lti validate"
     return f"{line}\nnote: {data['hint']}" if data["hint"] else line
 
 
@@ -352,11 +333,9 @@ def condition_text(data: Mapping[str, Any]) -> str:
     """What the sizes hold for."""
     out = data["left_out"]
     without = f"; {plural(out, 'case')} with an alarm without a fault left out" if out else ""
-    return (
-        f"smallest fault seen in {data['share']:.0%} of the cases within {number(data['within'])} s "
-        f"({data['confidence']:.0%} interval; put into what was left out at {plural(data['cases'], 'instant')}"
-        f"{without})"
-    )
+    seen = f"smallest fault seen in {data['share']:.0%} of the cases within {number(data['within'])} s"
+    put = f"put into what was left out at {plural(data['cases'], 'instant')}{without}"
+    return f"{seen} ({data['confidence']:.0%} interval; {put})"
 
 
 def detectable_blocks(data: Mapping[str, Any]) -> list[Block]:
@@ -410,11 +389,8 @@ def _size(fault: Mapping[str, Any], value: float | None) -> str:
 def tune_text(data: Mapping[str, Any]) -> str:
     """What `tune` prints: every way that was tried, and what was chosen."""
     header = ("way", "jumps seen, over those of fit", "width/range", "false alarms per hour at most")
-    rows = [
-        [t["way"], number(t["size"]), share(t["width_over_range"], 2), number(t["limit_per_hour"])]
-        for t in data["trials"]
-        if "refused" not in t
-    ]
+    tried = [t for t in data["trials"] if "refused" not in t]
+    rows = [[t["way"], number(t["size"]), share(t["width_over_range"], 2), number(t["limit_per_hour"])] for t in tried]
     refused = [f"  {t['way']}: {t['refused']}" for t in data["trials"] if "refused" in t]
     return text_of([Table(header, rows), *refused, f"chosen: {data['reason']}"])
 
@@ -427,9 +403,8 @@ def signature_text(learnt: Learnt) -> str:
     tried = [(label, found) for _, label, found in learnt.named if labels.count(label) > 1]
     if tried:
         right, unknown = sum(label == found for label, found in tried), sum(not found for _, found in tried)
-        blocks.append(
-            f"left out in turn, {right} of {plural(len(tried), 'recording')} named as labelled, "
-            f"{len(tried) - right - unknown} as another fault, {unknown} unknown"
-        )
+        others = f"{len(tried) - right - unknown} as another fault, {unknown} unknown"
+        named_right = f"{right} of {plural(len(tried), 'recording')} named as labelled"
+        blocks.append(f"left out in turn, {named_right}, {others}")
     blocks += [f"'{a}' and '{b}' look alike (match {match:.2f}), so neither is named" for a, b, match in learnt.alike]
     return text_of(blocks)

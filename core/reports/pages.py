@@ -77,12 +77,12 @@ def write_page(path: str | os.PathLike[str], page: str) -> None:
 def interactive_page(title: str, recordings: Sequence[Plotted], every: int = 0, **more: Any) -> str:
     """The page of some recordings; `every`: ms between two looks of a live one; `more`: of a report."""
     packed = packed_data(recordings, every).replace("<", "\\u003c")
-    scripts = [_asset(name).rstrip("\n") for name in ("uPlot.iife.min.js", "plot.js")]
+    scripts = [asset(name).rstrip("\n") for name in ("uPlot.iife.min.js", "plot.js")]
     allowed = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     views = list(dict.fromkeys(view for recording in recordings for view, _ in recording.views))
-    style = Markup(f"{_asset('uPlot.min.css')}\n{_asset('page.css')}")
+    style = Markup(f"{asset('uPlot.min.css')}\n{asset('page.css')}")
     marked = {"style": style, "data": Markup(packed), "scripts": [Markup(script) for script in scripts]}
-    page = environment().from_string(_asset("page.html"))
+    page = environment().from_string(asset("page.html"))
     return page.render(marked, title=title, every=every, views=views, allowed=allowed, **more)
 
 
@@ -100,7 +100,8 @@ def environment() -> Environment:
     return made
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Text of a file that pages or layouts are made of."""
     return files("uncertain_lti.reports").joinpath("assets", name).read_text(encoding="utf-8")
 
 
@@ -137,14 +138,9 @@ def html_report(
         ("trust", "How far to trust it", [*trust, Table(("weight", "reason"), reasons, left=(1,))]),
         ("origin", "Where it comes from", _where_from(facts)),
     ]
-    return interactive_page(
-        charts.base_name(facts["model"]["file"] or "model"),
-        plotted,
-        about=f"Alarm: {facts['rule']['words']}{conditions}.",
-        cards=list(_cards(facts)),
-        sections=sections,
-        version=facts["version"],
-    )
+    more: dict[str, Any] = {"about": f"Alarm: {facts['rule']['words']}{conditions}.", "cards": list(_cards(facts))}
+    title = charts.base_name(facts["model"]["file"] or "model")
+    return interactive_page(title, plotted, sections=sections, version=facts["version"], **more)
 
 
 def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:

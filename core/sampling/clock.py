@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import plural
-from uncertain_lti.signals.signal_map import SignalMap
+from uncertain_lti.signals.signal_map import SignalMap, TimeSource
 
 
 class Status(StrEnum):
@@ -100,8 +100,8 @@ def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) 
 
     `instants` (messages,): of each recording, ns.
     """
-    pooled = _pooled(instants, min_step_ns)
-    return int(np.median(pooled)) if pooled.size else None
+    steps = _pooled(instants, min_step_ns)
+    return int(np.median(steps)) if steps.size else None
 
 
 def longest_step(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0, recalls: bool = False) -> float:
@@ -126,8 +126,7 @@ def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.
     forward = steps[steps > 0]
     if (forward >= min_step_ns).all():
         return forward
-    longer = []
-    last = int(instants[0])
+    longer, last = [], int(instants[0])
     for instant in instants.tolist()[1:]:
         if instant - last >= min_step_ns:
             longer.append(instant - last)
@@ -193,20 +192,13 @@ def resolve(
     step = medians[clock]
     if step is None:
         count = sum(len(i) for i in instants[clock])
-        raise SignalError(
-            f"{clock}: {plural(count, 'message')} without a forward step in time, so no transition; "
-            f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
-        )
-    max_gap = signals.max_gap
+        remedy = f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
+        none = f"{plural(count, 'message')} without a forward step in time, so no transition"
+        raise SignalError(f"{clock}: {none}; {remedy}")
+    max_gap, constant = signals.max_gap, signals.step
     if max_gap is None:
         max_gap = longest_step(instants[clock], min_step_ns, bool(signals.recalled))
-    constant = signals.step
     if constant == "constant":
         constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9
-    return replace(
-        signals,
-        clock=clock,
-        max_gap=max_gap,
-        step=constant,
-        time={t: "header" if time[t] == "header" else "log" for t in signals.topics},
-    )
+    sources: dict[str, TimeSource] = {t: "header" if time[t] == "header" else "log" for t in signals.topics}
+    return replace(signals, clock=clock, max_gap=max_gap, step=constant, time=sources)

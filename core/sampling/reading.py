@@ -19,8 +19,8 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +30,7 @@ from uncertain_lti.base.arrays import core_count
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.recordings.recording import Progress, Recording
+from uncertain_lti.recordings.recording import Columns, Progress, Recording
 from uncertain_lti.sampling.clock import INVALID, LATE, TOO_OLD, Status, resolve
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.steady_state import resolve_auto
@@ -40,19 +40,13 @@ from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
 
 
 @dataclass
-class Stream:
-    """The wanted field values of one recording in order of arrival.
+class Stream(Columns):
+    """The wanted field values of one recording in order of arrival; a topic's values in the order of `signals.on`.
 
-    `bag`: the recording; `topic` (messages,): positions in `signals.topics`; `arrival` (messages,): log time, ns;
-    `stamp` (messages,): header stamp, ns; -1 for no stamp; `values` (messages of the topic, signals on it): one array
-    per topic, in the order of `signals.on(topic)`.
+    `bag`: the recording.
     """
 
-    bag: Recording
-    topic: NDArray[np.int64]
-    arrival: NDArray[np.int64]
-    stamp: NDArray[np.int64]
-    values: list[NDArray[np.float64]]
+    bag: Recording = field(kw_only=True)
 
 
 def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = None) -> Stream:
@@ -60,7 +54,7 @@ def read_stream(bag: Recording, signals: SignalMap, progress: Progress | None = 
     paths = check_paths(bag, signals)
     columns = bag.columns(signals.topics, paths, progress)
     refuse_absent(bag, signals, paths, columns.values)
-    return Stream(bag, columns.topic, columns.arrival, columns.stamp, columns.values)
+    return Stream(**vars(columns), bag=bag)
 
 
 def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
@@ -68,13 +62,12 @@ def check_paths(bag: Recording, signals: SignalMap) -> list[list[FieldPath]]:
 
     What the index of a file says is wrong is looked for in the file itself before it is reported: they may differ.
     """
-    if bag.indexed:
-        try:
-            if not _fits(bag, signals):
-                bag.walk()
-        except SignalError:
-            bag.walk()
-    _fits(bag, signals)
+    fits = False
+    with suppress(SignalError):
+        fits = bag.indexed and _fits(bag, signals)
+    if not fits:
+        bag.walk()
+        _fits(bag, signals)
     return [[FieldPath(signals.signals[i].field) for i in signals.on(t)] for t in signals.topics]
 
 
@@ -140,10 +133,8 @@ def resolved_by(recordings: Sequence[Times], signals: SignalMap) -> SignalMap:
         stamped, counted = (sum(times[topic][k] for times in recordings) for k in (0, 1))
         chosen = signals.time.get(topic)
         if chosen == "header" and not stamped:
-            raise SignalError(
-                f"{signals.source}: topics: {topic}: time is header, and no message has a stamp; write log, or leave "
-                f"it out"
-            )
+            none = "time is header, and no message has a stamp; write log, or leave it out"
+            raise SignalError(f"{signals.source}: topics: {topic}: {none}")
         sources[topic] = chosen or ("header" if 2 * stamped > counted else "log")
         stamps = sources[topic] == "header"
         instants[topic] = [times[topic][2] if stamps else times[topic][3] for times in recordings]
@@ -173,20 +164,11 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
     sampler = Sampler(signals)
     (t_ns, x, held), decisions = sampler.push_all(stream.topic, stream.arrival, stream.stamp, stream.values)
     assert signals.max_gap is not None
-    m = len(signals.controls)
-    transient = Transient(
-        t_ns,
-        x,
-        held[:, :m],
-        s=held[:, m:],
-        name=os.fspath(stream.bag.path),
-        signals=signals,
-        max_gap=signals.max_gap,
-        min_step=signals.min_step,
-        counters=sampler.counters,
-        sources=stream.bag.parts,
-        notes=(*stream.bag.warnings, *lags_in_words(stream, signals)),
-    )
+    m, bag = len(signals.controls), stream.bag
+    cut: dict[str, Any] = {"signals": signals, "max_gap": signals.max_gap, "min_step": signals.min_step}
+    read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts}
+    notes = (*bag.warnings, *lags_in_words(stream, signals))
+    transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], name=os.fspath(bag.path), notes=notes, **cut, **read)
     return transient, Decisions(*decisions)
 
 
@@ -206,10 +188,9 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
         since = np.minimum(stream.arrival[own] - stream.arrival[before], step)
         lag = float(np.median(stream.stamp[before] + since - stream.stamp[own]))
         if lag > step > 0:
-            said.append(
-                f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {lag * 1e-9:.3g} s, "
-                f"{lag / step:.3g} steps: each sample has the control that had come, not the one of its instant"
-            )
+            by = f"{lag * 1e-9:.3g} s, {lag / step:.3g} steps"
+            of = "each sample has the control that had come, not the one of its instant"
+            said.append(f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {by}: {of}")
     return said
 
 
@@ -304,52 +285,40 @@ def read_as_fitted_with_decisions(
 ) -> tuple[Transient, Decisions]:
     """`read_as_fitted`, and which message decided each clock message."""
     if any(not s.topic for s in signals.signals):
-        raise SignalError(
-            "the model was fitted to arrays and names no topics; check it with EnvelopeMonitor(model).check(transient)"
-        )
-    bag = (
-        open_recording(recording, indexed=True, layout=signals.table)
-        if isinstance(recording, (str, os.PathLike))
-        else recording
-    )
+        remedy = "check it with EnvelopeMonitor(model).check(transient)"
+        raise SignalError(f"the model was fitted to arrays and names no topics; {remedy}")
+    bag = recording if isinstance(recording, Recording) else open_recording(recording, (), True, signals.table)
     for topic, found in types_of([bag], signals).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
-            raise BagError(
-                f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; "
-                f"check a recording of the same topics"
-            )
+            remedy = "check a recording of the same topics"
+            raise BagError(f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; {remedy}")
     if signals.clock is None or signals.max_gap is None or any(t not in signals.time for t in signals.topics):
-        raise SignalError(
-            f"{signals.source}: it does not say clock, max_gap and time of every topic, so not how to cut samples; "
-            f"fit the model to recordings"
-        )
+        unsaid = "it does not say clock, max_gap and time of every topic, so not how to cut samples"
+        raise SignalError(f"{signals.source}: {unsaid}; fit the model to recordings")
     stream = read_stream(bag, signals, progress)
     stamps = stream.stamp[stream.topic == signals.topics.index(signals.clock)]
     if signals.time[signals.clock] == "header" and not (stamps > 0).any():
-        raise SignalError(
-            f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; fit it to such "
-            f"recordings, with time: log for that topic"
-        )
+        remedy = "fit it to such recordings, with time: log for that topic"
+        raise SignalError(f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; {remedy}")
     return sample(stream, signals)
 
 
 def read_field(
-    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, field: FieldPath
+    recording: Recording, signals: SignalMap, decisions: Decisions, topic: str, path: FieldPath
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """A field of any topic, and after which samples of the same recording its values came.
 
     Returns (K,): samples that were decided before each message came; Returns (K,): the values; NaN where a message has
     no such number.
     """
-    if topic not in recording.topics:
-        raise BagError(no_topic(recording, topic))
-    field.check(topic, recording.topics[topic].type, recording.type_fields(topic))
+    require(recording, topic)
+    path.check(topic, recording.topics[topic].type, recording.type_fields(topic))
     clock = signals.clock or ""
     of_clock = [FieldPath(signals.signals[i].field) for i in signals.on(clock)]
-    topics, paths = ([topic], [[field]]) if clock == topic else ([topic, clock], [[field], of_clock])
+    topics, paths = ([topic], [[path]]) if clock == topic else ([topic, clock], [[path], of_clock])
     columns = recording.columns(topics, paths)
-    _refuse_absent(recording, topic, field, columns.values[0][:, 0])
+    _refuse_absent(recording, topic, path, columns.values[0][:, 0])
     of_field = columns.topic == 0
     if clock == topic:  # clock messages before it; it goes with its own
         own, its = recording.columns([clock], [of_clock]).arrival, columns.arrival
@@ -366,15 +335,16 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
     except UncarriedTopicError as error:
         for bag in group_recordings(list(recordings), indexed=True):
             for topic in error.topics:
-                if topic not in bag.topics:
-                    raise BagError(no_topic(bag, topic)) from None
+                require(bag, topic)
         raise
 
 
-def no_topic(bag: Recording, topic: str) -> str:
-    """The sentence for a topic that a recording lacks, with the nearest names and all of them."""
-    there = shortlist(sorted(bag.topics), 50) or "none"
-    return f"{bag.path}: there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
+def require(bag: Recording, topic: str) -> None:
+    """Refuse a topic that a recording lacks, with the nearest names and all of them."""
+    if topic not in bag.topics:
+        there = shortlist(sorted(bag.topics), 50) or "none"
+        none = f"there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
+        raise BagError(f"{bag.path}: {none}") from None
 
 
 def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
@@ -382,13 +352,12 @@ def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]
     types: dict[str, str] = {}
     for bag in bags:
         for topic in signals.topics:
-            if topic not in bag.topics:
-                raise BagError(no_topic(bag, topic))
+            require(bag, topic)
             found = bag.topics[topic].type
             if types.setdefault(topic, found) != found:
+                other = f"{types[topic]} in {bags[0].path}"
                 raise BagError(
-                    f"{bag.path}: {topic} is {found}, and {types[topic]} in {bags[0].path}; "
-                    f"fit recordings of the same types together"
+                    f"{bag.path}: {topic} is {found}, and {other}; fit recordings of the same types together"
                 )
     return types
 
@@ -460,24 +429,22 @@ def read_streams(
 
 def _stream(bag: Recording, future: Future[tuple[Any, ...]]) -> Stream:
     try:
-        walked, undecoded, *columns = future.result()
+        walked, undecoded, columns = future.result()
     except BrokenProcessPool:
-        raise BagError(
-            f"{bag.path}: the process that read it was ended, perhaps for want of memory; "
-            f"read fewer recordings at once, or fit with --cache"
-        ) from None
+        ended = "the process that read it was ended, perhaps for want of memory"
+        raise BagError(f"{bag.path}: {ended}; read fewer recordings at once, or fit with --cache") from None
     if walked:
         bag.walk()
     bag.restore_notes(bag.reading_notes[0], undecoded)
-    return Stream(bag, *columns)
+    return Stream(**columns, bag=bag)
 
 
 def _read(bag: Recording, signals: SignalMap) -> tuple[Any, ...]:
     """In a process of its own: whether the index did not hold, messages left out by topic, and the columns."""
     indexed = bag.indexed
-    stream = read_stream(bag, signals)
-    walked = indexed and not bag.indexed
-    return walked, bag.reading_notes[1], stream.topic, stream.arrival, stream.stamp, stream.values
+    columns = vars(read_stream(bag, signals))
+    del columns["bag"]  # which the other process has
+    return indexed and not bag.indexed, bag.reading_notes[1], columns
 
 
 @contextmanager

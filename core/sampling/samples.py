@@ -66,10 +66,8 @@ def csv_columns(path: str | os.PathLike[str], wanted: Sequence[str], delimiter: 
                     continue
                 at = f"{path}: line {rows.line_num}"
                 if len(row) != len(columns):
-                    raise TransientError(
-                        f"{at} has {len(row)} cells, and the header names {len(columns)}; mend the file, or is the "
-                        f"delimiter not {delimiter!r}?"
-                    )
+                    remedy = f"mend the file, or is the delimiter not {delimiter!r}?"
+                    raise TransientError(f"{at} has {len(row)} cells, and the header names {len(columns)}; {remedy}")
                 for i, values in cells.items():
                     values.append(_number(row[i], f"{at}: '{row[i][:40]}' in column '{columns[i]}'"))
     except FileNotFoundError:
@@ -127,14 +125,12 @@ def nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
         return raw.astype(f"{raw.dtype.kind}8[ns]").astype(np.int64)
     if raw.dtype.kind in "iu":
         if raw.size and raw.max() > np.iinfo(np.int64).max:
-            raise TransientError(
-                f"{name}: t reaches {raw.max()} ns, past what 64 bits hold; count from a later instant"
-            )
+            remedy = "count from a later instant"
+            raise TransientError(f"{name}: t reaches {raw.max()} ns, past what 64 bits hold; {remedy}")
         t_ns = raw.astype(np.int64)
         if not recorded and (step := _median_forward(t_ns)) < 5:
-            raise TransientError(
-                f"{name}: integers are nanoseconds, and the steps are {step:g}; give seconds as floats"
-            )
+            remedy = "give seconds as floats"
+            raise TransientError(f"{name}: integers are nanoseconds, and the steps are {step:g}; {remedy}")
         return t_ns
     try:
         if raw.size and raw.dtype.kind not in "fO":
@@ -146,13 +142,11 @@ def nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
         where = int(np.argmin(np.isfinite(seconds)))
         raise TransientError(f"{name}: t[{where}] is {seconds[where]}; leave out samples without a time")
     if seconds.size and np.abs(seconds).max() > 9.2e9:
-        raise TransientError(
-            f"{name}: t reaches {np.abs(seconds).max():g} s; give seconds, or nanoseconds as an array of integers"
-        )
+        remedy = "give seconds, or nanoseconds as an array of integers"
+        raise TransientError(f"{name}: t reaches {np.abs(seconds).max():g} s; {remedy}")
     if (step := _median_forward(seconds)) < 5e-9:
-        raise TransientError(
-            f"{name}: steps of {step:g} s are too short for a nanosecond clock; give time in a larger unit"
-        )
+        remedy = "give time in a larger unit"
+        raise TransientError(f"{name}: steps of {step:g} s are too short for a nanosecond clock; {remedy}")
     return np.rint(seconds * 1e9).astype(np.int64)
 
 
@@ -174,9 +168,8 @@ def matrix(values: ArrayLike, rows: int, what: str, name: str) -> Array:
     elif array.ndim == 1:
         array = array[:, None]
     if array.ndim != 2 or array.shape[0] != rows:
-        raise TransientError(
-            f"{name}: {what} has shape {array.shape}, and t has {rows} instants; give one row of {what} per instant"
-        )
+        remedy = f"give one row of {what} per instant"
+        raise TransientError(f"{name}: {what} has shape {array.shape}, and t has {rows} instants; {remedy}")
     return array
 
 
@@ -206,8 +199,7 @@ def segments_of(
     if (opens | (steps >= max(min_step_ns, 1))).all():
         kept = np.arange(len(t_ns))
     else:  # dropping a sample changes the step of the next one, so one after the other
-        positions: list[int] = [0]
-        last = int(t_ns[0])
+        positions, last = [0], int(t_ns[0])
         for position, instant in enumerate(t_ns.tolist()[1:], start=1):
             step = instant - last
             if step == 0:

@@ -49,12 +49,8 @@ def codes(values: Array) -> dict[float, int]:
                 return found
             low, high = float(others.min()), float(others.max())
             apart = max(extreme - high, low - extreme)
-            several = (
-                count > 1
-                and abs(extreme) >= CODE_LEAST
-                and len(np.unique(others[:1000])) >= CODE_OTHERS
-                and apart > CODE_APART * (high - low)
-            )
+            several = count > 1 and abs(extreme) >= CODE_LEAST and apart > CODE_APART * (high - low)
+            several = several and len(np.unique(others[:1000])) >= CODE_OTHERS
             if several or (abs(extreme) >= CODE_SIZE and max(abs(low), abs(high)) < 1e-3 * CODE_SIZE):
                 found[extreme], rest = count, others
                 break
@@ -168,23 +164,21 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
     seen = np.isfinite(pooled).any(axis=0)
     span = np.zeros(len(signals))
     span[seen] = np.nanmax(pooled[:, seen], axis=0) - np.nanmin(pooled[:, seen], axis=0)
-    band = STILL_BAND
-    while True:
-        found = [(r[a:b], b - a) for r in finite for a, b in still_stretches(r, span, band)]
-        if found or band > 2.0:
+    for band in (STILL_BAND * 2.0**k for k in range(7)):  # up to beyond every range
+        found = [r[a:b] for r in finite for a, b in still_stretches(r, span, band)]
+        if found:
             break
-        band *= 2.0
     if found:
-        medians = np.array([np.median(part, axis=0) for part, _ in found])
+        medians = np.array([np.median(part, axis=0) for part in found])
         stops = end_stops(finite)
         first = [{float(r[0, j]) for r in finite if len(r)} for j in range(len(signals))]
-        held = [[j for j, _ in enumerate(signals) if _at(part[:, j], stops[j])] for part, _ in found]
-        lengths = [length for _, length in found]
+        held = [[j for j in range(len(signals)) if _at(part[:, j], stops[j])] for part in found]
+        lengths = list(map(len, found))
         longest = int(np.argmax(lengths))
 
         def rank(k: int) -> tuple[int, int]:
             """Away from end stops; else at none but those at which a recording begins, as machines do at rest."""
-            begins = all(_at(found[k][0][:, j], first[j] & set(stops[j])) for j in held[k])
+            begins = all(_at(found[k][:, j], first[j] & set(stops[j])) for j in held[k])
             return 2 if not held[k] else int(begins), lengths[k]
 
         chosen = max(range(len(found)), key=rank)
@@ -192,11 +186,9 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
         words = f"{lengths[chosen]} still samples (every signal within {band:.0%} of its range)"
         if held[longest]:
             names = ", ".join(signals[j].name for j in held[longest])
-            words += (
-                f", not the {lengths[longest]} with {names} at an end stop"
-                if chosen != longest
-                else f", all of them with {names} at an end stop: give `steady` yourself"
-            )
+            at_stop = f"with {names} at an end stop"
+            words += f", all of them {at_stop}: give `steady` yourself" * (chosen == longest)
+            words += f", not the {lengths[longest]} {at_stop}" * (chosen != longest)
     else:  # fewer than STILL_SAMPLES finite samples in a row
         still = np.zeros(len(signals))
         still[seen] = np.nanmedian(pooled[:, seen], axis=0)

@@ -181,16 +181,15 @@ class Transient:
         self.state_names = names_of(state_names, signals.states if signals else None, "x", self.x, name)
         self.control_names = names_of(control_names, signals.controls if signals else None, "u", self.u, name)
         self.scheduling_names = names_of(scheduling_names, signals.scheduling if signals else None, "s", self.s, name)
-        self.ends: tuple[At, ...] = (
-            tuple(c.at for c in signals.controls) if signals else ("departure",) * self.u.shape[1]
-        )
+        self.ends: tuple[At, ...] = ("departure",) * self.u.shape[1]
+        if signals:
+            self.ends = tuple(c.at for c in signals.controls)
         self.counters = Counters(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
         if max_gap is not None and not (0 < max_gap <= LONGEST_S or max_gap == math.inf):
-            raise TransientError(
-                f"{name}: max_gap is {max_gap}; it must be a positive number of seconds up to {LONGEST_S:g}, or inf"
-            )
+            must = f"it must be a positive number of seconds up to {LONGEST_S:g}, or inf"
+            raise TransientError(f"{name}: max_gap is {max_gap}; {must}")
         if not 0 <= min_step <= LONGEST_S:
             raise TransientError(f"{name}: min_step is {min_step}; it must be 0 s or more, up to {LONGEST_S:g}")
         if step is None:
@@ -270,29 +269,20 @@ class Transient:
             A new transient.
         """
         x, u = (changes.pop(name, getattr(self, name)[part]) for name in ("x", "u"))
-        arguments: dict[str, Any] = {
-            "s": self.s[part],
-            "step": self.step or "recorded",
-            **{
-                name: getattr(self, name)
-                for name in (
-                    "name", "signals", "state_names", "control_names", "scheduling_names", "max_gap", "min_step",
-                    "sources",
-                )
-            },
-        }  # fmt: skip
+        names = ("state_names", "control_names", "scheduling_names")
+        kept = ("name", "signals", "max_gap", "min_step", "sources", *names)
+        arguments: dict[str, Any] = {"s": self.s[part], "step": self.step or "recorded"}
+        arguments |= {name: getattr(self, name) for name in kept}
         if isinstance(part, slice) and part == slice(None):
             arguments |= {"counters": self.counters, "notes": self.notes}
         arguments |= changes
         if changes.get("signals") is not None:  # it has the names
-            for which in ("state_names", "control_names", "scheduling_names"):
-                arguments[which] = changes.get(which)
+            arguments |= {which: changes.get(which) for which in names}
         changed = Transient(self.t_ns[part], x, u, **arguments)
         changed.ends_given = self.ends_given
         if changed.signals is None:
-            changed.ends = tuple(
-                dict(zip(self.control_names, self.ends, strict=True)).get(n, "departure") for n in changed.control_names
-            )
+            ends = dict(zip(self.control_names, self.ends, strict=True))
+            changed.ends = tuple(ends.get(name, "departure") for name in changed.control_names)
         return changed
 
     def scheduled_on(self, names: Collection[str]) -> Transient:
@@ -335,10 +325,8 @@ class Transient:
         with np.errstate(over="ignore", invalid="ignore"):
             if math.isfinite(sum(float(a.sum()) for a in (self.x, self.u, self.s))):  # the usual case, in less time
                 return np.asarray(same)
-        finite_x = np.asarray(np.isfinite(self.x).all(axis=1))
-        finite_u = np.asarray(np.isfinite(self.u).all(axis=1)) & np.isfinite(self.s).all(axis=1)
-        usable: NDArray[np.bool_] = same & finite_x[:-1] & finite_u[:-1] & finite_x[1:]
-        return usable
+        finite_x, finite_u, finite_s = (np.asarray(np.isfinite(z).all(axis=1)) for z in (self.x, self.u, self.s))
+        return np.asarray(same & finite_x[:-1] & finite_u[:-1] & finite_s[:-1] & finite_x[1:])
 
     def transitions(self) -> Transitions:
         """The usable transitions, as arrays in recorded units.
@@ -374,13 +362,10 @@ class Transient:
         return len(self.t_ns)
 
     def __repr__(self) -> str:
-        n, m, usable = self.x.shape[1], self.u.shape[1], int(self.usable.sum())
-        span = float(self.t[-1]) if len(self) else 0.0
-        return (
-            f"Transient({self.name!r}: {plural(len(self), 'sample')} over {span:g} s, {plural(n, 'state')}, "
-            f"{plural(m, 'control')}, "
-            f"{plural(usable, 'usable transition')} in {plural(self.segments, 'segment')})"
-        )
+        span, usable = float(self.t[-1]) if len(self) else 0.0, plural(int(self.usable.sum()), "usable transition")
+        signals = f"{plural(self.x.shape[1], 'state')}, {plural(self.u.shape[1], 'control')}"
+        samples = f"{plural(len(self), 'sample')} over {span:g} s"
+        return f"Transient({self.name!r}: {samples}, {signals}, {usable} in {plural(self.segments, 'segment')})"
 
     def _repr_html_(self) -> str:
         """Range, largest step and missing samples of each signal."""
@@ -396,13 +381,10 @@ class Transient:
             rms = float(np.sqrt(np.nanmean(np.diff(values) ** 2))) if len(finite) > 1 else math.nan
             cells = [named(name, unit), kind, number_text(low), number_text(high), number_text(rms)]
             rows.append([*cells, str(len(values) - len(finite))])
-        counts = [
-            f"{count} {reason}" for reason, count in sorted(self.counters.items()) if count and reason != "samples"
-        ]
+        counted = sorted((reason, n) for reason, n in self.counters.items() if n and reason != "samples")
+        below = [f"not used, or without a verdict: {', '.join(f'{n} {reason}' for reason, n in counted)}"]
         header = ("signal", "", "least", "greatest", "rms step", "missing")
-        return html_table(
-            repr(self), header, rows, [f"not used, or without a verdict: {', '.join(counts)}"] if counts else []
-        )
+        return html_table(repr(self), header, rows, below if counted else [])
 
     def to_dataframe(self, absolute: bool = False) -> Any:
         """As a pandas DataFrame, of which `from_dataframe` makes the run again.
@@ -419,11 +401,9 @@ class Transient:
         """
         import pandas
 
-        index = (
-            pandas.DatetimeIndex(self.t_ns.view("M8[ns]"), tz="UTC", name="time")
-            if absolute
-            else pandas.Index(self.t, name="time [s]")
-        )
+        index = pandas.Index(self.t, name="time [s]")
+        if absolute:
+            index = pandas.DatetimeIndex(self.t_ns.view("M8[ns]"), tz="UTC", name="time")
         columns = [*self.state_names, *self.control_names, *self.scheduling_names]
         return pandas.DataFrame(np.hstack([self.x, self.u, self.s]), index=index, columns=columns)
 
@@ -518,9 +498,8 @@ def _ends_of(at: At | Mapping[str, At], transient: Transient) -> tuple[At, ...]:
             raise TransientError(f"{transient.name}: at is {end!r}; it must be departure, arrival or both")
         if name and name not in names:
             there = ", ".join(names) or "none"
-            raise TransientError(
-                f"{transient.name}: there is no control '{name}'{meant(name, names)}; there are {there}"
-            )
+            near = meant(name, names)
+            raise TransientError(f"{transient.name}: there is no control '{name}'{near}; there are {there}")
     found = list(transient.ends)
     for j, name in enumerate(names):
         bound = listed[j].delay or listed[j].memory if listed else None

@@ -214,19 +214,16 @@ class FieldPath:
         known = (*FUNCTIONS, "unwrap", *KINDS)
         while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
             if match[1] not in known:
-                raise SignalError(
-                    f"field '{text}': there is no function '{match[1]}'{meant(match[1], known)}; "
-                    f"there are {', '.join(known)}"
-                )
+                near, there = meant(match[1], known), ", ".join(known)
+                raise SignalError(f"field '{text}': there is no function '{match[1]}'{near}; there are {there}")
             functions.append(match[1])
             inner = match[2].strip()
         if functions[:1] == ["unwrap"]:
             self.unwrap = True
             functions = functions[1:]
         if len(functions) > 1 or not set(functions) <= set(FUNCTIONS):
-            raise SignalError(
-                f"field '{text}': functions nest only as unwrap(roll|pitch|yaw(...)), and in lag, diff, rate"
-            )
+            only = "functions nest only as unwrap(roll|pitch|yaw(...)), and in lag, diff, rate"
+            raise SignalError(f"field '{text}': {only}")
         if functions:
             self.function = FUNCTIONS[functions[0]]
         self.steps = self._parse(inner)
@@ -238,16 +235,11 @@ class FieldPath:
             match = _STEP.match(inner, position)
             dotted = inner[position] == "."
             if not match or (match[1] is not None and dotted != bool(steps)) or (match[1] is None and not steps):
-                raise SignalError(
-                    f"field '{self.text}' is not a field path; write for example twist.linear.x, data[0], "
-                    f"position[fan] or yaw(pose.orientation)"
-                )
-            if match[1] is not None:
-                steps.append(("attribute", match[1]))
-            elif match[2] is not None:
-                steps.append(("index", int(match[2])))
-            else:
-                steps.append(("name", match[3] or match[4]))
+                example = "twist.linear.x, data[0], position[fan] or yaw(pose.orientation)"
+                raise SignalError(f"field '{self.text}' is not a field path; write for example {example}")
+            kind = {1: "attribute", 2: "index"}.get(match.lastindex or 0, "name")
+            key = match[match.lastindex or 0]
+            steps.append((kind, int(key) if kind == "index" else key))
             position = match.end()
         if not steps:
             raise SignalError(f"field '{self.text}' is empty; name a field of the message")
@@ -264,40 +256,36 @@ class FieldPath:
 
     def read(self, message: Any) -> float:
         """Value in this message; NaN where an index or a name is not there, or a quaternion is all zero."""
-        value, parent = message, message
-        for kind, key in self.steps:
-            if kind == "attribute":
-                parent, value = value, getattr(value, key)  # type: ignore[arg-type]
-            elif kind == "index":
-                if key >= len(value):  # type: ignore[operator]
-                    return math.nan
-                value = value[key]
-            else:
-                names = list(parent.name)
-                if key not in names or names.index(key) >= len(value):  # of a name that is there twice, the first
-                    return math.nan
-                value = value[names.index(key)]
-        return self.function.of(value) if self.function else as_number(value)
+        value, lacking = self._look_up(message)
+        return math.nan if lacking else self.function.of(value) if self.function else as_number(value)
 
     def absent(self, message: Any) -> str:
         """What this path looks up and the message has not, in words, with what is there; empty where it has."""
+        value, lacking = self._look_up(message)
+        if not lacking:
+            return ""
+        name, key, names = lacking
+        if isinstance(key, str) and key not in names:
+            there = ", ".join(names) or "none"
+            return f"there is no '{key}' in the message's names{meant(key, names)}; names there: {there}"
+        if not len(value):
+            return f"'{name}' has no element in the message; choose a field that is filled"
+        there = f"elements there: 0 to {len(value) - 1}"
+        return f"'{name}' has {plural(len(value), 'element')} in the message; {there}"
+
+    def _look_up(self, message: Any) -> tuple[Any, tuple[str, str | int, list[str]] | None]:
+        """The value; or the array that lacks an entry, with its name, the key and the names of the message."""
         value, parent, name = message, message, ""
         for kind, key in self.steps:
             if kind == "attribute":
-                parent, value, name = value, getattr(value, key), str(key)  # type: ignore[arg-type]
+                parent, value, name = value, getattr(value, str(key)), str(key)
                 continue
             names = [str(one) for one in parent.name] if kind == "name" else []
-            if kind == "name" and key not in names:
-                there = ", ".join(names) or "none"
-                return f"there is no '{key}' in the message's names{meant(key, names)}; names there: {there}"
-            index = names.index(str(key)) if kind == "name" else int(key)
+            index = int(key) if kind == "index" else names.index(str(key)) if key in names else len(value)
             if index >= len(value):
-                if not len(value):
-                    return f"'{name}' has no element in the message; choose a field that is filled"
-                there = f"elements there: 0 to {len(value) - 1}"
-                return f"'{name}' has {plural(len(value), 'element')} in the message; {there}"
+                return value, (name, key, names)
             value = value[index]
-        return ""
+        return value, None
 
     def check(self, topic: str, type_name: str, type_fields: TypeFields) -> None:
         """Check the path against a message type."""
@@ -314,8 +302,7 @@ class FieldPath:
                 if key not in parent:
                     raise SignalError(
                         f"{here}: there is no '{key}' in {current.type_name}{meant(key, parent)}; fields there: "
-                        f"{', '.join(parent) or 'none'}; numeric field paths of {topic}: "
-                        f"{_some(numeric_paths(type_name, type_fields))}"
+                        f"{', '.join(parent) or 'none'}; {_instead(topic, type_name, type_fields)}"
                     )
                 current = parent[str(key)]
                 continue
@@ -324,12 +311,9 @@ class FieldPath:
             if kind == "index" and current.array and int(key) >= current.array:
                 raise SignalError(f"{here}: index {key} is past the end of an array of {current.array}")
             if kind == "name":
-                names = parent.get("name")
-                if names is None or names.kind != "string" or names.array is None:
-                    raise SignalError(
-                        f"{here}: '[{key}]' needs an array of strings called 'name' in the same message; "
-                        f"give an index instead, for example [0]"
-                    )
+                if not _are_names(parent.get("name")):
+                    needs = "needs an array of strings called 'name' in the same message"
+                    raise SignalError(f"{here}: '[{key}]' {needs}; give an index instead, for example [0]")
             current = replace(current, array=None)
         self._check_leaf(here, current, type_name, topic, type_fields)
 
@@ -346,16 +330,13 @@ class FieldPath:
                 raise SignalError(f"{here}: wants {takes.words}, and {leaf.type_name} is none")
         elif leaf.kind not in ("number", "bool") or leaf.array is not None:
             what = "an array; give an index, for example [0]" if leaf.array is not None else f"a {leaf.type_name}"
-            raise SignalError(
-                f"{here} is not one number but {what}; numeric field paths of {topic}: "
-                f"{_some(numeric_paths(type_name, type_fields))}"
-            )
+            raise SignalError(f"{here} is not one number but {what}; {_instead(topic, type_name, type_fields)}")
 
 
-def _some(paths: Iterator[str], limit: int = 24) -> str:
-    found = list(paths)
+def _instead(topic: str, type_name: str, type_fields: TypeFields, limit: int = 24) -> str:
+    found = list(numeric_paths(type_name, type_fields))
     more = f", and {len(found) - limit} more" if len(found) > limit else ""
-    return (", ".join(found[:limit]) or "none") + more
+    return f"numeric field paths of {topic}: {', '.join(found[:limit]) or 'none'}{more}"
 
 
 _NO_SIGNALS = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
@@ -411,7 +392,10 @@ def _inside(type_fields: TypeFields, field: FieldType, value: Any, path: str, de
 
 def has_names(type_fields: TypeFields, type_name: str) -> bool:
     """Whether messages of a type name the entries of their arrays, as a JointState does."""
-    field = type_fields(type_name).get("name")
+    return _are_names(type_fields(type_name).get("name"))
+
+
+def _are_names(field: FieldType | None) -> bool:
     return field is not None and field.kind == "string" and field.array is not None
 
 

@@ -84,10 +84,7 @@ class Signal:
     @property
     def recalls(self) -> bool:
         """Whether the field is a memory; one that is no field path is refused by `check`."""
-        try:
-            return self.memory is not None
-        except SignalError:
-            return False
+        return memory_of(self.field)[0] is not None
 
     def admits(self, value: float) -> bool:
         """Whether a value of the field counts."""
@@ -110,9 +107,8 @@ class Signal:
         elif self.steady != "auto" and not -LARGEST <= self.steady <= LARGEST:
             problem = f"steady is {self.steady}; it must be a finite number or auto, up to {LARGEST:g}"
         elif self.max_hold is not None and not 0 <= self.max_hold <= LONGEST_S:
-            problem = (
-                f"max_hold is {self.max_hold}; it must be 0 s or more, up to {LONGEST_S:g}, or left out for no limit"
-            )
+            least = f"it must be 0 s or more, up to {LONGEST_S:g}, or left out for no limit"
+            problem = f"max_hold is {self.max_hold}; {least}"
         elif not 0 <= self.delay <= LONGEST_DELAY:
             problem = f"delay is {reprlib.repr(self.delay)}; it must be 0 to {LONGEST_DELAY} samples"
         elif self.delay and self.memory:
@@ -120,13 +116,11 @@ class Signal:
         elif self.at not in AT:
             problem = f"at is {reprlib.repr(self.at)}; write departure, arrival or both"
         elif self.at != "departure" and (self.delay or self.memory):
-            problem = (
-                f"at is {self.at}, and it is taken from earlier samples (delay, lag, diff, rate); leave one of them out"
-            )
+            earlier = "it is taken from earlier samples (delay, lag, diff, rate)"
+            problem = f"at is {self.at}, and {earlier}; leave one of them out"
         elif self.judged and (self.delay or self.memory or self.at != "departure"):
-            problem = (
-                "is judged, and delayed, a memory or not at the departure, which leaves nothing to judge; choose one"
-            )
+            nothing = "which leaves nothing to judge"
+            problem = f"is judged, and delayed, a memory or not at the departure, {nothing}; choose one"
         elif self.valid is not None and not self.valid[0] < self.valid[1]:
             problem = f"valid is {list(self.valid)}; write [least, greatest]"
         elif any(math.isnan(code) for code in self.ignore):
@@ -136,13 +130,20 @@ class Signal:
         raise SignalError(f"{where}: {problem}")
 
 
+def memory_of(field: object) -> tuple[Memory | None, str]:
+    """The memory that a field is, and of what; what is no field path is refused later, by the signal's name."""
+    try:
+        return parse_memory(str(field))
+    except SignalError:
+        return None, ""
+
+
 def _single(value: float) -> float:
     """The nearest number of single precision; the value itself beyond its range."""
     try:
-        rounded: float = struct.unpack("f", struct.pack("f", value))[0]
+        return float(struct.unpack("f", struct.pack("f", value))[0])
     except OverflowError:
         return value
-    return rounded
 
 
 @dataclass(frozen=True)
@@ -250,10 +251,8 @@ def _ignored(value: Any, where: str) -> tuple[float, ...]:
 
 
 def _step(value: Any, where: str) -> Any:
-    if value in ("recorded", "constant"):
-        return value
     try:
-        return checked_number(value, where)
+        return value if value in ("recorded", "constant") else checked_number(value, where)
     except SignalError:
         raise wrong(where, value, STEP_CHOICES) from None
 
@@ -309,7 +308,7 @@ def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
     listed = {(str(e.get("topic")), str(e.get("field")).strip()): e for e in reversed(entries)}
 
     def filled(entry: Any) -> Any:
-        memory, inner = _memory(entry) if isinstance(entry, dict) else (None, "")
+        memory, inner = memory_of(entry.get("field")) if isinstance(entry, dict) else (None, "")
         if memory is None or (of := listed.get((str(entry.get("topic")), inner))) is None:
             return entry
         unit = str(of.get("unit") or "")
@@ -318,14 +317,6 @@ def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
         return own | entry
 
     return {key: [filled(entry) for entry in of_list] for key, of_list in lists.items()}
-
-
-def _memory(entry: Mapping[str, Any]) -> tuple[Memory | None, str]:
-    """The memory that an entry is, and of what field; what is no field path is refused later, by the signal's name."""
-    try:
-        return parse_memory(str(entry.get("field")))
-    except SignalError:
-        return None, ""
 
 
 PLACE = "{}"
@@ -350,6 +341,7 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
         if not isinstance(found.get(key), list):
             continue
         entries: list[Any] = []
+        unique = "state" if key == "structure" else "name"
         for position, entry in enumerate(found[key]):
             if not isinstance(entry, dict) or "for" not in entry:
                 entries.append(entry)
@@ -357,12 +349,9 @@ def expand(top: Mapping[str, Any], source: str) -> dict[str, Any]:
             here = f"{source}: {key}[{position}]"
             members = members_of(entry["for"], f"{here}: for")
             plain = {name: value for name, value in entry.items() if name != "for"}
-            unique = "state" if key == "structure" else "name"
             if len(members) > 1 and PLACE not in str(plain.get(unique, "")):
-                raise SignalError(
-                    f"{here}: {unique} is {reprlib.repr(plain.get(unique))}, the same for all of "
-                    f"{shortlist(members, 3)}; write {PLACE} where the member goes, in quotes"
-                )
+                same = f"{unique} is {reprlib.repr(plain.get(unique))}, the same for all of {shortlist(members, 3)}"
+                raise SignalError(f"{here}: {same}; write {PLACE} where the member goes, in quotes")
             for one in members:
                 written = {k: v.replace(PLACE, one) if isinstance(v, str) else v for k, v in plain.items()}
                 entries.append(written)
@@ -407,7 +396,7 @@ def _own(top: Mapping[str, Any], member: Mapping[str, str]) -> list[dict[str, An
     states, controls = ([e for e in top.get(key) or [] if isinstance(e, dict)] for key in ("states", "controls"))
     names = [str(e.get("name")) for e in (*states, *controls)]
     judged = [e for e in controls if e.get("judged") is True]
-    rows = [str(e.get("name")) for e in (*states, *judged) if _memory(e)[0] is None]
+    rows = [str(e.get("name")) for e in (*states, *judged) if memory_of(e.get("field"))[0] is None]
     return [
         {"state": state, "from": other, "nominal": 0, "half_width": 0}
         for state in rows

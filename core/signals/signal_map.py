@@ -153,10 +153,8 @@ class SignalMap:
         of_states = {(s.topic, s.field) for s in self.states}
         for s in self.states:
             if (s.max_hold is not None and not s.judged) or s.delay:
-                self._refuse(
-                    f"state '{s.name}' has max_hold or delay; both are for controls (the age of a state is limited by "
-                    f"max_skew)"
-                )
+                both = "both are for controls (the age of a state is limited by max_skew)"
+                self._refuse(f"state '{s.name}' has max_hold or delay; {both}")
         for s in self.scheduling:
             if s.delay:
                 self._refuse(f"scheduling signal '{s.name}' has a delay; that is for controls")
@@ -205,9 +203,8 @@ class SignalMap:
         states = [s for s in self.states if not s.recalls]
         controls = [*self.controls, *(s for s in self.states if s.recalls)]
         if self.states and not states:
-            self._refuse(
-                "every state is a lag, diff or rate, which has no row of its own; list the field itself as a state, too"
-            )
+            remedy = "list the field itself as a state, too"
+            self._refuse(f"every state is a lag, diff or rate, which has no row of its own; {remedy}")
         known = {(s.topic, s.field): s for s in reversed((*states, *controls, *self.scheduling))}
 
         def as_listed(signal: Signal) -> Signal:
@@ -308,13 +305,11 @@ class SignalMap:
             s: of a state, and of the memory of a topic of states, max_skew or else max_gap; of the others max_hold.
         """
         signal = self.signals[position]
-        if signal.max_hold is not None:
-            return signal.max_hold
+        age = signal.max_hold
         of_state = signal.topic in {s.topic for s in self.states}
-        if position < len(self.states) or (of_state and signal.memory is not None):
+        if age is None and (position < len(self.states) or (of_state and signal.memory is not None)):
             age = self.max_gap if self.max_skew is None else self.max_skew
-            return math.inf if age is None else age
-        return math.inf
+        return math.inf if age is None else age
 
     def replace_signals(self, signals: Sequence[Signal]) -> SignalMap:
         """The same map with other signals in the place of these.
@@ -329,13 +324,9 @@ class SignalMap:
         SignalMap
             A new map.
         """
-        n, m = len(self.states), len(self.controls)
-        return replace(
-            self,
-            states=tuple(signals[:n]),
-            controls=tuple(signals[n : n + m]),
-            scheduling=tuple(signals[n + m :]),
-        )
+        n, m = len(self.states), len(self.states + self.controls)
+        states, controls, scheduling = tuple(signals[:n]), tuple(signals[n:m]), tuple(signals[m:])
+        return replace(self, states=states, controls=controls, scheduling=scheduling)
 
     def scheduled_on(self, names: Collection[str]) -> SignalMap:
         """Leave out the further scheduling signals that are not named, and what is said of them.
@@ -353,12 +344,9 @@ class SignalMap:
         gone = {s.name for s in self.scheduling if s.name not in names}
         if not gone:
             return self
-        left = replace(
-            self,
-            scheduling=tuple(s for s in self.scheduling if s.name not in gone),
-            schedule=tuple(rule for rule in self.schedule if rule.signal not in gone),
-            time={},
-        )
+        scheduling = tuple(s for s in self.scheduling if s.name not in gone)
+        schedule = tuple(rule for rule in self.schedule if rule.signal not in gone)
+        left = replace(self, scheduling=scheduling, schedule=schedule, time={})
         return replace(left, time={topic: kind for topic, kind in self.time.items() if topic in left.topics})
 
     @property
@@ -447,11 +435,8 @@ class SignalMap:
                 at = "" if s.at == "departure" else s.at
                 rows.append([named(s.name, s.unit), kind, s.topic, s.field, *point, hold, str(s.delay or ""), at])
         header = ("signal", "", "topic", "field", "steady", "scale", "max_hold", "delay", "at")
-        below = [
-            f"{name}: {value}"
-            for name in ("clock", "max_gap", "min_step", "max_skew", "step", "additive")
-            if (value := getattr(self, name)) not in (None, 0.0, "recorded")
-        ]
+        said = {name: getattr(self, name) for name in ("clock", "max_gap", "min_step", "max_skew", "step", "additive")}
+        below = [f"{name}: {value}" for name, value in said.items() if value not in (None, 0.0, "recorded")]
         return html_table(f"signals ({self.source})", header, rows, below)
 
     @classmethod

@@ -56,15 +56,14 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
     import yaml  # the live node reads signals from the model file and needs no YAML
 
     if (kind := kind_of(path)) and kind != "a signals file":
-        raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {_remedy(kind)}")
+        remedy = "name a file in it" if kind == "a folder" else "are the arguments swapped?"
+        raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {remedy}")
     try:
         with open(path, encoding="utf-8") as stream:
             node = compose(stream)
         if repeated := _repeated_key(node):
-            raise SignalError(
-                f"{path}: key '{repeated.value}' is twice in one mapping, again at line "
-                f"{repeated.start_mark.line + 1}; keep one"
-            )
+            line = repeated.start_mark.line + 1
+            raise SignalError(f"{path}: key '{repeated.value}' is twice in one mapping, again at line {line}; keep one")
         data = construct(node)
     except FileNotFoundError:
         raise SignalError(f"{path}: there is no such signals file; check the path") from None
@@ -78,9 +77,8 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
         problem = str(getattr(error, "problem", None) or error).splitlines()[0]
         raise SignalError(f"{path}: is not YAML{line}: {problem}; mend it") from None
     if data is None:
-        raise SignalError(
-            f"{path}: nothing is in it; list the states and controls, or let `uncertain-lti init` propose them"
-        )
+        remedy = "list the states and controls, or let `uncertain-lti init` propose them"
+        raise SignalError(f"{path}: nothing is in it; {remedy}")
     return data
 
 
@@ -122,11 +120,6 @@ def kind_in_yaml(data: object) -> str:
     """Name what a value is in the words of YAML."""
     names = {dict: "a mapping", list: "a list", str: "a text", bool: "a truth value", type(None): "nothing"}
     return names.get(type(data), "a number" if isinstance(data, (int, float)) else type(data).__name__)
-
-
-def _remedy(kind: str) -> str:
-    """What to do about a file of another kind."""
-    return "name a file in it" if kind == "a folder" else "are the arguments swapped?"
 
 
 def wrong(where: str, value: object, write: str) -> SignalError:
