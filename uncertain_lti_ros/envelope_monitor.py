@@ -416,7 +416,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             return
         if self.session is not None and self.active and not self._diagnostics.listeners:
             self._reported = now
-            self.session.pass_over(now)
+            self.session.pass_over()
             self._mark_reported()
         else:
             self.report()
