@@ -188,7 +188,8 @@ def test_a_free_run_follows_the_controls_and_begins_again_after_gaps() -> None:
     expected = model.operating_point.recorded_x(naive_run(model, recording))
     np.testing.assert_allclose(free.x, expected)
     assert np.isnan(expected[10]).all() and np.isfinite(np.delete(expected, 10, axis=0)).all()
-    refuses(ModelError, "it has 3 states, 1 controls", model.free_run, Transient(t, np.zeros((30, 3)), u))
+    other = Transient(t, np.zeros((30, 3)), u)
+    refuses(ModelError, "3 states and 1 control, and the model has 2 and 1", model.free_run, other)
 
 
 def test_weights_of_another_shape_are_refused() -> None:

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import WORTH_THREADS, Array, core_count, on_cores
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, refuse_other
+from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.domain import Domain, outside_in_words
@@ -26,7 +27,7 @@ from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbrok
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns, normalised
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, Elements, Term
-from uncertain_lti.sampling.transient import Transitions
+from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
 from uncertain_lti.signals.signal_map import SignalMap
 
 
@@ -81,6 +82,21 @@ class Envelope(Elements):
         if self.schedule is None:
             return self.centre_and_half_at(z[:rows], dt)
         return self.centre_and_half_at(z[:rows], dt, None, self.schedule.table, z[self.scheduling_positions])
+
+    def own_signals_of(self, transient: Transient) -> Transient:
+        """A recording with the controls and scheduling signals as this model takes them, refused if it has others."""
+        instead = "read a recording with read_transients first, and give one after the other"
+        refuse_other(transient, Transient, "the recording", instead, ModelError)
+        own = transient.scheduled_on([s.name for s in self.signals.scheduling])
+        own = controls_as(own, self.signals.controls)
+        states, controls, further = own.x.shape[1], own.u.shape[1], own.s.shape[1]
+        if (states, controls, further) != (self.n, self.m, self.q):
+            raise ModelError(
+                f"{own.name}: {plural(states, 'state')} and {plural(controls, 'control')}, and the model has {self.n} "
+                f"and {self.m}; of further scheduling signals it has {further}, and the model {self.q}; read it with "
+                f"the signals of the model"
+            )
+        return own
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """Normalised [x; u; s] (n + m + q, K) of K transitions in recorded units."""

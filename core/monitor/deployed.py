@@ -118,7 +118,7 @@ class DeployedMonitor:
         armed = arming.over(transient.t_ns[a:b], came[later], heard[later])
         if (a, b) != (0, count):
             around = a, count - b
-            armed = Armed(np.pad(armed.counts, around), np.pad(armed.cleared, around), slice(a, b))
+            armed = Armed(*(np.pad(marks, around) for marks in armed))
         verdicts = self.monitor.check(transient, armed)
         if self.latch:
             verdicts = dataclasses.replace(verdicts, alarm=np.logical_or.accumulate(verdicts.alarm))

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from typing import Any
@@ -23,7 +24,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
-from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import (
     FLAGS,
     JUDGED,
@@ -45,24 +45,19 @@ from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
 from uncertain_lti.model.repeats import Bounds, FrozenWatch, Partly, followed, needs
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Armed, Arming, back_and_restarts, steps_back
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step, all_finite
-from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
+from uncertain_lti.sampling.transient import Transient, Transitions
 
 
-def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int, int]]:
+def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed) -> list[tuple[int, int]]:
     """[start, stop) of samples over which the alarm goes on from a cleared one; others raise none."""
-    count = len(t_ns)
-    _, cleared = back_and_restarts(t_ns)
-    counts = np.ones(count, dtype=bool)
-    if armed is not None:
-        counts, cleared = armed.counts, cleared | armed.cleared
-    edges = np.flatnonzero(cleared | np.append(True, counts[1:] != counts[:-1])[:count])
-    if not count:
-        return []
-    return [(int(a), int(b)) for a, b in zip(edges, [*edges[1:], count], strict=True) if counts[a]]
+    counts, count = armed.counts, len(t_ns)
+    _, restarts = back_and_restarts(t_ns)
+    edges = np.flatnonzero(restarts | armed.cleared | np.append(True, counts[1:] != counts[:-1])[:count])
+    return [(a, b) for a, b in pairwise([*edges.tolist(), count]) if counts[a]]
 
 
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
@@ -115,7 +110,7 @@ class EnvelopeMonitor:
     masked: tuple[str, ...] = cython.declare(object, visibility="readonly")
     frozen_watch: FrozenWatch | None = cython.declare(object, visibility="readonly")
     _counted: Any
-    _every: Any
+
     _judge: Any
     _runs: Any
     _nothing: Any
@@ -140,14 +135,10 @@ class EnvelopeMonitor:
         if rules is not None:
             model = model.replace(alarm=rules)
         self.model = model
-        rule = model.alarm_rule
-        self.rule = AlarmRule(
-            rule.violations if violations is None else violations,
-            rule.window if window is None else window,
-            rule.margin if margin is None else margin,
-        )
-        other = (violations, window, margin) != (None, None, None)
-        every = with_containment(model.alarm, self.rule) if other else model.alarm
+        given: dict[str, Any] = {"violations": violations, "window": window, "margin": margin}
+        given = {name: value for name, value in given.items() if value is not None}
+        self.rule = replace(model.alarm_rule, **given)
+        every = with_containment(model.alarm, self.rule) if given else model.alarm
         names = model.state_names
         for name in masked:
             if name not in names:
@@ -156,7 +147,7 @@ class EnvelopeMonitor:
         if len(self.masked) == len(names):
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
-        self._every = np.arange(model.n)
+
         self._judge = model.judge_of(self.rule.margin, self._counted)
         self.alarms = Alarm(every, model, self._counted)
         self._runs = model.runs_of(self._judge)
@@ -195,12 +186,6 @@ class EnvelopeMonitor:
         if self.model.repeats is None:
             return None
         return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist(), needs(self.model))
-
-    @cython.cfunc
-    def _forget_repeats(self) -> None:
-        self._frozen_alarm = False
-        if self.frozen_watch is not None:
-            self.frozen_watch.forget()
 
     def _bounds_of(self, step: Step, judgement: Judgement) -> Bounds:
         """What the watch asks for if a state repeats."""
@@ -252,7 +237,8 @@ class EnvelopeMonitor:
         Verdict
             Its `lower` and `upper` are the bounds.
         """
-        return self.look(Step(Status.OK, t_ns, 0, dt, z, z[: len(self._counted)]))
+        step = Step(Status.OK, t_ns, 0, dt, z, z[: len(self._counted)])
+        return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def foresee(self, t_ns: int, z: Sequence[float], dt: float) -> Foreseen | None:
         """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are.
@@ -275,21 +261,6 @@ class EnvelopeMonitor:
         if bounds is None or not all_finite(bounds):
             return None
         return Foreseen(t_ns + max(self.model.steps) * round(dt * 1e9), bounds)
-
-    def look(self, step: Step) -> Verdict:
-        """Verdict on a complete step, not counted for the alarm.
-
-        Parameters
-        ----------
-        step : Step
-            With a complete transition.
-
-        Returns
-        -------
-        Verdict
-            With the alarm as it was.
-        """
-        return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def steps_back(self, step: Step) -> bool:
         """Whether time steps back with a sample that `judge` has not taken yet.
@@ -357,12 +328,14 @@ class EnvelopeMonitor:
             looked = watch.look(step.t_ns, step.dt, step.before, step.after, bounds)
             self._frozen_alarm = armed and bool(looked.frozen)
             if withheld := looked.withheld:
-                if self._counted[np.delete(self._every, withheld)].any():
+                if np.delete(self._counted, withheld).any():
                     judgement = Partly(judgement, withheld, self._counted)
                 else:
                     judgement, status = None, Status.FROZEN
         elif judgement is None and not status.dropped:
-            self._forget_repeats()
+            self._frozen_alarm = False
+            if watch is not None:
+                watch.forget()
         longer = self._nothing
         if self._runs is not None:
             if judgement is not None and not withheld:
@@ -405,31 +378,16 @@ class EnvelopeMonitor:
         ModelError
             The transient has other numbers of states or controls than the model.
         """
-        instead = "read a recording with read_transients first, and give one after the other"
-        refuse_other(transient, Transient, "the recording", instead, ModelError)
         model, point = self.model, self.model.operating_point
-        transient = controls_as(transient, model.signals.controls)
-        if transient.x.shape[1] != model.n or transient.u.shape[1] != model.m:
-            raise ModelError(
-                f"{transient.name}: {plural(transient.x.shape[1], 'state')} and "
-                f"{plural(transient.u.shape[1], 'control')}, and the "
-                f"model has {model.n} and {model.m}"
-            )
-        transient = transient.scheduled_on([s.name for s in model.signals.scheduling])
-        if transient.s.shape[1] != model.q:
-            raise ModelError(
-                f"{transient.name}: {plural(transient.s.shape[1], 'further scheduling signal')}, and the model has "
-                f"{model.q}; read it with the signals of the model"
-            )
+        transient = model.own_signals_of(transient)
         step = None if isinstance(model.signals.step, str) else model.signals.step
         if transient.step != step:
             transient = transient.replace(step=step or "recorded")
         steps = transient.transitions()
-        count, n, asked = len(transient), model.n, None
-        if armed is not None and armed.asked is not None:
-            asked = np.zeros(count, dtype=bool)
-            asked[armed.asked] = True
-            steps = steps.take(asked[steps.k] & asked[steps.k + 1])
+        count, n = len(transient), model.n
+        armed = Arming(None, 0).over(transient.t_ns) if armed is None else armed
+        if not armed.asked.all():
+            steps = steps.take(armed.asked[steps.k] & armed.asked[steps.k + 1])
         fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)
         unfitted_step = np.zeros(count, dtype=bool)
         if not fitted.all():
@@ -481,11 +439,11 @@ class EnvelopeMonitor:
 
         alarm = over(each)
         if why:
-            alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
+            alarm |= frozen.any(axis=1) & armed.counts
         return Verdicts(
             transient, numbers, seen[UTILISATION], judged, left, outside, alarm, unfitted_step, unlisted_mode,
             unknown_regime, frozen, withheld, repeating, statistics, each, self.alarms, longer.transpose(1, 0, 2),
-            longer_residual.transpose(1, 0, 2), why, asked, None if armed is None else armed.counts,
+            longer_residual.transpose(1, 0, 2), why, armed.asked, armed.counts,
         )  # fmt: skip
 
     def _look_all(
