@@ -43,13 +43,13 @@ class Snapshots:
 
     def open(self) -> None:
         """Keep messages from now on, if there is a folder to write to."""
-        folder = str(self._settings.value("snapshot.folder"))
-        self._settings.check_snapshots(self._settings.value("snapshot.on_alarm"))
+        folder = self._settings["snapshot.folder"]
+        self._settings.check_snapshots(self._settings["snapshot.on_alarm"])
         if folder:
             limit = self._settings.size("snapshot.megabytes")
             name = self._node.get_fully_qualified_name()
-            self._album = Album(folder, name, self._settings.value("snapshot.keep"), limit)
-            self.recent = Recent(self._settings.real("snapshot.seconds"), self._settings.size("snapshot.memory"))
+            self._album = Album(folder, name, self._settings["snapshot.keep"], limit)
+            self.recent = Recent(self._settings["snapshot.seconds"], self._settings.size("snapshot.memory"))
 
     def close(self, session: Session | None) -> None:
         """Write what is due, and forget all messages."""
@@ -69,8 +69,8 @@ class Snapshots:
         assert self.recent is not None
         self.recent.add(entry)
         # no alarm for as long as a snapshot goes back: one that flaps must not replace the first file
-        if raised and self._due is None and entry.now - self._alarmed >= self._settings.real("snapshot.seconds"):
-            self._due = entry.now + self._settings.real("snapshot.after")
+        if raised and self._due is None and entry.now - self._alarmed >= self._settings["snapshot.seconds"]:
+            self._due = entry.now + self._settings["snapshot.after"]
 
     def alarm_over(self, now: float) -> None:
         """The alarm is over."""
@@ -83,7 +83,7 @@ class Snapshots:
 
     def _take_due(self, session: Session) -> None:
         assert self._album is not None
-        if not self._settings.value("snapshot.on_alarm"):
+        if not self._settings["snapshot.on_alarm"]:
             self._due = None
         elif not self._album.busy:
             self._due = None
@@ -95,7 +95,7 @@ class Snapshots:
     def write(self, session: Session | None) -> str:
         """Write the last seconds to a file."""
         if self._album is None or session is None:
-            if self._settings.value("snapshot.folder"):
+            if self._settings["snapshot.folder"]:
                 raise ModelError("the node is not configured, so there is nothing to write")
             raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
         return self._album.take(self._scene(session, "asked for"), _SERVICE_WAIT)
@@ -106,7 +106,7 @@ class Snapshots:
         about = {
             "node": node.get_fully_qualified_name(),
             "why": why,
-            "model": str(self._settings.value("model")),
+            "model": self._settings["model"],
             "alarm": f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}",
         }
         topics = {output.name: node.resolve_topic_name(f"~/{output.name}") for output in RECORDED}
