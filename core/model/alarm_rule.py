@@ -134,12 +134,10 @@ class StatisticRule:
         if not each or not all(_number(t) and 1 / LARGEST <= t <= LARGEST for t in each):
             must = f"a positive number, or one for each state, {1 / LARGEST:g} to {LARGEST:g}"
             raise _wrong(f"threshold of {self.kind}", self.threshold, must)
-        if isinstance(self.threshold, (list, tuple)):
+        if each is self.threshold:
             if self.kind in JOINT:
-                raise ModelError(
-                    f"alarm: {self.kind} is one number for all states, so its threshold must be one number"
-                )
-            object.__setattr__(self, "threshold", tuple(map(float, self.threshold)))
+                raise ModelError(f"alarm: {self.kind} is one number for all states; give one threshold")
+            object.__setattr__(self, "threshold", tuple(map(float, each)))
         _check_horizon(self.horizon)
         if not (_number(self.allowance) and 0.0 <= self.allowance <= LARGEST):
             raise _wrong("allowance", self.allowance, f"a number, 0 to {LARGEST:g}")

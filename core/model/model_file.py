@@ -70,6 +70,7 @@ def structure(model: Any) -> dict[str, Any]:
         "table": _dict(signals.table),
     }
     box = {name: getattr(domain, name).tolist() for name in ("x_min", "x_max", "u_min", "u_max")}
+    found = {"measure": _dict(domain.measure), "step_max": finite_data(domain.step_max), "anywhere": domain.anywhere}
     whole = {
         "format": FORMATS[0],
         "states": [_signal(s, _STATE) for s in signals.states],
@@ -79,14 +80,7 @@ def structure(model: Any) -> dict[str, Any]:
         "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
         "run": _dict(model.run),
         "domain": {name: [v if math.isfinite(v) else None for v in limits] for name, limits in box.items()}
-        | _known(
-            {
-                "measure": _dict(domain.measure),
-                "step_max": finite_data(domain.step_max),
-                "anywhere": domain.anywhere,
-            },
-            _OF_DOMAIN,
-        ),
+        | _known(found, _OF_DOMAIN),
         "residuals": _dict(model.residuals),
         "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
         if model.alarm == (rule,)
@@ -198,7 +192,7 @@ def _domain(data: Any, n: int, m: int, newer: bool) -> Domain:
     limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
     measure, step_max, anywhere = (box.get(name) for name in _OF_DOMAIN)
     if anywhere is not None and not (
-        isinstance(anywhere, list) and len(anywhere) == n + m and all(isinstance(each, bool) for each in anywhere)
+        isinstance(anywhere, list) and [type(each) for each in anywhere] == [bool] * (n + m)
     ):
         raise ModelError(f"field 'domain.anywhere' must be a list of {n + m} of true and false")
     if step_max is not None and ((step_max := checked(step_max, "domain.step_max", (n,))) < 0.0).any():
@@ -250,10 +244,8 @@ def read(path: str | os.PathLike[str]) -> Any:
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise ModelError(f"{path}: is no regular file (a pipe or a device), and a model file is one; check the path")
     if (kind := kind_of(path)) and kind != "a model file":
-        cure = {
-            "a folder": "name the file in it",
-            "a signals file": "write a model with `uncertain-lti fit`",
-        }.get(kind, "are the arguments swapped?")
+        cures = {"a folder": "name the file in it", "a signals file": "write a model with `uncertain-lti fit`"}
+        cure = cures.get(kind, "are the arguments swapped?")
         raise ModelError(f"{path}: this is {kind}, and a model file is wanted here; {cure}")
     try:
         if os.path.getsize(path) > MAX_FILE_BYTES:

@@ -98,6 +98,7 @@ class Repeats:
         The shapes do not fit one another, or a number is negative or not finite.
     """
 
+    longest_repeat_s: Array
     largest_run: Array
     largest_sum: Array
     active_beyond: Array
@@ -111,19 +112,17 @@ class Repeats:
         active_beyond: ArrayLike | None = None,
         noisy_steps: ArrayLike | None = None,
     ) -> None:
-        self.longest_repeat_s = checked(longest_repeat_s, "frozen.longest_repeat_s", None)
-        if self.longest_repeat_s.ndim != 1:
+        longest = checked(longest_repeat_s, "frozen.longest_repeat_s", None)
+        if longest.ndim != 1:
             raise ModelError("field 'frozen.longest_repeat_s' must be a list with one number per state")
-        shape = self.longest_repeat_s.shape
-        given = zip(_KEYS[1:], (largest_run, largest_sum, active_beyond, noisy_steps), strict=True)
-        for name, values in given:
-            unknown = np.full(shape, 0.0 if name == "noisy_steps" else np.inf)
-            setattr(self, name, unknown if values is None else checked(values, f"frozen.{name}", shape))
-        for name in _KEYS:
-            array = getattr(self, name)
-            array.flags.writeable = False
+        given = longest, largest_run, largest_sum, active_beyond, noisy_steps
+        for name, values in zip(_KEYS, given, strict=True):
+            unknown = np.full(longest.shape, 0.0 if name == "noisy_steps" else np.inf)
+            array = unknown if values is None else checked(values, f"frozen.{name}", longest.shape)
             if (array < 0).any():
                 raise ModelError(f"field 'frozen.{name}' holds a negative number")
+            array.flags.writeable = False
+            setattr(self, name, array)
 
     def __repr__(self) -> str:
         return f"Repeats(longest {', '.join(f'{s:.3g} s' for s in self.longest_repeat_s)})"
@@ -282,11 +281,9 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
 
 def _usual(windows: Array, shares: Array) -> Array:
     """Of each column what this share of its numbers is below; a half-width at least where they are few."""
-    found = np.full(windows.shape[1], np.inf)
-    for i, (column, share) in enumerate(zip(windows.T, shares, strict=True)):
-        known = column[~np.isnan(column)]
-        found[i] = np.quantile(known, share) if len(known) >= WINDOWS else 1.0
-    return found
+    known = [column[~np.isnan(column)] for column in windows.T]
+    each = zip(known, shares, strict=True)
+    return np.array([np.quantile(some, share) if len(some) >= WINDOWS else 1.0 for some, share in each])
 
 
 FARTHER = 2.0
@@ -368,14 +365,11 @@ class FrozenWatch:
             self.forget()
             return Looked(withheld=withheld)
         self._on = True
-        each = [
-            (Moved(i, s, self._why(i, code, size)), code)
-            for i, s, code, size in self._follow.take(t_ns, dt, before, after, *bounds())
-        ]
-        frozen = tuple(moved for moved, code in each if code != LONGER)
+        each = self._follow.take(t_ns, dt, before, after, *bounds())
+        frozen = tuple(Moved(i, s, self._why(i, code, size)) for i, s, code, size in each if code != LONGER)
         now = {moved.state for moved in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
-        return Looked(frozen, withheld, tuple(moved for moved, code in each if code == LONGER))
+        return Looked(frozen, withheld, tuple(Moved(i, s) for i, s, code, _ in each if code == LONGER))
 
     def look_all(self, given: Followed) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Callable[[int, int], str]]:
         """As `look`, many transitions: codes and rows withheld (K, n), and why a state is frozen after one of them."""

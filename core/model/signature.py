@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
-from uncertain_lti.model.terms import checked
+from uncertain_lti.model.terms import checked, object_of
 
 MOST_SIGNATURES = 256
 _KEYS = ("label", "recordings", "verdicts", "steps", "moments")
@@ -73,21 +73,17 @@ class Signature:
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file."""
-        return {name: getattr(self, name) for name in _KEYS[:3]} | {
-            "steps": list(self.steps),
-            "moments": self.moments.tolist(),
-        }
+        found = {name: getattr(self, name) for name in _KEYS}
+        return found | {"steps": list(self.steps), "moments": self.moments.tolist()}
 
     @classmethod
     def list_from(cls, data: Any) -> tuple[Signature, ...]:
         """From a model file."""
-        if not isinstance(data, list) or not all(isinstance(entry, Mapping) for entry in data):
+        if not isinstance(data, list):
             raise ModelError("field 'signatures' must be a list of objects")
-        for entry in data:
-            if set(entry) != set(_KEYS):
-                raise ModelError(f"an entry of 'signatures' must have {', '.join(_KEYS)}")
-            if not isinstance(entry["steps"], list):
-                raise ModelError("'steps' of an entry of 'signatures' must be a list")
+        for i, entry in enumerate(data):
+            if not isinstance(object_of(entry, f"signatures[{i}]", _KEYS, _KEYS)["steps"], list):
+                raise ModelError(f"field 'signatures[{i}].steps' must be a list")
         return tuple(cls(**entry) for entry in data)
 
 

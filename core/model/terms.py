@@ -163,11 +163,8 @@ class Elements:
 
     def blocks_to_list(self, names: Sequence[str] = ARRAYS) -> list[dict[str, Any]]:
         """Of each block the arrays of these names, as they are in a model file."""
-        lead = self.A.ndim > 2
-        return [
-            {name: (getattr(self, name)[r] if lead else getattr(self, name)).tolist() for name in names}
-            for r in range(len(self.A) if lead else 1)
-        ]
+        blocks = range(len(self.A)) if self.A.ndim > 2 else [...]
+        return [{name: getattr(self, name)[r].tolist() for name in names} for r in blocks]
 
 
 def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:

@@ -151,11 +151,9 @@ class UncertainLTI(Envelope):
         if run is not None:
             self.fits(run, "run")
         if signals is None:
-            signals = SignalMap(
-                tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n)),
-                tuple(Signal(f"u{j + 1}", "", f"u{j + 1}") for j in range(m)),
-                source="model",
-            )
+            states = tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n))
+            controls = tuple(Signal(f"u{j + 1}", "", f"u{j + 1}") for j in range(m))
+            signals = SignalMap(states, controls, source="model")
         if (len(signals.states), len(signals.controls)) != (n, m):
             raise ModelError(
                 f"{plural(len(signals.states), 'state')} and {plural(len(signals.controls), 'control')} are named for "
@@ -165,18 +163,17 @@ class UncertainLTI(Envelope):
         self.operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
         names = [s.name for s in signals.signals]
         self.scheduling_positions = list(schedule.positions(names)) if schedule is not None else []
-        for name in names[n + m :]:
-            if schedule is None or name not in [axis.signal for axis in schedule.axes]:
-                raise ModelError(f"scheduling signal '{name}' schedules nothing; leave it out")
-        self.block_data = tuple(block_data or (BlockData() for _ in range(lead[0] if lead else 1)))
-        if len(self.block_data) != (lead[0] if lead else 1):
-            raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(*lead or (1,), 'block')}")
+        if idle := sorted({*range(n + m, len(names))} - {*self.scheduling_positions}):
+            raise ModelError(f"scheduling signal '{names[idle[0]]}' schedules nothing; leave it out")
+        blocks = 1 if schedule is None else schedule.blocks
+        self.block_data = tuple(block_data or [BlockData()] * blocks)
+        if len(self.block_data) != blocks:
+            raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(blocks, 'block')}")
         self.sampling = sampling or Sampling()
-        unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
-        self.domain = domain or unbounded
-        self.residuals = residuals
+        everywhere = np.full(n, np.inf), np.full(m, np.inf)
+        self.domain = domain or Domain(-everywhere[0], everywhere[0], -everywhere[1], everywhere[1])
+        self.residuals, self.repeats = residuals, repeats
         self.alarm = self._alarm(alarm, alarm_rule)
-        self.repeats = repeats
         self.signatures = checked_signatures(signatures, n)
         if repeats is not None and len(repeats.longest_repeat_s) != n:
             raise ModelError(f"field 'frozen' has {len(repeats.longest_repeat_s)} numbers for {plural(n, 'state')}")
@@ -243,9 +240,8 @@ class UncertainLTI(Envelope):
         """Each block as a model of its own, without a schedule; of a model without one, itself."""
         if self.schedule is None:
             return (self,)
-        return tuple(
-            self._unscheduled({name: getattr(self, name)[r] for name in ARRAYS}) for r in range(self.schedule.blocks)
-        )
+        each = [{name: array[r] for name, array in self.arrays.items()} for r in range(self.schedule.blocks)]
+        return tuple(map(self._unscheduled, each))
 
     def at(self, **values: float) -> UncertainLTI:
         """The uncertain linear model that holds at one point of the schedule.
