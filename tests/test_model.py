@@ -533,7 +533,7 @@ RESIDUALS: list[tuple[str, Any, str]] = [
         ("signatures.0.steps", [True], "whole numbers"),
         ("signatures.0.moments", [[[1.0]]], "states"),
         ("signatures.0.recordings", 0, "whole numbers"),
-        ("signatures.0.more", 1, "signatures[0].more"),
+        ("signatures.0.more", 1, "unknown field"),
         ("signatures", armed()["signatures"] * 2, "different labels"),
         ("domain.measure.cells", True, "domain.measure.cells"),
         ("domain.measure.cells", 10**9, "domain.measure.cells"),

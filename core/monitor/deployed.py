@@ -110,12 +110,8 @@ class DeployedMonitor:
         if count and not len(inside):
             raise ModelError(f"{transient.name}: no sample lies between the times asked for; it has {t[-1]:g} s")
         a, b = (int(inside[0]), int(inside[-1]) + 1) if count else (0, 0)
-        arming = Arming(self.condition, to_ns(self.grace))
-        came, heard = np.asarray(before, dtype=np.intp) - a, np.asarray(values, dtype=np.float64)
-        for value in heard[came < 0][-1:].tolist():
-            arming.learn(value)
-        later = came >= 0
-        armed = arming.over(transient.t_ns[a:b], came[later], heard[later])
+        came = np.maximum(np.asarray(before, dtype=np.intp) - a, 0)
+        armed = Arming(self.condition, to_ns(self.grace)).over(transient.t_ns[a:b], came, values)
         if (a, b) != (0, count):
             around = a, count - b
             armed = Armed(*(np.pad(marks, around) for marks in armed))
