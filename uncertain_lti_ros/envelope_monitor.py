@@ -141,24 +141,24 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Prepare what the new values require, or refuse them; `_on_have_set` puts it in place."""
         given = {p.name: p.value for p in parameters}
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
+        candidate: Session | Rule | None = None
         self._candidate = None
         try:
             self.settings.check_snapshots(given.get("snapshot.on_alarm", False))
             if "model" in changes:
-                self._candidate = self._make_session(changes["model"], self.settings.rule(changes))
+                candidate = self._make_session(changes["model"], self.settings.rule(changes))
             elif changes and self.session is not None:
-                self._candidate = self.settings.rule(changes)
-                self.session.check(self._candidate)
+                candidate = self.settings.rule(changes)
+                self.session.check(candidate)
             elif "enable" in changes:
                 Condition.parse(changes["enable"])
         except UncertainLTIError as error:
-            self._candidate = None
             self.get_logger().warning(f"parameters refused: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         except Exception as error:  # a file can be wrong in unexpected ways
-            self._candidate = None
             self.note_failure("while parameters were set", error)
             return SetParametersResult(successful=False, reason=f"unexpected: {error!r}")
+        self._candidate = candidate
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
@@ -347,7 +347,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._look_at_clock()
         tasks = (
             self._keep_beating, self._keep_reason, self._look_around, self._keep_reporting,
-            partial(self.snapshots.write_due, self.session), self._log_events,
+            lambda: self.snapshots.write_due(self.session, time.monotonic()), self._log_events,
         )  # fmt: skip
         for task in tasks:
             try:
@@ -435,7 +435,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
             self.get_logger().warning(line)
-        else:
+        else:  # rclpy lets a line of code log at one level only
             self.get_logger().info(line)
 
     def _lasting_problems(self) -> list[str]:
@@ -536,7 +536,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "future": dict(session.future) if session else {},
                 "decoded": session.decoded if session else {},
                 "unexpected_errors": self.failures.count,
-                "snapshot": self.snapshots.last,
+                "snapshot": self.snapshots.values.get("last snapshot", ""),
                 "problems": self._problems(),
             }
         )

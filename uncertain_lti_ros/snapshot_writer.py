@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 from rclpy.node import Node
 
@@ -53,8 +52,7 @@ class Snapshots:
 
     def close(self, session: Session | None) -> None:
         """Write what is due, and forget all messages."""
-        if self._due is not None and session is not None:
-            self._take_due(session)
+        self.write_due(session, math.inf)
         if self._album is not None:
             self._album.close()
         self._album = self.recent = self._due = None
@@ -76,13 +74,10 @@ class Snapshots:
         """The alarm is over."""
         self._alarmed = now
 
-    def write_due(self, session: Session | None) -> None:
-        """Begin to write the snapshot of an alarm, if it is due."""
-        if session is not None and self._due is not None and time.monotonic() >= self._due:
-            self._take_due(session)
-
-    def _take_due(self, session: Session) -> None:
-        assert self._album is not None
+    def write_due(self, session: Session | None, now: float) -> None:
+        """Begin to write the snapshot of an alarm, if it is due; `now`: steady time, s."""
+        if session is None or self._album is None or self._due is None or now < self._due:
+            return
         if not self._settings["snapshot.on_alarm"]:
             self._due = None
         elif not self._album.busy:
@@ -103,22 +98,13 @@ class Snapshots:
     def _scene(self, session: Session, why: str) -> Scene:
         assert self.recent is not None
         node, model, monitor = self._node, session.model, session.monitor
-        about = {
-            "node": node.get_fully_qualified_name(),
-            "why": why,
-            "model": self._settings["model"],
-            "alarm": f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}",
-        }
+        alarm = f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}"
+        name, path = node.get_fully_qualified_name(), self._settings["model"]
+        about = {"node": name, "why": why, "model": path, "alarm": alarm}
         topics = {output.name: node.resolve_topic_name(f"~/{output.name}") for output in RECORDED}
         names = names_of(model.state_names, model.steps, monitor.alarms.names)
-        return Scene(
-            self.recent.entries(), names, session.types, topics, about, definition, Reasons(model, monitor.alarms.rules)
-        )
-
-    @property
-    def last(self) -> str:
-        """Path of the last file; empty if there is none."""
-        return self._album.last if self._album else ""
+        reasons = Reasons(model, monitor.alarms.rules)
+        return Scene(self.recent.entries(), names, session.types, topics, about, definition, reasons)
 
     @property
     def values(self) -> dict[str, str]:

@@ -27,7 +27,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import apart, plural, shortlist
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
 from uncertain_lti.model.operating_point import recorded
-from uncertain_lti.model.terms import object_of
+from uncertain_lti.model.terms import is_whole, object_of
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def cells_for(count: int) -> int:
     return cells if cells >= 4 else 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Occupancy:
     """Which combinations of two signals the fit saw: for each pair of them a grid over their ranges.
 
@@ -114,10 +114,9 @@ class Occupancy:
         """From a model file."""
         keys = "cells", "occupied"
         cells, text = (object_of(data, "domain.measure", keys, keys)[key] for key in keys)
-        if isinstance(cells, bool) or not isinstance(cells, int) or not 2 <= cells <= 64:
-            raise ModelError(
-                f"field 'domain.measure.cells' is {reprlib.repr(cells)}; it must be a whole number, 2 to 64"
-            )
+        if not (is_whole(cells) and 2 <= cells <= 64):
+            must = "it must be a whole number, 2 to 64"
+            raise ModelError(f"field 'domain.measure.cells' is {reprlib.repr(cells)}; {must}")
         shape = (pair_count(size), cells, cells)
         try:
             packed = np.frombuffer(b64decode(text, validate=True), dtype=np.uint8)
@@ -129,12 +128,6 @@ class Occupancy:
                 f"cells take {size_of}; fit the model again"
             )
         return cls(cells, np.unpackbits(packed, count=math.prod(shape)).astype(bool).reshape(shape))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Occupancy) and np.array_equal(self.occupied, other.occupied)
-
-    def __hash__(self) -> int:
-        return hash(self.occupied.tobytes())
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import Elements, blocks_of, checked, object_of
+from uncertain_lti.model.terms import Elements, blocks_of, checked, is_whole, object_of
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
@@ -240,7 +240,7 @@ class Horizon(Elements):
         widths: Widths = "growing",
         residuals: Residuals | None = None,
     ) -> None:
-        if isinstance(steps, bool) or not isinstance(steps, int) or not 2 <= steps <= MOST_STEPS:
+        if not (is_whole(steps) and 2 <= steps <= MOST_STEPS):
             raise ModelError(f"horizons: steps is {steps!r}; it must be a whole number, 2 to {MOST_STEPS}")
         if widths not in get_args(Widths):
             raise ModelError(f"horizon of {steps} steps: widths is {widths!r}; it must be growing or constant")

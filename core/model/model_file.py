@@ -29,7 +29,7 @@ from uncertain_lti.model.horizon import Horizon, Residuals, Run
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
-from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, object_of
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, is_number, is_whole, object_of
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.values import TableLayout
 
@@ -219,7 +219,7 @@ def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[
     for r, block in enumerate(data["blocks"]):
         for name, most in (("transitions", math.inf), ("tied_to", schedule.blocks - 1)):
             value = block.get(name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most):
+            if value is not None and not (is_whole(value) and 0 <= value <= most):
                 raise ModelError(f"field 'blocks[{r}].{name}' is {reprlib.repr(value)}; it must be a whole number")
         facts.append(BlockData(block.get("transitions"), block.get("tied_to")))
     return arrays, {"schedule": schedule, "block_data": facts}
@@ -284,10 +284,7 @@ def _positive(value: Any, name: str, zero: bool = False) -> float | None:
     """A number of seconds that is positive, or not negative where zero is allowed; None for null."""
     if value is None:
         return None
-    try:
-        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
-    except OverflowError:
-        number = math.nan
+    number = float(value) if is_number(value) else math.nan
     if not (0.0 < number <= LONGEST_S or (zero and number == 0.0)):
         limit = f", at most {LONGEST_S:g}" if number > LONGEST_S else ""
         raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")

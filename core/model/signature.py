@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
-from uncertain_lti.model.terms import checked, object_of
+from uncertain_lti.model.terms import checked, is_whole, object_of
 
 MOST_SIGNATURES = 256
 _KEYS = ("label", "recordings", "verdicts", "steps", "moments")
@@ -57,8 +57,8 @@ class Signature:
         self.label = label
         self.steps = tuple(steps)
         name = f"signatures[{label}]"
-        whole = [isinstance(v, int) and not isinstance(v, bool) for v in (*self.steps, recordings, verdicts)]
-        if not (all(whole) and self.steps and self.steps[0] >= 1 and recordings >= 1 and verdicts >= 0):
+        whole = all(map(is_whole, (*self.steps, recordings, verdicts)))
+        if not (whole and self.steps and self.steps[0] >= 1 and recordings >= 1 and verdicts >= 0):
             raise ModelError(f"field '{name}' must have whole numbers as steps, recordings and verdicts")
         if any(b <= a for a, b in zip(self.steps, self.steps[1:], strict=False)):
             raise ModelError(f"field '{name}.steps' must rise")

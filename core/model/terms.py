@@ -19,6 +19,7 @@ Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -186,6 +187,19 @@ def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_wid
     if half_width and (array < 0).any():
         raise ModelError(f"field '{name}' holds a negative half-width")
     return array
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number, and no truth value."""
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number, and no truth value."""
+    try:
+        return not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def _numbers_only(value: Any) -> bool:

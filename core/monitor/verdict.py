@@ -404,16 +404,10 @@ class Verdicts:
             bad = np.flatnonzero(self.flags[:, i] == 1.0)
             given = judged & ~np.isnan(self.flags[:, i])
             count, width = int(given.sum()), (self.upper - self.lower)[given, i]
-            rows.append(
-                [
-                    named(name, unit),
-                    str(len(bad)),
-                    f"{1 - len(bad) / count:.3%}" if count else "–",
-                    number_text(float(width.mean())) if count else "–",
-                    number_text(float(width.max())) if count else "–",
-                    f"{transient.t[bad[0]]:.4f} s" if len(bad) else "–",
-                ]
-            )
+            first = f"{transient.t[bad[0]]:.4f} s" if len(bad) else "–"
+            mean, largest = (float(width.mean()), float(width.max())) if count else (None, None)
+            inside = f"{1 - len(bad) / count:.3%}" if count else "–"
+            rows.append([named(name, unit), str(len(bad)), inside, number_text(mean), number_text(largest), first])
         return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
     def statuses(self) -> list[Status]:
