@@ -126,11 +126,7 @@ def whole_to_real(given: Parameter, default: object) -> Parameter:
 
 
 def run_node(
-    name: str,
-    summary: str,
-    parameters: Sequence[Declared],
-    run: Callable[[list[str]], int],
-    args: Sequence[str] | None,
+    name: str, summary: str, parameters: Sequence[Declared], run: Callable[[list[str]], int], args: Sequence[str] | None
 ) -> int:
     """Run a node on some arguments.
 

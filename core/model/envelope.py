@@ -179,27 +179,14 @@ class Envelope(Elements):
         return self._judge(self.tables, margin, counted, None if law is None else law.tables[0])
 
     def _judge(
-        self,
-        elements: tuple[Array, Array, Array],
-        margin: float,
-        counted: NDArray[np.bool_],
-        law: Array | None = None,
+        self, elements: tuple[Array, Array, Array], margin: float, counted: NDArray[np.bool_], law: Array | None = None
     ) -> Judge:
         point, domain = self.operating_point, self.domain
         return Judge(
-            *elements,
-            point.steady,
-            point.scale,
-            domain.least,
-            domain.greatest,
-            margin,
-            counted,
+            *elements, point.steady, point.scale, domain.least, domain.greatest, margin, counted,
             None if domain.measure is None else domain.measure.occupied,
-            self.schedule,
-            self.scheduling_positions,
-            [data.known for data in self.block_data],
-            law,
-        )
+            self.schedule, self.scheduling_positions, [data.known for data in self.block_data], law,
+        )  # fmt: skip
 
     def _runner(self) -> Judge:
         """Of the elements that are run over the windows of the horizons."""

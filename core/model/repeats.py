@@ -45,18 +45,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import (
-    BY_ACTIVITY,
-    BY_NOISE,
-    BY_RUN,
-    BY_SUM,
-    FLAGS,
-    LONGER,
-    UTILISATION,
-    Repeating,
-    changes,
-    edges,
-)
+from uncertain_lti.kernel import arithmetic as kernel
 from uncertain_lti.model.terms import checked, object_of
 
 _KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond", "noisy_steps")
@@ -190,7 +179,7 @@ def followed(
     on = np.append(False, np.diff(at) == 1)[: len(at)]
     with np.errstate(over="ignore", invalid="ignore"):
         centre, half = model.columns_centre_and_half(z, steps.dt)
-        lower, upper = (model.operating_point.recorded_x(bound.T) for bound in edges(centre, half, margin))
+        lower, upper = (model.operating_point.recorded_x(bound.T) for bound in kernel.edges(centre, half, margin))
     outside = model.domain.beyond(z) | model.unknown(z)
     return at, (on, t_ns[at + 1], steps.dt, steps.x, steps.x_next, lower, upper, model.own_rates(z).T, outside)
 
@@ -214,8 +203,8 @@ def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
     steps = transient.transitions()
     windows, noisy = _activity(model, transient, steps)
-    some, largest = changes(transient.x, steps.k)
-    follow = Repeating(np.full((model.n, 7), np.inf), LEAST, [False] * model.n, 1.0)
+    some, largest = kernel.changes(transient.x, steps.k)
+    follow = kernel.Repeating(np.full((model.n, 7), np.inf), LEAST, [False] * model.n, 1.0)
     if some.any():
         follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
     most = follow.most
@@ -340,7 +329,7 @@ class FrozenWatch:
         noisy = np.where(longest == 0.0, repeats.noisy_steps, 0.0)
         by_noise = np.where(noisy >= NOISY, USUAL_S, np.inf), np.where(noisy >= SLOW_NOISY, SLOW_S, np.inf)
         thresholds = np.vstack([usual, longest, np.where(beyond < LARGEST, beyond, np.inf), *by_noise]).T
-        self._follow = Repeating(thresholds, LEAST, counted, margin)
+        self._follow = kernel.Repeating(thresholds, LEAST, counted, margin)
         self.forget()
 
     def forget(self) -> None:
@@ -350,12 +339,7 @@ class FrozenWatch:
         self._on = False  # something repeats
 
     def look(
-        self,
-        t_ns: int,
-        dt: float,
-        before: Sequence[float],
-        after: Sequence[float],
-        bounds: Callable[[], Bounds],
+        self, t_ns: int, dt: float, before: Sequence[float], after: Sequence[float], bounds: Callable[[], Bounds]
     ) -> Looked:
         """Take one transition."""
         if not any(map(eq, before, after)):
@@ -366,15 +350,15 @@ class FrozenWatch:
             return Looked(withheld=withheld)
         self._on = True
         each = self._follow.take(t_ns, dt, before, after, *bounds())
-        frozen = tuple(Moved(i, s, self._why(i, code, size)) for i, s, code, size in each if code != LONGER)
+        frozen = tuple(Moved(i, s, self._why(i, code, size)) for i, s, code, size in each if code != kernel.LONGER)
         now = {moved.state for moved in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
-        return Looked(frozen, withheld, tuple(Moved(i, s) for i, s, code, _ in each if code == LONGER))
+        return Looked(frozen, withheld, tuple(Moved(i, s) for i, s, code, _ in each if code == kernel.LONGER))
 
     def look_all(self, given: Followed) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Callable[[int, int], str]]:
         """As `look`, many transitions: codes and rows withheld (K, n), and why a state is frozen after one of them."""
         codes, sizes = self._follow.take_all(*given)
-        frozen = codes > LONGER
+        frozen = codes > kernel.LONGER
         stale = frozen | (np.roll(frozen, 1, axis=0) & given[0][:, None])
         withheld = np.zeros(frozen.shape, dtype=bool)
         for j in np.flatnonzero(stale.any(axis=0)):
@@ -387,14 +371,14 @@ class FrozenWatch:
     def _why(self, i: int, code: int, size: float) -> str:
         """Why a state is frozen, in words; empty if it is not."""
         repeats = self.repeats
-        if code == BY_RUN:
+        if code == kernel.BY_RUN:
             return _moved("the model moves it", size, repeats.largest_run[i])
-        if code == BY_SUM:
+        if code == kernel.BY_SUM:
             return _moved("the model's steps add up", size, repeats.largest_sum[i])
-        if code == BY_ACTIVITY:
+        if code == kernel.BY_ACTIVITY:
             active = f"{size:.3g} half-widths, and beyond {repeats.active_beyond[i]:.3g} it always moved"
             return f"while the machine is active: its rate by the model changes by {active}"
-        if code == BY_NOISE:
+        if code == kernel.BY_NOISE:
             return f"while at constant controls noise changed it {repeats.noisy_steps[i]:.0f} times in the fit"
         return ""
 
@@ -430,9 +414,9 @@ class Partly:
     __slots__ = ("_values", "contained", "outside_domain", "unknown_regime", "violation")
 
     def __init__(self, judgement: Any, withheld: Sequence[int], counted: NDArray[np.bool_]) -> None:
-        self._values = np.array([judgement.numbers(kind) for kind in range(UTILISATION + 1)], dtype=np.float64)
+        self._values = np.array([judgement.numbers(kind) for kind in range(kernel.UTILISATION + 1)], dtype=np.float64)
         self._values[:, list(withheld)] = np.nan
-        left = self._values[FLAGS] == 1.0
+        left = self._values[kernel.FLAGS] == 1.0
         self.contained, self.violation = not left.any(), bool((left & counted).any())
         self.outside_domain, self.unknown_regime = judgement.outside_domain, judgement.unknown_regime
 

@@ -28,14 +28,7 @@ from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
 from uncertain_lti.model import free_run as nominal
 from uncertain_lti.model import interchange
-from uncertain_lti.model.alarm_rule import (
-    JOINT,
-    AlarmRule,
-    Rule,
-    StatisticRule,
-    checked_rules,
-    with_containment,
-)
+from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, Rule, StatisticRule, checked_rules, with_containment
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.envelope import Envelope
 from uncertain_lti.model.horizon import Horizon, Residuals, Run, checked_horizons

@@ -24,23 +24,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
-from uncertain_lti.kernel.arithmetic import (
-    FLAGS,
-    JUDGED,
-    LEFT,
-    LONGER,
-    LOWER,
-    OUTSIDE,
-    REPEATS,
-    RESIDUAL,
-    UNKNOWN,
-    UNLISTED,
-    UPPER,
-    UTILISATION,
-    VIOLATION,
-    Judgement,
-    all_carried,
-)
+from uncertain_lti.kernel import arithmetic as kernel
+from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, all_carried
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
 from uncertain_lti.model.repeats import Bounds, FrozenWatch, Partly, followed, needs
@@ -396,7 +381,9 @@ class EnvelopeMonitor:
         marks = np.zeros(count, dtype=np.uint8)
         first = (RESIDUAL, UTILISATION) if self.alarms.needs_residual else (UTILISATION,)
         seen = self._numbers(transient, steps, first, marks)
-        judged, left, violated, unlisted_mode = ((marks & mark) > 0 for mark in (JUDGED, LEFT, VIOLATION, UNLISTED))
+        judged, left, violated, unlisted_mode = (
+            (marks & mark) > 0 for mark in (kernel.JUDGED, kernel.LEFT, kernel.VIOLATION, kernel.UNLISTED)
+        )
         if np.count_nonzero(judged) < len(steps.k):
             steps = steps.take(judged[steps.k + 1])
         frozen, withheld, repeating, why = self._look_all(transient, steps, marks)
@@ -404,7 +391,9 @@ class EnvelopeMonitor:
         if withheld.any():
             part = np.asarray(withheld.any(axis=1))
             rows = np.flatnonzero(part)
-            flags = np.asarray(self._numbers(transient, steps.take(part[steps.k + 1]), (FLAGS,))[FLAGS][rows] == 1.0)
+            flags = np.asarray(
+                self._numbers(transient, steps.take(part[steps.k + 1]), (kernel.FLAGS,))[kernel.FLAGS][rows] == 1.0
+            )
             judged &= ~withheld[:, self._counted].all(axis=1)
             flags &= ~withheld[rows] & judged[rows, None]
             left[rows], violated[rows] = flags.any(axis=1), (flags & self._counted).any(axis=1)
@@ -424,7 +413,7 @@ class EnvelopeMonitor:
             found = model.over_horizons(whole.k, model.normalised_columns(whole), whole.dt, x_next.T)
             for values, one in zip((longer, longer_residual), found, strict=True):
                 values[:, arrival] = one.transpose(1, 0, 2)
-        outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (OUTSIDE, UNKNOWN))
+        outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (kernel.OUTSIDE, kernel.UNKNOWN))
         each, dt = np.zeros((count, len(self.alarms.rules)), dtype=bool), np.zeros(count)
         dt[steps.k + 1] = steps.dt
         rows_of = [seen[UTILISATION], *longer, seen[RESIDUAL], *longer_residual]
@@ -456,12 +445,12 @@ class EnvelopeMonitor:
         if watch is None:
             return frozen, withheld, repeating, why
 
-        some = steps.rows(marks, 1) & REPEATS > 0
+        some = steps.rows(marks, 1) & kernel.REPEATS > 0
         if some.any():
             at, given = followed(self.model, transient.t_ns, steps, some, self.rule.margin)
             codes, withheld[at + 1], because = watch.look_all(given)
-            frozen[at + 1], repeating[at + 1] = codes > LONGER, codes == LONGER
-            for row, state in np.argwhere(codes > LONGER).tolist():
+            frozen[at + 1], repeating[at + 1] = codes > kernel.LONGER, codes == kernel.LONGER
+            for row, state in np.argwhere(codes > kernel.LONGER).tolist():
                 why[int(at[row]) + 1, state] = because(row, state)
         return frozen, withheld, repeating, why
 
