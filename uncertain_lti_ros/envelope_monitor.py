@@ -15,6 +15,7 @@ import gc
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -306,7 +308,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.trigger_shutdown()
         self.reason = ""
         self.report()
-        self._diagnostics.wait(_LAST_WORDS)
+        self._diagnostics.publisher.wait_for_all_acked(Duration(seconds=_LAST_WORDS))
 
     # --- messages ---
 
@@ -317,12 +319,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         for topic in list(self.inputs):
             if self.inputs[topic].type_name != types.get(topic):
                 self.inputs.pop(topic).destroy()
-        for topic, type_name in types.items():
-            if topic not in self.inputs:
-                self.inputs[topic] = MatchedSubscription(
-                    self, self._there(topic), type_name, partial(self.intake.message, topic),
-                    self.settings.requested_qos(),
-                )  # fmt: skip
+        requested = self.settings.requested_qos()
+        for topic in [topic for topic in types if topic not in self.inputs]:
+            take = partial(self.intake.message, topic)
+            self.inputs[topic] = MatchedSubscription(self, self._there(topic), types[topic], take, requested)
 
     def _there(self, topic: str) -> str:
         """Where a topic of the model, or of the enable condition, is heard; before remapping."""
@@ -415,7 +415,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = time.monotonic()
         if now - self._reported < self.settings["diagnostics_period"]:
             return
-        if self.session is not None and self.active and not self._diagnostics.listeners:
+        if self.session is not None and self.active and not self._diagnostics.publisher.get_subscription_count():
             self._reported = now
             self.session.pass_over()
             self._mark_reported()
@@ -459,13 +459,12 @@ class EnvelopeMonitorNode(LifecycleNode):
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
             reports = self.session.report(now, self.settings["state_timeout"], self._problems())
-            extra = input_values(self.inputs)
+            extra = input_values(self.inputs) | self.snapshots.values
             extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.sender.held_back)}
-            extra |= self.snapshots.values
-            reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
+            reports[0] = replace(reports[0], values={**reports[0].values, **extra})
         else:
             state = self.state_name
-            message = f"{state}: {self.reason}" if self.reason else f"{state}: no verdicts are given"
+            message = f"{state}: {self.reason or 'no verdicts are given'}"
             level = ERROR if self.reason else STALE
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:

@@ -438,19 +438,14 @@ _UNHEARD = 2.0  # s without a first message although there are publishers
 class Diagnostics:
     """Publisher of the node's reports.
 
-    `node`: gives its name; `hardware_id`: of every status; empty for the node's name.
+    `node`: gives its name; `hardware_id`: of every status; empty for the node's name; `publisher`: of the topic.
     """
 
     def __init__(self, node: Node, hardware_id: str) -> None:
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._name = node.get_fully_qualified_name().lstrip("/")
         self._hardware_id = hardware_id or node.get_name()
         self._reported: dict[str, tuple[int, int]] = {}  # topic: lost and late messages up to the last report
-
-    @property
-    def listeners(self) -> int:
-        """Number of subscriptions to the topic."""
-        return int(self._publisher.get_subscription_count())
 
     def publish(self, reports: Sequence[Report], stamp: Any, model: str) -> None:
         """Publish one message."""
@@ -467,11 +462,7 @@ class Diagnostics:
                     values=[KeyValue(key=key, value=value) for key, value in values.items()],
                 )
             )
-        self._publisher.publish(message)
-
-    def wait(self, seconds: float) -> None:
-        """Wait until every reader has every report."""
-        self._publisher.wait_for_all_acked(Duration(seconds=seconds))
+        self.publisher.publish(message)
 
     def problems(self, inputs: Mapping[str, MatchedSubscription]) -> list[str]:
         """What keeps messages from coming, and what was lost since the last report."""
