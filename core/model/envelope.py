@@ -173,30 +173,26 @@ class Envelope(Elements):
             return np.repeat(own[:, None], z.shape[1], axis=1)
         return np.asarray(blended(own, *self.schedule.corners(z[self.scheduling_positions])))
 
-    def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
-        """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count."""
-        law = None if self.residuals is None else self.residuals.law
-        return self._judge(self.tables, margin, counted, None if law is None else law.tables[0])
+    def judge_of(self, margin: float, counted: NDArray[np.bool_], run: bool = False) -> Judge:
+        """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count.
 
-    def _judge(
-        self, elements: tuple[Array, Array, Array], margin: float, counted: NDArray[np.bool_], law: Array | None = None
-    ) -> Judge:
+        `run`: by the elements that are run over the windows of the horizons.
+        """
+        elements = self.run if run and self.run is not None else self
+        law = None if run or self.residuals is None else self.residuals.law
         point, domain = self.operating_point, self.domain
         return Judge(
-            *elements, point.steady, point.scale, domain.least, domain.greatest, margin, counted,
-            None if domain.measure is None else domain.measure.occupied,
-            self.schedule, self.scheduling_positions, [data.known for data in self.block_data], law,
+            *elements.tables, point.steady, point.scale, domain.least, domain.greatest, margin, counted,
+            None if domain.measure is None else domain.measure.occupied, self.schedule, self.scheduling_positions,
+            [data.known for data in self.block_data], None if law is None else law.tables[0],
         )  # fmt: skip
-
-    def _runner(self) -> Judge:
-        """Of the elements that are run over the windows of the horizons."""
-        return self._judge(self.tables if self.run is None else self.run.tables, 1.0, np.ones(self.n, dtype=bool))
 
     def runs_of(self, judge: Judge) -> Runs | None:
         """What judges the state several steps after a measured one, as `over_horizons` does, if there are any."""
         if not self.horizons:
             return None
-        return Runs(judge, self.horizons, None if self.run is None else self._runner())
+        every = np.ones(self.n, dtype=bool)
+        return Runs(judge, self.horizons, None if self.run is None else self.judge_of(1.0, every, run=True))
 
     def windows(self, k: NDArray[np.intp], z: Array, dt: Array, steps: Sequence[int]) -> Iterator[Windows]:
         """What is run, over so many transitions in a row, of each length; good until the next one is asked for.
@@ -207,13 +203,12 @@ class Envelope(Elements):
         vectors, n, rows, count = z[self.scheduling_positions], self.n, self.n + self.m, len(dt)
         begin = unbroken_over(k, vectors, self.schedule)
         runs = np.concatenate([z[:n], np.zeros((self.m + 1, count))])
-        runner, edges = self._runner(), np.linspace(0, count, core_count() + 1).astype(int).tolist()
-        done = 0
+        runner = self.judge_of(1.0, np.ones(n, dtype=bool), run=True)
+        edges = np.linspace(0, count, core_count() + 1).astype(int).tolist()
         kept: Array | None = None
-        for length in steps:
+        for done, length in itertools.pairwise([0, *steps]):
             tasks = [(runs, z, dt, done, length, *part) for part in itertools.pairwise(edges)]
             on_cores(runner.advance, tasks, count * (length - done) > WORTH_THREADS)
-            done = length
             start = np.arange(count - length + 1)
             whole = begin[start + (length - 1)] <= start
             run, control, time = runs[:n], runs[n:rows], runs[rows]

@@ -122,17 +122,16 @@ class DeployedMonitor:
 
     def words(self) -> str:
         """What differs from a monitor without conditions."""
-        said = [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
-        said += condition_words(self.condition, self.grace, self.latch)
-        said += [] if self.start is None else [f"from {self.start:g} s"]
-        said += [] if self.stop is None else [f"to {self.stop:g} s"]
+        said = conditions_in_words(self.monitor, self.condition, self.grace, self.latch)
+        said += [f"{name} {t:g} s" for name, t in (("from", self.start), ("to", self.stop)) if t is not None]
         return ", ".join(said)
 
 
-def condition_words(condition: Condition | None, grace: float, latch: bool) -> list[str]:
-    """When an alarm counts and how long it lasts, in words."""
-    said = {f"as long as {condition}": condition, f"grace {grace:g} s": grace, "latched": latch}
-    return [words for words, holds in said.items() if holds]
+def conditions_in_words(monitor: EnvelopeMonitor, condition: Condition | None, grace: float, latch: bool) -> list[str]:
+    """Which violations count for the alarm, and how long it lasts, in words."""
+    masked = ", ".join(monitor.masked)
+    said = {f"masked: {masked}": masked, f"as long as {condition}": condition, f"grace {grace:g} s": grace}
+    return [words for words, holds in (said | {"latched": latch}).items() if holds]
 
 
 class Days:

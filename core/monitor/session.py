@@ -24,7 +24,7 @@ from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
 from uncertain_lti.model.repeats import Moved, frozen_words, repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.deployed import Days, condition_words
+from uncertain_lti.monitor.deployed import Days, conditions_in_words
 from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.outputs import JUDGED
@@ -71,16 +71,12 @@ class Session(Stream):
         period = self.pass_over()
         if period.verdicts and self.last is not None and not period.alarm:
             self.days.take(self.last.t_ns, period.largest)
-        without = self.without_verdict(now)
-        reports = [self._report_monitor(period, now, without, state_timeout, problems)]
-        for i, name in enumerate(self.model.state_names):
-            reports.append(self._report_state(i, name, period, without, state_timeout))
-        return reports
+        monitor = self._report_monitor(period, now, state_timeout, problems)
+        states = range(self.model.n)
+        return [monitor, *(self._report_state(i, period, self.without_verdict(now), state_timeout) for i in states)]
 
-    def _report_monitor(
-        self, period: Period, now: float, without: float, timeout: float, problems: Sequence[str]
-    ) -> Report:
-        never = [topic for topic in self.types if self.heard(topic) is None]
+    def _report_monitor(self, period: Period, now: float, timeout: float, problems: Sequence[str]) -> Report:
+        without, never = self.without_verdict(now), [topic for topic in self.types if self.heard(topic) is None]
         complaints, calm = list(problems), list[str]()
         lacking = self.lacking(period.counters)
         came_late = Counters(self.sampler.counters - period.counters).of(LATE)
@@ -119,8 +115,7 @@ class Session(Stream):
         if self.latched and not self.monitor.alarm:
             complaints.insert(0, "alarm: latched until ~/reset")
         calm += self.days.words
-        silent = self.silent_for(now)
-        frozen = [self.frozen_text(moved) for moved in period.frozen.values()]
+        silent, frozen = self.silent_for(now), [self.frozen_text(moved) for moved in period.frozen.values()]
         if frozen and self.monitor.alarm and silent <= timeout:
             level = ERROR
             complaints.insert(0, f"alarm: frozen: {'; '.join(frozen)}")
@@ -151,10 +146,11 @@ class Session(Stream):
         text = self.reasons.text
         if self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
-        never = [topic for topic in self.types if self.heard(topic) is None]
-        silent = self.silent_for(now) > timeout
-        why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
-        why = f"nothing received on {', '.join(never)}" if never else why
+        why = "no sample could be judged"
+        if never := [topic for topic in self.types if self.heard(topic) is None]:
+            why = f"nothing received on {', '.join(never)}"
+        elif self.silent_for(now) > timeout:
+            why = f"no message on {self.sampler.clock}"
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
@@ -228,11 +224,11 @@ class Session(Stream):
         """The alarm rule in words, with everything that it depends on."""
         rule = self.rule
         parts = [f"alarm when {self.rule_text()}", f"margin {self.monitor.rule.margin:g}"]
-        parts += [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
-        parts += condition_words(self.arming.condition, rule.grace, rule.latch)
+        parts += conditions_in_words(self.monitor, self.arming.condition, rule.grace, rule.latch)
         return ", ".join(parts)
 
-    def _report_state(self, i: int, name: str, period: Period, without: float, timeout: float) -> Report:
+    def _report_state(self, i: int, period: Period, without: float, timeout: float) -> Report:
+        name = self.model.state_names[i]
         masked, violated = name in self.monitor.masked, period.violations[i]
         values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i]), "masked": str(int(masked))}
         if self.last is not None:
