@@ -420,7 +420,7 @@ def put(data: dict[str, Any], place: str, value: Any) -> Any:
         ("states.0.name", ..., r"states\[0\]: 'name' is missing"),
         ("states.0.colour", "red", r"states\[0\]: unknown key 'colour'"),
         ("states.0.scale", NAN, "scale is nan"),
-        ("states.0.scale", "auto", "scale of 'a' is auto; a model file holds numbers"),
+        ("states.0.scale", "auto", "signal 'a': scale is auto and not resolved; give a number"),
         ("states.0.steady", INF, "signal 'a': steady is inf"),
         ("sampling", [], "field 'sampling' is not an object"),
         ("sampling.maxgap", 1.0, "unknown field 'sampling.maxgap'; known are clock"),

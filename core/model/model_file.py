@@ -157,10 +157,6 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         time=time,
         table=TableLayout.from_dict(said["table"], "sampling.table") if "table" in said else None,
     )
-    for signal in signals.signals:
-        for key in ("steady", "scale"):
-            if getattr(signal, key) == "auto":
-                raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
     n, m = len(signals.states), len(signals.controls)
     arrays, regime_data = _blocks(data, n, m) if scheduled else ({name: data.get(name) for name in ARRAYS}, {})
     if not scheduled:

@@ -100,10 +100,8 @@ def checked_signatures(signatures: Sequence[Signature], n: int) -> tuple[Signatu
 
 def closeness(a: Signature, b: Signature) -> float:
     """How alike two signatures are."""
-    common = [
-        (a.moments[i], b.moments[b.steps.index(h)])
-        for i, h in enumerate(a.steps)
-        if h in b.steps and a.moments[i].any() and b.moments[b.steps.index(h)].any()
-    ]
+    other = dict(zip(b.steps, b.moments, strict=True))
+    pairs = [(own, other[h]) for h, own in zip(a.steps, a.moments, strict=True) if h in other]
+    common = [(p, q) for p, q in pairs if p.any() and q.any()]
     cosines = [float(np.sum(p * q) / np.sqrt(np.sum(p * p) * np.sum(q * q))) for p, q in common]
     return sum(cosines) / len(cosines) if cosines else 0.0

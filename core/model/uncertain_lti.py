@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
 from uncertain_lti.model import free_run as nominal
@@ -263,14 +263,13 @@ class UncertainLTI(Envelope):
             raise ModelError(f"give a value of {' and of '.join(names)}, and nothing else")
         if odd := [name for name in names if not math.isfinite(values[name])]:
             raise ModelError(f"{odd[0]} is {values[odd[0]]}; give a finite number")
-        point = self.operating_point
-        recorded_values = np.zeros(len(point.steady))
-        recorded_values[self.scheduling_positions] = [values[name] for name in names]
-        if unlisted := self.why_unlisted(recorded_values.tolist()):
+        point, of_each = self.operating_point, self.signals.signals
+        sample = np.array([values.get(signal.name, 0.0) for signal in of_each])
+        if unlisted := self.why_unlisted(sample.tolist()):
             raise ModelError(f"{unlisted}; give one of them")
-        s = normalised(recorded_values, point.steady, point.scale)[self.scheduling_positions]
-        places, weights = self.schedule.corners(s[:, None])
-        return self._unscheduled({name: blended(getattr(self, name), places, weights)[..., 0] for name in ARRAYS})
+        s = normalised(sample, point.steady, point.scale)[self.scheduling_positions]
+        corners = self.schedule.corners(s[:, None])
+        return self._unscheduled({name: blended(a, *corners)[..., 0] for name, a in self.arrays.items()})
 
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
@@ -293,14 +292,12 @@ class UncertainLTI(Envelope):
         return tuple(s.name for s in self.signals.controls)
 
     def __repr__(self) -> str:
-        text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; "
-        text += f"{plural(self.m, 'control')}"
-        if self.m:
-            text += f": {', '.join(self.control_names)}"
+        text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; {plural(self.m, 'control')}"
+        text += f": {', '.join(self.control_names)}" * bool(self.m)
         if self.schedule is not None:
             text += f"; {plural(self.schedule.blocks, 'block')} over {self.schedule.words}"
         if self.horizons:
-            text += f"; horizons of {', '.join(str(horizon.steps) for horizon in self.horizons)} steps"
+            text += f"; horizons of {', '.join(map(str, self.steps))} steps"
         if "criterion" in self.fit_summary:
             count = plural(self.fit_summary.get("transitions"), "transition")
             text += f"; fitted by {self.fit_summary['criterion']} to {count}"
@@ -336,10 +333,7 @@ class UncertainLTI(Envelope):
         ModelError
             Shapes do not fit.
         """
-        x = np.asarray(x, dtype=np.float64)
-        u = np.asarray(u, dtype=np.float64)
-        dt = np.asarray(dt, dtype=np.float64)
-        s = np.zeros(0) if s is None else np.asarray(s, dtype=np.float64)
+        x, u, dt, s = (np.asarray(a, dtype=np.float64) for a in (x, u, dt, np.zeros(0) if s is None else s))
         if x.shape[-1:] != (self.n,) or u.shape[-1:] != (self.m,):
             raise ModelError(f"x has shape {x.shape} and u {u.shape}; they must end in {self.n} and {self.m}")
         if s.shape[-1:] != (self.q,):
@@ -559,6 +553,6 @@ class UncertainLTI(Envelope):
             return cls(**arguments(data, source))
         except RecursionError:
             raise ModelError(f"{source}: is nested too deeply; is this a model file?") from None
-        except (ModelError, SignalError) as error:
+        except UncertainLTIError as error:
             text = str(error).removeprefix(source).removeprefix(": ")
             raise ModelError(f"{source}: {' '.join(text.split())}") from None  # names may hold line breaks
