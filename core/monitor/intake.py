@@ -75,10 +75,12 @@ class Sender:
     _reason_sent: str = cython.declare(object)
     _doubted: cython.double  # until when what messages take is measured by the processor's time
     _known: cython.bint  # who listens; otherwise it must be found out
-    _given: tuple[list[Any], Any]  # for a message without a verdict: ways of what somebody listens to, and an encoder
-    _judged: tuple[list[Any], Any]
-    _predicted: tuple[list[Any], Any]
-    _foreseen: tuple[list[Any], Any]
+    _given: (
+        Any  # of a message without a verdict: ways of what somebody listens to, and its encoder; None if nobody does
+    )
+    _judged: Any
+    _predicted: Any
+    _foreseen: Any
     _violation: Any
     _reason: Any
     _alarm_heard: cython.bint
@@ -104,10 +106,10 @@ class Sender:
         """There are more or fewer listeners, or nothing is sent for now; which ways are slow is found out again."""
         self._known, self._ways = False, {}
 
-    def _heard(self, *when: str) -> tuple[list[Any], Encoder]:
+    def _heard(self, *when: str) -> tuple[list[Any], Encoder] | None:
         outputs = self._messages.outputs
         names = [name for name in outputs if outputs[name].when in when and self._publishers[name].listeners]
-        return [self._ways[name] for name in names], self._messages.encoder(names)
+        return ([self._ways[name] for name in names], self._messages.encoder(names)) if names else None
 
     def _listen(self) -> None:
         """Choose the vectors that somebody listens to, and lay out their messages."""
@@ -133,25 +135,31 @@ class Sender:
         beats: cython.bint = False
         for verdict in verdicts:
             judged: cython.bint = verdict.judged
-            to, encode = self._judged if judged else self._given
-            if to:
-                ways += to
-                messages += encode(verdict)
+            heard = self._judged if judged else self._given
+            if heard is not None:
+                self._lay_out(heard, verdict, ways, messages)
             beats = beats or judged
         if beats and self._alarm_heard and not turned:
             self.alarm_sent = now
             ways.append(self._ways[VIOLATION.name])
             messages.append(TRUE if session.alarm else FALSE)
-        for (to, encode), foretell in ((self._predicted, session.predict), (self._foreseen, session.foresee)):
-            if opened and to and (foretold := foretell()) is not None:
-                ways += to
-                messages += encode(foretold)
+        if opened and self._predicted is not None and (expected := session.predict()) is not None:
+            self._lay_out(self._predicted, expected, ways, messages)
+        if opened and self._foreseen is not None and (foreseen := session.foresee()) is not None:
+            self._lay_out(self._foreseen, foreseen, ways, messages)
         if messages:
             self._send(ways, messages)
         if turned:
             self.send_alarm(session.alarm, now)
         if self._reason_heard and (beats or turned or "no verdict:" in session.reasons.text):
             self.send_reason(session.reasons.text)  # else it is that of an earlier sample: `Session.reason` has more
+
+    @cython.cfunc
+    def _lay_out(self, heard: tuple[list[Any], Any], verdict: Any, ways: list[Any], messages: list[bytes]) -> None:
+        """Add the messages of a verdict, or of what is predicted, and the way that each goes."""
+        to, encode = heard
+        ways += to
+        messages += encode(verdict)
 
     @cython.cfunc
     def _send(self, ways: list[Any], messages: list[bytes]) -> None:
