@@ -152,13 +152,19 @@ class Repeats:
 class Moved(NamedTuple):
     """One repeat so far.
 
-    `state`: number of the state; `seconds`: since the last fresh sample, s; `why`: why it is frozen, in words; empty
-    for a state that is not.
+    `state`: number of the state; `seconds`: since the last fresh sample, s; `longest`: the longest of the fit, s;
+    `why`: why it is frozen, in words; empty for a state that is not.
     """
 
     state: int
     seconds: float
+    longest: float
     why: str = ""
+
+    @property
+    def words(self) -> str:
+        """What is said of it, after the name of the state."""
+        return repeat_words(self.seconds, self.longest) + f", {self.why}" * bool(self.why)
 
 
 Followed = tuple[NDArray[np.bool_], NDArray[np.int64], Array, Array, Array, Array, Array, Array, NDArray[np.bool_]]
@@ -349,11 +355,12 @@ class FrozenWatch:
             self.forget()
             return Looked(withheld=withheld)
         self._on = True
-        each = self._follow.take(t_ns, dt, before, after, *bounds())
-        frozen = tuple(Moved(i, s, self._why(i, code, size)) for i, s, code, size in each if code != kernel.LONGER)
-        now = {moved.state for moved in frozen}
+        longest, taken = self.repeats.longest_repeat_s, self._follow.take(t_ns, dt, before, after, *bounds())
+        moved = [Moved(i, s, longest[i], self._why(i, code, size)) for i, s, code, size in taken]
+        frozen = tuple(one for one in moved if one.why)
+        now = {one.state for one in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
-        return Looked(frozen, withheld, tuple(Moved(i, s) for i, s, code, _ in each if code == kernel.LONGER))
+        return Looked(frozen, withheld, tuple(one for one in moved if not one.why))
 
     def look_all(self, given: Followed) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Callable[[int, int], str]]:
         """As `look`, many transitions: codes and rows withheld (K, n), and why a state is frozen after one of them."""
@@ -427,11 +434,6 @@ class Partly:
     def packed(self) -> bytes:
         """As of `Judgement`."""
         return self._values.tobytes()
-
-
-def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
-    """What is said of a frozen state."""
-    return f"{name} {repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])}, {moved.why}"
 
 
 def repeat_words(seconds: float, longest: float) -> str:

@@ -134,7 +134,7 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
             status=statuses[k],
             unknown_regime=verdicts.unknown_regime[k],
             raised=verdicts.raised(k) if verdicts.alarm[k] else (),
-            frozen=[Moved(i, math.nan) for i in np.flatnonzero(verdicts.frozen[k]).tolist()],
+            frozen=[Moved(i, math.nan, math.nan) for i in np.flatnonzero(verdicts.frozen[k]).tolist()],
             withheld=np.flatnonzero(verdicts.withheld[k]).tolist(),
             before=np.concatenate([transient.x[k - 1], transient.u[k - 1], transient.s[k - 1]]).tolist(),
             numbers=lambda name, k=k: getattr(verdicts, name)[k].tolist(),

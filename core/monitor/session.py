@@ -22,7 +22,7 @@ from typing import Any
 
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
-from uncertain_lti.model.repeats import Moved, frozen_words, repeat_words
+from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import Days, conditions_in_words
 from uncertain_lti.monitor.deployed import Rule as Rule
@@ -191,8 +191,7 @@ class Session(Stream):
 
     def frozen_text(self, moved: Moved) -> str:
         """What is said of a frozen state."""
-        assert self.model.repeats is not None
-        return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
+        return f"{self.model.state_names[moved.state]} {moved.words}"
 
     def lacking(self, before: Counter[str]) -> list[Signal]:
         """Signals that samples had no value of since some counters."""
@@ -238,7 +237,7 @@ class Session(Stream):
             if not period.verdicts:  # the clock is slower than the reports
                 violated = int(self.last.numbers("flags")[i] == 1.0)
         if i in period.frozen:
-            level, message = ERROR, f"frozen: {self.frozen_text(period.frozen[i]).removeprefix(name).lstrip()}"
+            level, message = ERROR, f"frozen: {period.frozen[i].words}"
         elif without > timeout:
             level, message = STALE, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet"
         elif (lost := period.withheld[i]) and lost >= period.verdicts:
@@ -250,9 +249,8 @@ class Session(Stream):
             where, some = ("outside its bounds", f"{violated} of ") if violated else ("within its bounds", "")
             message = f"{where} in {some}{period.verdicts} verdicts"
             message = message if period.verdicts else f"last verdict {without:.1f} s ago: {where}"
-        if i in period.repeating and i not in period.frozen and self.model.repeats is not None:
-            longest = self.model.repeats.longest_repeat_s[i]
-            level, message = max(level, WARN), f"{message}; {repeat_words(period.repeating[i].seconds, longest)}"
+        if i in period.repeating and i not in period.frozen:
+            level, message = max(level, WARN), f"{message}; {period.repeating[i].words}"
         return Report(level, name, f"{message} (masked)" if masked else message, values)
 
     def counts(self, now: float) -> dict[str, str]:
