@@ -229,7 +229,10 @@ def together(n: int, found: Sequence[Found]) -> Repeats:
     """What recordings have of exact repeats, from what each of them has."""
     longest, run, total, active = np.max([np.zeros((4, n)), *(one.most for one in found)], axis=0)
     windows = np.concatenate([np.zeros((0, n)), *(one.windows for one in found)])
-    usual = _usual(windows, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2))
+    known = [column[~np.isnan(column)] for column in windows.T]
+    each = zip(known, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2), strict=True)
+    # a half-width where there are few
+    usual = np.array([np.quantile(some, share) if len(some) >= WINDOWS else 1.0 for some, share in each])
     noisy = np.array([np.zeros(n), *(one.noisy for one in found)])
     beyond = np.maximum(usual, MORE_ACTIVE * active)
     run, total, beyond = (np.minimum(values, LARGEST) for values in (run, total, beyond))  # JSON has no infinity
@@ -272,13 +275,6 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
         activity[(2 * repeats >= counts[:, None]) | ~np.isfinite(activity)] = np.nan
         found.append(activity[whole])
     return np.concatenate([np.zeros((0, model.n)), *found]), np.maximum(noisy, -1.0)
-
-
-def _usual(windows: Array, shares: Array) -> Array:
-    """Of each column what this share of its numbers is below; a half-width at least where they are few."""
-    known = [column[~np.isnan(column)] for column in windows.T]
-    each = zip(known, shares, strict=True)
-    return np.array([np.quantile(some, share) if len(some) >= WINDOWS else 1.0 for some, share in each])
 
 
 FARTHER = 2.0

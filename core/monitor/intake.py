@@ -275,7 +275,8 @@ class Intake:
             late = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
             messages = session.accept(topic, arrival_ns, data, now, sent_ns, late)
         except Exception as error:
-            self._note(session, topic, error)
+            self._failed(f"on a message of {topic}", error)
+            session.failed()
         else:
             self._take_all(session, messages, now)
 
@@ -296,12 +297,8 @@ class Intake:
             try:
                 self._take(session, topic, arrival_ns, data, now)
             except Exception as error:
-                self._note(session, topic, error)
-
-    @cython.cfunc
-    def _note(self, session: Any, topic: str, error: Exception) -> None:
-        self._failed(f"on a message of {topic}", error)
-        session.failed()
+                self._failed(f"on a message of {topic}", error)
+                session.failed()
 
     @cython.cfunc
     def _take(self, session: Any, topic: str, arrival_ns: int, data: bytes, now: float) -> None:
