@@ -387,21 +387,22 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._enable_problem = ""
         if session is None or not self.active or not session.enable_topic:
             return
-        infos = self.get_publishers_info_by_topic(self._there(session.enable_topic))
-        found = [info.topic_type for info in infos]
-        if not infos:
-            if session.heard(session.enable_topic) is None:
-                self._enable_problem = f"nobody publishes {session.enable_topic}, which parameter enable names"
-        elif session.enable_type not in found and not session.enable_type_is_given:
+        topic = session.enable_topic
+        publishers_tell = not (session.rule.enable_type or topic in session.model.signals.topics)
+        found = [info.topic_type for info in self.get_publishers_info_by_topic(self._there(topic))]
+        if not found:
+            if session.heard(topic) is None:
+                self._enable_problem = f"nobody publishes {topic}, which parameter enable names"
+        elif publishers_tell and session.enable_type not in found:
             try:
                 session.found_enable_type(found[0])
             except UncertainLTIError as error:
                 self._enable_problem = f"parameter enable: {error}"
                 return
-            if (former := self.inputs.pop(session.enable_topic, None)) is not None:
+            if (former := self.inputs.pop(topic, None)) is not None:
                 former.destroy()
                 return  # the middleware takes no other type before it has let go of the former subscription
-        if session.enable_type and session.enable_topic not in self.inputs:
+        if session.enable_type and topic not in self.inputs:
             self.subscribe()
         if why := session.why_no_condition():
             self._enable_problem = f"parameter enable: {why}"

@@ -205,10 +205,12 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
         data |= {name: array if array.ndim > 1 else array[:, None] for name, array in model.arrays.items()}
     else:
         data |= {name: np.moveaxis(array, 0, -1) for name, array in model.arrays.items()} | _schedule_variables(model)
-    for name, values in (("x_steady", point.x_s), ("x_scale", point.X), ("u_steady", point.u_s), ("u_scale", point.U)):
-        data[name] = values[:, None]
-    for name, group in (("state", model.signals.states), ("control", model.signals.controls)):
+    groups = [("state", "x", model.signals.states), ("control", "u", model.signals.controls)]
+    groups += [("scheduling", "s", model.signals.scheduling)] if model.schedule is not None else []
+    for name, letter, group in groups:
         data |= {f"{name}_names": _cells([s.name for s in group]), f"{name}_units": _cells([s.unit for s in group])}
+        data[f"{letter}_steady"] = getattr(point, f"{letter}_s")[:, None]
+        data[f"{letter}_scale"] = getattr(point, letter.upper())[:, None]
     for name, step in (("dt", sampling.dt_median), ("dt_min", sampling.dt_min), ("dt_max", sampling.dt_max)):
         data[name] = math.nan if step is None else step
     with written(path, ModelError) as stream:
@@ -225,9 +227,8 @@ def _cells(values: Sequence[Any]) -> NDArray[np.object_]:
 
 def _schedule_variables(model: Any) -> dict[str, Any]:
     """Variables of a scheduled model other than its arrays."""
-    point, schedule = model.operating_point, model.schedule
+    schedule, facts = model.schedule, model.block_data
     values = schedule.recorded_values(model.signals.signals)
-    facts = model.block_data
     return {
         "schedule_signals": _cells([axis.signal for axis in schedule.axes]),
         "schedule_kinds": _cells(["knots" if axis.knots else "modes" for axis in schedule.axes]),
@@ -235,10 +236,6 @@ def _schedule_variables(model: Any) -> dict[str, Any]:
         "schedule_blocks": np.array(schedule.indices, dtype=np.float64) + 1.0,
         "transitions": np.array([[math.nan if f.transitions is None else f.transitions] for f in facts]),
         "tied_to": np.array([[0.0 if f.tied_to is None else f.tied_to + 1.0] for f in facts]),
-        "scheduling_names": _cells([s.name for s in model.signals.scheduling]),
-        "scheduling_units": _cells([s.unit for s in model.signals.scheduling]),
-        "s_steady": point.s_s[:, None],
-        "s_scale": point.S[:, None],
     }
 
 

@@ -265,7 +265,6 @@ class Session(Stream):
             "latched": str(int(self.latched)),
             "armed": {True: "1", False: "0", None: "unknown"}[self.arming.on],
             "alarms": str(self.alarms),
-            "unexpected errors": str(self.failures),
             "verdicts": str(self.verdicts),
             "violations": repr(rule.violations),
             "window": repr(rule.window),

@@ -176,7 +176,7 @@ class Stream:
         self.why_unreadable: dict[str, str] = {}
         self.future: Counter[str] = Counter()
         self.received: dict[str, int] = {}  # setting an item of a Counter is slow
-        self.verdicts = self.alarms = self.failures = 0
+        self.verdicts = self.alarms = 0
         self.violations = [0] * self.model.n
         self.last: Verdict | None = None
         self._heard: dict[str, float] = {}
@@ -270,11 +270,6 @@ class Stream:
         self._newest.pop(self.enable_topic, None)  # it was of another type
 
     @property
-    def enable_type_is_given(self) -> bool:
-        """Whether the model or the rule has the type of the condition's topic; otherwise publishers have."""
-        return bool(self.rule.enable_type) or self.enable_topic in self._model_types
-
-    @property
     def types(self) -> dict[str, str]:
         """Topics to listen to with their types, as far as these are known."""
         types = dict(self._model_types)
@@ -303,7 +298,6 @@ class Stream:
         latched, counters = self.latched, self.sampler.counters
         self._start()
         self.latched, self.sampler.counters = latched, counters
-        self.failures += 1
 
     @property
     def lags(self) -> dict[str, float]:
