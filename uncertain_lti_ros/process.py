@@ -150,12 +150,6 @@ def run_node(
     return BAD_USAGE
 
 
-def hold_domain(number: str) -> None:
-    """Refuse a domain without ports, for which Fast DDS would end the process with status 1."""
-    if number.isdecimal() and int(number) > _LAST_DOMAIN:
-        raise ArgumentError(f"ROS_DOMAIN_ID is {number}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
-
-
 def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
     lines = [
         f"usage: {name} [--ros-args [{_PARAMETER}]... [{_FILE}]... [{_REMAP}]... [{_LEVEL}]]",
@@ -366,7 +360,9 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
     After a signal SIGALRM then ends the process, as no Python runs meanwhile.
     """
-    hold_domain(os.environ.get("ROS_DOMAIN_ID", ""))
+    domain = os.environ.get("ROS_DOMAIN_ID", "")
+    if domain.isdecimal() and int(domain) > _LAST_DOMAIN:  # Fast DDS would end the process with status 1
+        raise ArgumentError(f"ROS_DOMAIN_ID is {domain}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
     args = list(args or [])
     stop: list[int] = []
     node: Node | None = None

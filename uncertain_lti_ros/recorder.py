@@ -73,10 +73,8 @@ def run(args: argparse.Namespace) -> Result:
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
-    args.say(
-        f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s"
-        + (f", {lost} lost on the way" if lost else "")
-    )
+    on_the_way = f", {lost} lost on the way" if lost else ""
+    args.say(f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s{on_the_way}")
     counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost}
     return Result(data={"bag": str(output), **counts})
 

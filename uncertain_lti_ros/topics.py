@@ -453,15 +453,10 @@ class Diagnostics:
         message.header.stamp = stamp
         for report in reports:
             values = {"model": model, **report.values} if report is reports[0] else report.values
-            message.status.append(
-                DiagnosticStatus(
-                    level=bytes([report.level]),
-                    name=f"{self._name}: {report.name}",
-                    message=report.message,
-                    hardware_id=self._hardware_id,
-                    values=[KeyValue(key=key, value=value) for key, value in values.items()],
-                )
-            )
+            status = DiagnosticStatus(level=bytes([report.level]), name=f"{self._name}: {report.name}")
+            status.message, status.hardware_id = report.message, self._hardware_id
+            status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+            message.status.append(status)
         self.publisher.publish(message)
 
     def problems(self, inputs: Mapping[str, MatchedSubscription]) -> list[str]:

@@ -273,12 +273,9 @@ class UncertainLTI(Envelope):
 
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
+        signals = replace(self.signals.scheduled_on(()), schedule=())
         return UncertainLTI(
-            **arrays,
-            signals=replace(self.signals.scheduled_on(()), schedule=()),
-            sampling=self.sampling,
-            domain=self.domain,
-            alarm_rule=self.alarm_rule,
+            **arrays, signals=signals, sampling=self.sampling, domain=self.domain, alarm_rule=self.alarm_rule
         )
 
     @property
