@@ -441,12 +441,8 @@ class EnvelopeMonitor:
         """`frozen`, `withheld`, `repeating`, `why_frozen` of `Verdicts`, by the watch of `judge`."""
         frozen, withheld, repeating = (np.zeros((len(transient), self.model.n), dtype=bool) for _ in range(3))
         why: dict[tuple[int, int], str] = {}
-        watch = self._watch()
-        if watch is None:
-            return frozen, withheld, repeating, why
-
-        some = steps.rows(marks, 1) & kernel.REPEATS > 0
-        if some.any():
+        watch, some = self._watch(), steps.rows(marks, 1) & kernel.REPEATS > 0
+        if watch is not None and some.any():
             at, given = followed(self.model, transient.t_ns, steps, some, self.rule.margin)
             codes, withheld[at + 1], because = watch.look_all(given)
             frozen[at + 1], repeating[at + 1] = codes > kernel.LONGER, codes == kernel.LONGER
