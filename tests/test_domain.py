@@ -181,7 +181,8 @@ def a_file(folder: Path) -> tuple[UncertainLTI, dict[str, Any]]:
 def test_the_oldest_format_that_holds_a_model_is_written(tmp_path: Path) -> None:
     model, data = a_file(tmp_path)
     assert data["format"] == "uncertain-lti/2"
-    assert UncertainLTI.load(tmp_path / "m.model.json").domain.measure == model.domain.measure
+    loaded = UncertainLTI.load(tmp_path / "m.model.json").domain.measure
+    assert np.array_equal(loaded.occupied, model.domain.measure.occupied)
     del data["domain"]["measure"]
     assert data["domain"].pop("step_max") and data.pop("residuals")
     assert data.pop("frozen") and data.pop("memory")

@@ -188,7 +188,8 @@ def test_a_free_run_follows_the_controls_and_begins_again_after_gaps() -> None:
     expected = model.operating_point.recorded_x(naive_run(model, recording))
     np.testing.assert_allclose(free.x, expected)
     assert np.isnan(expected[10]).all() and np.isfinite(np.delete(expected, 10, axis=0)).all()
-    refuses(ModelError, "it has 3 states, 1 controls", model.free_run, Transient(t, np.zeros((30, 3)), u))
+    other = Transient(t, np.zeros((30, 3)), u)
+    refuses(ModelError, "3 states and 1 control, and the model has 2 and 1", model.free_run, other)
 
 
 def test_weights_of_another_shape_are_refused() -> None:
@@ -419,7 +420,7 @@ def put(data: dict[str, Any], place: str, value: Any) -> Any:
         ("states.0.name", ..., r"states\[0\]: 'name' is missing"),
         ("states.0.colour", "red", r"states\[0\]: unknown key 'colour'"),
         ("states.0.scale", NAN, "scale is nan"),
-        ("states.0.scale", "auto", "scale of 'a' is auto; a model file holds numbers"),
+        ("states.0.scale", "auto", "signal 'a': scale is auto and not resolved; give a number"),
         ("states.0.steady", INF, "signal 'a': steady is inf"),
         ("sampling", [], "field 'sampling' is not an object"),
         ("sampling.maxgap", 1.0, "unknown field 'sampling.maxgap'; known are clock"),
@@ -532,7 +533,7 @@ RESIDUALS: list[tuple[str, Any, str]] = [
         ("signatures.0.steps", [True], "whole numbers"),
         ("signatures.0.moments", [[[1.0]]], "states"),
         ("signatures.0.recordings", 0, "whole numbers"),
-        ("signatures.0.more", 1, "must have"),
+        ("signatures.0.more", 1, "unknown field"),
         ("signatures", armed()["signatures"] * 2, "different labels"),
         ("domain.measure.cells", True, "domain.measure.cells"),
         ("domain.measure.cells", 10**9, "domain.measure.cells"),

@@ -571,7 +571,7 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
         album.take(scene(150_000), patience=300.0)
     album.take(scene(30_000), patience=300.0)
     assert outside.read_bytes() == b"of someone else" and (folder / written[0].name).is_symlink()
-    assert not list(tmp_path.rglob("*.part"))
+    assert not list(tmp_path.rglob("*.tmp"))
 
 
 _LEAVES = """

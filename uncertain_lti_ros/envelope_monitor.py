@@ -15,6 +15,7 @@ import gc
 import json
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from lifecycle_msgs.srv import ChangeState
 from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
+from rclpy.duration import Duration
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -105,16 +107,17 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.intake = Intake(self.outputs.sender, self.snapshots, self._event_log.turned, self.note_failure)
         self._look_at_clock()
         self._noted = 0.0
-        self._diagnostics = Diagnostics(self, str(self.settings.value("hardware_id")))
-        services = {
-            "status": self._on_status, "reset": self._on_reset, "reload": self._on_reload, "snapshot": self._on_snapshot
+        self._diagnostics = Diagnostics(self, self.settings["hardware_id"])
+        services: dict[str, Callable[[], tuple[bool, str]]] = {
+            "status": self._on_status, "reset": self._on_reset, "reload": self._on_reload,
+            "snapshot": lambda: (True, self.snapshots.write(self.session)),
         }  # fmt: skip
         for name, serve in services.items():
             self.create_service(Trigger, f"~/{name}", partial(self._serve, serve))
         self.add_pre_set_parameters_callback(lambda given: [whole_to_real(p, DEFAULTS.get(p.name)) for p in given])
         self.add_on_set_parameters_callback(self._on_set)
         self.add_post_set_parameters_callback(self._on_have_set)
-        tick = min(_TICK, self.settings.real("heartbeat") / 4, self.settings.real("diagnostics_period") / 2)
+        tick = min(_TICK, self.settings["heartbeat"] / 4, self.settings["diagnostics_period"] / 2)
         self.create_timer(tick, self.tick, clock=self._steady)
         self.create_timer(POLL, self._on_poll, clock=self._steady)
         self._change_state = self._service_change_state.callback
@@ -140,24 +143,24 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Prepare what the new values require, or refuse them; `_on_have_set` puts it in place."""
         given = {p.name: p.value for p in parameters}
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
+        candidate: Session | Rule | None = None
         self._candidate = None
         try:
             self.settings.check_snapshots(given.get("snapshot.on_alarm", False))
             if "model" in changes:
-                self._candidate = self._make_session(changes["model"], self.settings.rule(changes))
+                candidate = self._make_session(changes["model"], self.settings.rule(changes))
             elif changes and self.session is not None:
-                self._candidate = self.settings.rule(changes)
-                self.session.check(self._candidate)
+                candidate = self.settings.rule(changes)
+                self.session.check(candidate)
             elif "enable" in changes:
                 Condition.parse(changes["enable"])
         except UncertainLTIError as error:
-            self._candidate = None
             self.get_logger().warning(f"parameters refused: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         except Exception as error:  # a file can be wrong in unexpected ways
-            self._candidate = None
             self.note_failure("while parameters were set", error)
             return SetParametersResult(successful=False, reason=f"unexpected: {error!r}")
+        self._candidate = candidate
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
@@ -168,7 +171,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         return result
 
     def _on_have_set(self, parameters: Sequence[Parameter]) -> None:
-        self.settings.changed()
+        self.settings.read()
         self._look_at_clock()
         candidate, self._candidate = self._candidate, None
         if isinstance(candidate, Rule) and self.session is not None:
@@ -198,7 +201,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.snapshots.clear()
         if self.active:
             self.subscribe()
-        name = Path(str(self.settings.value("model"))).name
+        name = Path(self.settings["model"]).name
         self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
         self._event_log.begin(session, time.monotonic())
 
@@ -231,7 +234,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     @_failures_noted
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check the model, and offer the outputs."""
-        path = str(self.settings.value("model"))
+        path = self.settings["model"]
         try:
             self.settings.requested_qos()
             self._prefix = self.settings.topic_prefix()
@@ -245,7 +248,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.report()
             return TransitionCallbackReturn.FAILURE
         self.reason = ""
-        self.outputs.open(self.settings.real("heartbeat"))
+        self.outputs.open(self.settings["heartbeat"])
         self.outputs.prepare(session)
         self.get_logger().info(f"configured with {Path(path).name}: {session.model}")
         if session.model.sampling.dt_median is None:
@@ -305,7 +308,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.trigger_shutdown()
         self.reason = ""
         self.report()
-        self._diagnostics.wait(_LAST_WORDS)
+        self._diagnostics.publisher.wait_for_all_acked(Duration(seconds=_LAST_WORDS))
 
     # --- messages ---
 
@@ -316,12 +319,10 @@ class EnvelopeMonitorNode(LifecycleNode):
         for topic in list(self.inputs):
             if self.inputs[topic].type_name != types.get(topic):
                 self.inputs.pop(topic).destroy()
-        for topic, type_name in types.items():
-            if topic not in self.inputs:
-                self.inputs[topic] = MatchedSubscription(
-                    self, self._there(topic), type_name, partial(self.intake.message, topic),
-                    self.settings.requested_qos(),
-                )  # fmt: skip
+        requested = self.settings.requested_qos()
+        for topic in [topic for topic in types if topic not in self.inputs]:
+            take = partial(self.intake.message, topic)
+            self.inputs[topic] = MatchedSubscription(self, self._there(topic), types[topic], take, requested)
 
     def _there(self, topic: str) -> str:
         """Where a topic of the model, or of the enable condition, is heard; before remapping."""
@@ -346,7 +347,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._look_at_clock()
         tasks = (
             self._keep_beating, self._keep_reason, self._look_around, self._keep_reporting,
-            partial(self.snapshots.write_due, self.session), self._log_events,
+            lambda: self.snapshots.write_due(self.session, time.monotonic()), self._log_events,
         )  # fmt: skip
         for task in tasks:
             try:
@@ -367,7 +368,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.intake.clock = (lambda: self.clock.now().nanoseconds) if self.clock.ros_time_is_active else None
 
     def _keep_beating(self) -> None:
-        if self.active and time.monotonic() - self.outputs.sender.alarm_sent >= self.settings.real("heartbeat") / 2:
+        if self.active and time.monotonic() - self.outputs.sender.alarm_sent >= self.settings["heartbeat"] / 2:
             self._beat()
 
     def _look_around(self) -> None:
@@ -386,21 +387,22 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._enable_problem = ""
         if session is None or not self.active or not session.enable_topic:
             return
-        infos = self.get_publishers_info_by_topic(self._there(session.enable_topic))
-        found = [info.topic_type for info in infos]
-        if not infos:
-            if session.heard(session.enable_topic) is None:
-                self._enable_problem = f"nobody publishes {session.enable_topic}, which parameter enable names"
-        elif session.enable_type not in found and not session.enable_type_is_given:
+        topic = session.enable_topic
+        publishers_tell = not (session.rule.enable_type or topic in session.model.signals.topics)
+        found = [info.topic_type for info in self.get_publishers_info_by_topic(self._there(topic))]
+        if not found:
+            if session.heard(topic) is None:
+                self._enable_problem = f"nobody publishes {topic}, which parameter enable names"
+        elif publishers_tell and session.enable_type not in found:
             try:
                 session.found_enable_type(found[0])
             except UncertainLTIError as error:
                 self._enable_problem = f"parameter enable: {error}"
                 return
-            if (former := self.inputs.pop(session.enable_topic, None)) is not None:
+            if (former := self.inputs.pop(topic, None)) is not None:
                 former.destroy()
                 return  # the middleware takes no other type before it has let go of the former subscription
-        if session.enable_type and session.enable_topic not in self.inputs:
+        if session.enable_type and topic not in self.inputs:
             self.subscribe()
         if why := session.why_no_condition():
             self._enable_problem = f"parameter enable: {why}"
@@ -408,15 +410,15 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _keep_reason(self) -> None:
         """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""
         if self.active and self.session is not None:
-            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self.settings.real("state_timeout")))
+            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self.settings["state_timeout"]))
 
     def _keep_reporting(self) -> None:
         now = time.monotonic()
-        if now - self._reported < self.settings.real("diagnostics_period"):
+        if now - self._reported < self.settings["diagnostics_period"]:
             return
-        if self.session is not None and self.active and not self._diagnostics.listeners:
+        if self.session is not None and self.active and not self._diagnostics.publisher.get_subscription_count():
             self._reported = now
-            self.session.pass_over(now)
+            self.session.pass_over()
             self._mark_reported()
         else:
             self.report()
@@ -429,12 +431,12 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems = [problem for subscription in self.inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self.inputs.items()}
-        self._event_log.look(self.session, now, self.settings.real("state_timeout"), publishers, problems)
+        self._event_log.look(self.session, now, self.settings["state_timeout"], publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
             self.get_logger().warning(line)
-        else:
+        else:  # rclpy lets a line of code log at one level only
             self.get_logger().info(line)
 
     def _lasting_problems(self) -> list[str]:
@@ -457,20 +459,19 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Publish diagnostics."""
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
-            reports = self.session.report(now, self.settings.real("state_timeout"), self._problems())
-            extra = input_values(self.inputs)
+            reports = self.session.report(now, self.settings["state_timeout"], self._problems())
+            extra = input_values(self.inputs) | self.snapshots.values
             extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.sender.held_back)}
-            extra |= self.snapshots.values
-            reports[0] = Report(reports[0].level, reports[0].name, reports[0].message, {**reports[0].values, **extra})
+            reports[0] = replace(reports[0], values={**reports[0].values, **extra})
         else:
             state = self.state_name
-            message = f"{state}: {self.reason}" if self.reason else f"{state}: no verdicts are given"
+            message = f"{state}: {self.reason or 'no verdicts are given'}"
             level = ERROR if self.reason else STALE
             reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:
                 reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
         self._mark_reported()
-        self._diagnostics.publish(reports, self.clock.now().to_msg(), str(self.settings.value("model")))
+        self._diagnostics.publish(reports, self.clock.now().to_msg(), self.settings["model"])
 
     def _mark_reported(self) -> None:
         self.failures.reported()
@@ -479,11 +480,11 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- services ---
 
     def _serve(
-        self, serve: Callable[[Trigger.Response], None], _: Trigger.Request, response: Trigger.Response
+        self, serve: Callable[[], tuple[bool, str]], _: Trigger.Request, response: Trigger.Response
     ) -> Trigger.Response:
         """Answer a call; a refusal and an unexpected error are reported in the answer."""
         try:
-            serve(response)
+            response.success, response.message = serve()
         except UncertainLTIError as error:
             response.success, response.message = False, str(error)
         except Exception as error:
@@ -491,47 +492,41 @@ class EnvelopeMonitorNode(LifecycleNode):
             response.success, response.message = False, f"unexpected: {error!r}"
         return response
 
-    def _on_reset(self, response: Trigger.Response) -> None:
+    def _on_reset(self) -> tuple[bool, str]:
         """End a latched alarm, and let the alarm look at verdicts from now on only."""
         if self.session is None or not self.active:
             raise ModelError("the node is not active, so there is no alarm to reset")
-        response.message = "the alarm is reset" if self.session.alarm else "there was no alarm; its window is empty now"
+        done = "the alarm is reset" if self.session.alarm else "there was no alarm; its window is empty now"
         self.session.reset()
         self._event_log.turned(self.session, (), time.monotonic(), ", by ~/reset")
         self._beat()
-        response.success = True
+        return True, done
 
-    def _on_reload(self, response: Trigger.Response) -> None:
+    def _on_reload(self) -> tuple[bool, str]:
         """Read the model file once more."""
         if self.session is None:
             raise ModelError("the node is not configured; configure it, which reads the model file")
-        path = str(self.settings.value("model"))
+        path = self.settings["model"]
         self._swap(self._make_session(path, self.settings.rule({})))
-        response.success, response.message = True, f"{Path(path).name}: {self.session.model}"
+        return True, f"{Path(path).name}: {self.session.model}"
 
-    def _on_snapshot(self, response: Trigger.Response) -> None:
-        """Write the last seconds to a file."""
-        response.message = self.snapshots.write(self.session)
-        response.success = True
-
-    def _on_status(self, response: Trigger.Response) -> None:
-        """Counters as JSON; success: verdicts are given."""
+    def _on_status(self) -> tuple[bool, str]:
+        """Whether verdicts are given, and counters as JSON."""
         session = self.session
-        response.success = self.active
-        response.message = json.dumps(
+        return self.active, json.dumps(
             {
                 "state": self.state_name,
                 "reason": self.reason,
-                "model": self.settings.value("model"),
+                "model": self.settings["model"],
                 "now_ns": self.clock.now().nanoseconds,
-                "use_sim_time": self.settings.value("use_sim_time"),
+                "use_sim_time": self.get_parameter("use_sim_time").value,
                 "received": {s.topic: s.received for s in self.inputs.values()},
                 "lost": {s.topic: s.lost for s in self.inputs.values()},
                 "listeners": {name: output.listeners for name, output in self.outputs.publishers.items()},
                 "verdicts": session.verdicts if session else 0,
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
-                "why": session.reason(time.monotonic(), self.settings.real("state_timeout")) if session else "",
+                "why": session.reason(time.monotonic(), self.settings["state_timeout"]) if session else "",
                 "looks_like": like.words if session and (like := session.explainer.likeness()) else "",
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,
@@ -541,7 +536,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "future": dict(session.future) if session else {},
                 "decoded": session.decoded if session else {},
                 "unexpected_errors": self.failures.count,
-                "snapshot": self.snapshots.last,
+                "snapshot": self.snapshots.values.get("last snapshot", ""),
                 "problems": self._problems(),
             }
         )
@@ -560,7 +555,7 @@ def _run(args: list[str]) -> int:
         node.get_logger().info(f"runs on the {life.executor_name}")
         if node.get_parameter("autostart").value:
             node.start()
-            if not node.active and node.settings.value("required"):
+            if not node.active and node.settings["required"]:
                 node.get_logger().error("ends, as parameter required is true")
                 node.report()
                 return BAD_USAGE

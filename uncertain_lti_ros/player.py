@@ -121,13 +121,10 @@ def run(args: argparse.Namespace) -> Result:
                         clock.publish(_clock(message.log_time_ns))
                     _send(played, message)
         if behind > 1.0 and life.alive:
-            note(
-                f"fell behind the requested rate by up to {behind:.1f} s, to keep messages at least "
-                f"{1e3 / crowd:.2g} ms apart"
-            )
+            apart = f"to keep messages at least {1e3 / crowd:.2g} ms apart"
+            note(f"fell behind the requested rate by up to {behind:.1f} s, {apart}")
         took = time.monotonic() - began
-        missed = _unconfirmed(life, played)
-        if missed:
+        if missed := _unconfirmed(life, played):
             note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
     ended = f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s"
@@ -189,22 +186,20 @@ def _hold_layout(type_name: str, recorded: TypeFields, installed: TypeFields) ->
 
 def _durability(bag: Bag, topic: str) -> DurabilityPolicy:
     """Transient local where every publisher was, as the recorder wrote down."""
-    lasting = False
-    for message in bag.raw_messages([topic]):
-        if message.channel.counted:
-            with suppress(yaml.YAMLError, TypeError, LookupError):  # notes of some recorder
-                offered = yaml.safe_load(message.channel.metadata.get("offered_qos_profiles") or "[]")
-                lasting = bool(offered) and all(o["durability"] in (1, "transient_local") for o in offered)
-            break
-    return DurabilityPolicy.TRANSIENT_LOCAL if lasting else DurabilityPolicy.VOLATILE
+    first = next((message for message in bag.raw_messages([topic]) if message.channel.counted), None)
+    with suppress(yaml.YAMLError, TypeError, LookupError):  # notes of some recorder
+        offered = yaml.safe_load(first.channel.metadata.get("offered_qos_profiles") or "[]") if first else []
+        if offered and all(o["durability"] in (1, "transient_local") for o in offered):
+            return DurabilityPolicy.TRANSIENT_LOCAL
+    return DurabilityPolicy.VOLATILE
 
 
 def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
     """Messages a second that are sent at most while catching up."""
-    infos = [info for topic in played if (info := bag.topics[topic]).first is not None]
-    span = max((i.last or 0 for i in infos), default=0) - min((i.first or 0 for i in infos), default=0)
-    count = sum(i.count for i in infos)
-    return max(_CROWD, 1.5 * count / (span * 1e-9)) if span > 1e9 else _CROWD
+    infos = [bag.topics[topic] for topic in played]
+    times = [at for info in infos for at in (info.first, info.last) if at is not None]
+    span = (max(times, default=0) - min(times, default=0)) * 1e-9
+    return max(_CROWD, 1.5 * sum(info.count for info in infos) / span) if span > 1.0 else _CROWD
 
 
 def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[str], None]) -> None:
@@ -280,9 +275,8 @@ def _lockstep(
 ) -> None:  # fmt: skip
     follower = _Follower(life, f"{node if node.startswith('/') else '/' + node}/status", wait)
     if clock is not None and not follower.status.get("use_sim_time", True):
-        raise UncertainLTIError(
-            f"{node}: does not follow /clock; start it with -p use_sim_time:=true, or leave out --clock"
-        )
+        remedy = "start it with -p use_sim_time:=true, or leave out --clock"
+        raise UncertainLTIError(f"{node}: does not follow /clock; {remedy}")
     for sent, message in enumerate(messages, start=1):
         if clock is not None:
             follower.reach(clock, message.log_time_ns)

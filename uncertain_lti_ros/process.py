@@ -25,7 +25,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import rclpy
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
@@ -77,8 +77,7 @@ class Declared:
         descriptor = ParameterDescriptor(description=self.text, read_only=self.fixed)
         if self.low is not None and self.high is not None:
             if isinstance(self.default, int):
-                limits = IntegerRange(from_value=int(self.low), to_value=int(self.high), step=0)
-                descriptor.integer_range = [limits]
+                descriptor.integer_range = [IntegerRange(from_value=int(self.low), to_value=int(self.high), step=0)]
             else:
                 descriptor.floating_point_range = [FloatingPointRange(from_value=self.low, to_value=self.high)]
         return descriptor
@@ -127,11 +126,7 @@ def whole_to_real(given: Parameter, default: object) -> Parameter:
 
 
 def run_node(
-    name: str,
-    summary: str,
-    parameters: Sequence[Declared],
-    run: Callable[[list[str]], int],
-    args: Sequence[str] | None,
+    name: str, summary: str, parameters: Sequence[Declared], run: Callable[[list[str]], int], args: Sequence[str] | None
 ) -> int:
     """Run a node on some arguments.
 
@@ -146,27 +141,13 @@ def run_node(
         return run(given)
     except UncertainLTIError as error:
         print(f"{name}: {error}", file=sys.stderr)
-        if args is None:
-            _leave(BAD_USAGE)
-        return BAD_USAGE
-
-
-def _leave(status: int) -> NoReturn:
-    """End the process at once.
-
-    Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
-    """
-    for stream in (sys.stdout, sys.stderr):
-        if stream is not None:
-            with suppress(OSError, ValueError):
-                stream.flush()
-    os._exit(status)
-
-
-def hold_domain(number: str) -> None:
-    """Refuse a domain without ports, for which Fast DDS would end the process with status 1."""
-    if number.isdecimal() and int(number) > _LAST_DOMAIN:
-        raise ArgumentError(f"ROS_DOMAIN_ID is {number}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
+    # Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
+    for stream in (sys.stdout, sys.stderr) if args is None else ():
+        with suppress(OSError, ValueError, AttributeError):  # AttributeError: it was closed before the start
+            stream.flush()
+    if args is None:
+        os._exit(BAD_USAGE)
+    return BAD_USAGE
 
 
 def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
@@ -379,18 +360,20 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     Fast DDS 2.14 waits for ever for its own listeners when a participant is destroyed while it comes to know another.
     After a signal SIGALRM then ends the process, as no Python runs meanwhile.
     """
-    hold_domain(os.environ.get("ROS_DOMAIN_ID", ""))
+    domain = os.environ.get("ROS_DOMAIN_ID", "")
+    if domain.isdecimal() and int(domain) > _LAST_DOMAIN:  # Fast DDS would end the process with status 1
+        raise ArgumentError(f"ROS_DOMAIN_ID is {domain}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
     args = list(args or [])
     stop: list[int] = []
-    lives: list[Life] = []
+    node: Node | None = None
+    life: Life | None = None
 
     def end(number: int, _: Any) -> None:
         stop.append(number)
-        for life in lives:
+        if life is not None:
             life.end()
 
     before = {name: signal.signal(name, end) for name in (signal.SIGINT, signal.SIGTERM)}
-    node = None
     try:
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
@@ -399,13 +382,13 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
             # RuntimeError: what rcl raises, under names that rclpy does not export
             raise ArgumentError(in_words(error)) from None
         hold_overrides(node, args)
-        lives.append(Life(node, stop))
-        yield lives[0]
+        life = Life(node, stop)
+        yield life
     finally:
         if stop:
             signal.signal(signal.SIGALRM, signal.SIG_DFL)
             signal.alarm(_LAST)
-        for life in lives:
+        if life is not None:
             life.executor.shutdown()  # before its node: the middleware calls into it as long as it knows the entities
         if node is not None:
             node.destroy_node()

@@ -73,10 +73,8 @@ def run(args: argparse.Namespace) -> Result:
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
-    args.say(
-        f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s"
-        + (f", {lost} lost on the way" if lost else "")
-    )
+    on_the_way = f", {lost} lost on the way" if lost else ""
+    args.say(f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s{on_the_way}")
     counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost}
     return Result(data={"bag": str(output), **counts})
 
@@ -126,24 +124,23 @@ def _record(
     life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None,
     step: Callable[[str], None],
 ) -> None:  # fmt: skip
-    looked = flushed = polled = time.monotonic()
-    while life.alive:
-        now = time.monotonic()
-        if now - polled > POLL:
-            polled = now
-            for subscription in subscriptions:
-                subscription.poll()
-        if now - looked > _LOOK or any(s.look_soon for s in subscriptions):
-            looked = now
-            for subscription in subscriptions:
-                subscription.look()
-        if now - flushed > _FLUSH:
-            flushed = now
-            file.flush()
-        if duration is not None and file.began is not None and now - file.began >= duration:
-            break
+    def look() -> None:
+        for subscription in subscriptions:
+            subscription.look()
+
+    def poll() -> None:
+        for subscription in subscriptions:
+            subscription.poll()
+        if any(s.look_soon for s in subscriptions):
+            look()
+
+    def over() -> bool:
         step(f"{file.count} messages, {file.span:.1f} s")
-        life.spin_once(0.05)
+        return duration is not None and file.began is not None and time.monotonic() - file.began >= duration
+
+    for period, task in ((POLL, poll), (_LOOK, look), (_FLUSH, file.flush)):
+        life.node.create_timer(period, task)
+    life.until(over)
 
 
 class _File:

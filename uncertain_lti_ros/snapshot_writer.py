@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import math
-import time
 
 from rclpy.node import Node
 
@@ -43,18 +42,17 @@ class Snapshots:
 
     def open(self) -> None:
         """Keep messages from now on, if there is a folder to write to."""
-        folder = str(self._settings.value("snapshot.folder"))
-        self._settings.check_snapshots(self._settings.value("snapshot.on_alarm"))
+        folder = self._settings["snapshot.folder"]
+        self._settings.check_snapshots(self._settings["snapshot.on_alarm"])
         if folder:
             limit = self._settings.size("snapshot.megabytes")
             name = self._node.get_fully_qualified_name()
-            self._album = Album(folder, name, self._settings.value("snapshot.keep"), limit)
-            self.recent = Recent(self._settings.real("snapshot.seconds"), self._settings.size("snapshot.memory"))
+            self._album = Album(folder, name, self._settings["snapshot.keep"], limit)
+            self.recent = Recent(self._settings["snapshot.seconds"], self._settings.size("snapshot.memory"))
 
     def close(self, session: Session | None) -> None:
         """Write what is due, and forget all messages."""
-        if self._due is not None and session is not None:
-            self._take_due(session)
+        self.write_due(session, math.inf)
         if self._album is not None:
             self._album.close()
         self._album = self.recent = self._due = None
@@ -69,21 +67,18 @@ class Snapshots:
         assert self.recent is not None
         self.recent.add(entry)
         # no alarm for as long as a snapshot goes back: one that flaps must not replace the first file
-        if raised and self._due is None and entry.now - self._alarmed >= self._settings.real("snapshot.seconds"):
-            self._due = entry.now + self._settings.real("snapshot.after")
+        if raised and self._due is None and entry.now - self._alarmed >= self._settings["snapshot.seconds"]:
+            self._due = entry.now + self._settings["snapshot.after"]
 
     def alarm_over(self, now: float) -> None:
         """The alarm is over."""
         self._alarmed = now
 
-    def write_due(self, session: Session | None) -> None:
-        """Begin to write the snapshot of an alarm, if it is due."""
-        if session is not None and self._due is not None and time.monotonic() >= self._due:
-            self._take_due(session)
-
-    def _take_due(self, session: Session) -> None:
-        assert self._album is not None
-        if not self._settings.value("snapshot.on_alarm"):
+    def write_due(self, session: Session | None, now: float) -> None:
+        """Begin to write the snapshot of an alarm, if it is due; `now`: steady time, s."""
+        if session is None or self._album is None or self._due is None or now < self._due:
+            return
+        if not self._settings["snapshot.on_alarm"]:
             self._due = None
         elif not self._album.busy:
             self._due = None
@@ -95,7 +90,7 @@ class Snapshots:
     def write(self, session: Session | None) -> str:
         """Write the last seconds to a file."""
         if self._album is None or session is None:
-            if self._settings.value("snapshot.folder"):
+            if self._settings["snapshot.folder"]:
                 raise ModelError("the node is not configured, so there is nothing to write")
             raise ModelError("parameter snapshot.folder is empty; start the node with a folder for snapshots")
         return self._album.take(self._scene(session, "asked for"), _SERVICE_WAIT)
@@ -103,22 +98,13 @@ class Snapshots:
     def _scene(self, session: Session, why: str) -> Scene:
         assert self.recent is not None
         node, model, monitor = self._node, session.model, session.monitor
-        about = {
-            "node": node.get_fully_qualified_name(),
-            "why": why,
-            "model": str(self._settings.value("model")),
-            "alarm": f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}",
-        }
+        alarm = f"{monitor.rule.violations} of {monitor.rule.window}, margin {monitor.rule.margin!r}"
+        name, path = node.get_fully_qualified_name(), self._settings["model"]
+        about = {"node": name, "why": why, "model": path, "alarm": alarm}
         topics = {output.name: node.resolve_topic_name(f"~/{output.name}") for output in RECORDED}
         names = names_of(model.state_names, model.steps, monitor.alarms.names)
-        return Scene(
-            self.recent.entries(), names, session.types, topics, about, definition, Reasons(model, monitor.alarms.rules)
-        )
-
-    @property
-    def last(self) -> str:
-        """Path of the last file; empty if there is none."""
-        return self._album.last if self._album else ""
+        reasons = Reasons(model, monitor.alarms.rules)
+        return Scene(self.recent.entries(), names, session.types, topics, about, definition, reasons)
 
     @property
     def values(self) -> dict[str, str]:

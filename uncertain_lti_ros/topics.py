@@ -17,13 +17,14 @@ handler makes the events executor of Jazzy run Python without Python's lock, and
 from __future__ import annotations
 
 import importlib
+import math
 import re
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from types import SimpleNamespace
-from typing import Any, Literal
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.duration import Duration
@@ -31,7 +32,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.lifecycle import LifecycleNode
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import JointState
@@ -90,18 +91,15 @@ def _split(text: str) -> tuple[str, int | None, str]:
 
 def _field_type(text: str) -> FieldType:
     element, array, _ = _split(text)
-    kind: Literal["number", "bool", "string", "message", "other"] = "other"
     if element in _NUMBERS:
-        kind, element = "number", _NUMBERS[element]
-    elif element == "boolean":
-        kind, element = "bool", "bool"
-    elif element.startswith(("string", "wstring")):
-        kind = "string"
-    elif element == "octet":
-        element = "byte"
-    elif "/" in element:
-        kind, element = "message", full_name(element)
-    return FieldType(kind, element, array)
+        return FieldType("number", _NUMBERS[element], array)
+    if element.startswith(("string", "wstring")):
+        return FieldType("string", element, array)
+    if "/" in element:
+        return FieldType("message", full_name(element), array)
+    if element == "boolean":
+        return FieldType("bool", "bool", array)
+    return FieldType("other", "byte" if element == "octet" else element, array)
 
 
 def stamp_ns(message: Any) -> int:
@@ -163,8 +161,7 @@ class PolledEvents:
         for handler in self._handlers:
             handler.is_ready(_EVERY)
             status = handler.take_data()
-            changes = (getattr(status, name, 0) for name in ("total_count_change", "current_count_change"))
-            if status is not None and any(changes):
+            if any(getattr(status, name, 0) for name in ("total_count_change", "current_count_change")):
                 handler.callback(status)
 
     def destroy(self) -> None:
@@ -202,14 +199,13 @@ def choose_qos(offers: Iterable[QoSProfile], requested: RequestedQos, history: b
     lasting = bool(offers) and all(o.durability == DurabilityPolicy.TRANSIENT_LOCAL for o in offers)
     deadlines = [o.deadline.nanoseconds for o in offers]
     promised = bool(deadlines) and all(0 < d < _NEVER_NS for d in deadlines)
+    reliability = RELIABILITY["reliable" if reliable else "best_effort"]
+    durability = DURABILITY["transient_local" if lasting and history else "volatile"]
     return QoSProfile(
         deadline=Duration(nanoseconds=max(deadlines)) if promised else Duration(),
-        history=HistoryPolicy.KEEP_LAST,
         depth=requested.depth,
-        reliability=requested.reliability
-        or (ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT),
-        durability=requested.durability
-        or (DurabilityPolicy.TRANSIENT_LOCAL if lasting and history else DurabilityPolicy.VOLATILE),
+        reliability=requested.reliability or reliability,
+        durability=requested.durability or durability,
     )
 
 
@@ -245,8 +241,9 @@ class MatchedSubscription:
     `node`: the node; `topic`: as in the model or on the command line; expanded and remapped by the node; `type_name`:
     `pkg/msg/Type`; `callback`: takes the bytes of a message, and when it was published, ns by its publisher;
     `requested`: what the user requests; `received, lost, late`: messages received, those lost on the way or in the
-    queue, and deadlines missed by publishers; `publishers`: publishers of this type that the graph knows; `qos`: what
-    is asked of them now; `problems`: publishers that cannot be heard and why, one sentence each.
+    queue, and deadlines missed by publishers; `publishers`: publishers of this type that the graph knows; `published`:
+    since when there are some, steady time in s; infinite without any; `qos`: what is asked of them now; `problems`:
+    publishers that cannot be heard and why, one sentence each.
 
     The middleware reports what its writer gives up, and not what full queues of this reader push out; the numbers that
     a publisher gives its messages show both, as long as it is the only one.
@@ -269,13 +266,9 @@ class MatchedSubscription:
         self._alone = False  # one publisher sends all messages since that one
         self.problems: list[str] = []
         self.look_soon = False
-        self._published: float | None = None  # since when there are publishers, steady time in s
+        self.published = math.inf  # since when there are publishers, steady time in s
         self._subscription: Subscription | None = None
         self.look()
-
-    def nothing_for(self) -> float:
-        """How long there have been publishers and not a single message, s; 0 without publishers."""
-        return 0.0 if self.received or self._published is None else time.monotonic() - self._published
 
     @property
     def lost(self) -> int:
@@ -291,10 +284,7 @@ class MatchedSubscription:
         if not self._alone:
             self._number = None
         self._alone = len(offers) == 1
-        if not offers:
-            self._published = None
-        elif self._published is None:
-            self._published = time.monotonic()
+        self.published = min(self.published, time.monotonic()) if offers else math.inf
         if self._subscription is None:
             self._subscribe(choose_qos(offers, self._requested))
         elif offers:  # when the last publisher leaves, the next one is likely to offer the same
@@ -303,14 +293,10 @@ class MatchedSubscription:
             if _policies(qos) != _policies(self.qos):
                 self.destroy()
                 self._subscribe(qos)
-        self.problems = sorted(
-            {f"{self.topic}: a publisher cannot be heard, {p}" for o in offers for p in incompatible(self.qos, o)}
-            | {
-                f"{self.topic}: a publisher sends {i.topic_type}, and {self.type_name} is wanted"
-                for i in infos
-                if i.topic_type != self.type_name
-            }
-        )
+        why = {f"cannot be heard, {problem}" for offer in offers for problem in incompatible(self.qos, offer)}
+        others = {info.topic_type for info in infos} - {self.type_name}
+        why |= {f"sends {other}, and {self.type_name} is wanted" for other in others}
+        self.problems = [f"{self.topic}: a publisher {what}" for what in sorted(why)]
 
     def destroy(self) -> None:
         """Stop receiving."""
@@ -327,10 +313,7 @@ class MatchedSubscription:
     def _subscribe(self, qos: QoSProfile) -> None:
         self.qos = qos
         events = SubscriptionEventCallbacks(
-            incompatible_qos=self._changed,
-            matched=self._changed,
-            message_lost=self._lost,
-            deadline=self._missed,
+            incompatible_qos=self._changed, matched=self._changed, message_lost=self._lost, deadline=self._missed
         )
         self._number = None
         self._subscription = subscription = self._node.create_subscription(
@@ -455,19 +438,14 @@ _UNHEARD = 2.0  # s without a first message although there are publishers
 class Diagnostics:
     """Publisher of the node's reports.
 
-    `node`: gives its name; `hardware_id`: of every status; empty for the node's name.
+    `node`: gives its name; `hardware_id`: of every status; empty for the node's name; `publisher`: of the topic.
     """
 
     def __init__(self, node: Node, hardware_id: str) -> None:
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._name = node.get_fully_qualified_name().lstrip("/")
         self._hardware_id = hardware_id or node.get_name()
         self._reported: dict[str, tuple[int, int]] = {}  # topic: lost and late messages up to the last report
-
-    @property
-    def listeners(self) -> int:
-        """Number of subscriptions to the topic."""
-        return int(self._publisher.get_subscription_count())
 
     def publish(self, reports: Sequence[Report], stamp: Any, model: str) -> None:
         """Publish one message."""
@@ -475,27 +453,18 @@ class Diagnostics:
         message.header.stamp = stamp
         for report in reports:
             values = {"model": model, **report.values} if report is reports[0] else report.values
-            message.status.append(
-                DiagnosticStatus(
-                    level=bytes([report.level]),
-                    name=f"{self._name}: {report.name}",
-                    message=report.message,
-                    hardware_id=self._hardware_id,
-                    values=[KeyValue(key=key, value=value) for key, value in values.items()],
-                )
-            )
-        self._publisher.publish(message)
-
-    def wait(self, seconds: float) -> None:
-        """Wait until every reader has every report."""
-        self._publisher.wait_for_all_acked(Duration(seconds=seconds))
+            status = DiagnosticStatus(level=bytes([report.level]), name=f"{self._name}: {report.name}")
+            status.message, status.hardware_id = report.message, self._hardware_id
+            status.values = [KeyValue(key=key, value=value) for key, value in values.items()]
+            message.status.append(status)
+        self.publisher.publish(message)
 
     def problems(self, inputs: Mapping[str, MatchedSubscription]) -> list[str]:
         """What keeps messages from coming, and what was lost since the last report."""
-        problems = []
+        problems, now = list[str](), time.monotonic()
         for topic, subscription in inputs.items():
             problems += subscription.problems
-            if (waited := subscription.nothing_for()) > _UNHEARD:
+            if not subscription.received and (waited := now - subscription.published) > _UNHEARD:
                 heard = plural(subscription.publishers, "publisher")
                 problems.append(f"{subscription.topic}: nothing received in {waited:.0f} s, and there is {heard}")
             lost, late = self._reported.get(topic, (0, 0))

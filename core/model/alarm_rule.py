@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import math
 import reprlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -21,7 +20,7 @@ from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.horizon import MOST_STEPS
-from uncertain_lti.model.terms import object_of
+from uncertain_lti.model.terms import is_number, is_whole, object_of
 
 LONGEST_WINDOW = 1_000_000
 """Verdicts that the alarm looks at, at most."""
@@ -61,12 +60,12 @@ class AlarmRule:
 
     def __post_init__(self) -> None:
         m, n = self.violations, self.window
-        if not (_whole(m) and _whole(n) and 1 <= m <= n <= LONGEST_WINDOW):
+        if not (is_whole(m) and is_whole(n) and 1 <= m <= n <= LONGEST_WINDOW):
             raise ModelError(
                 f"alarm: violations is {reprlib.repr(m)} of window {reprlib.repr(n)}; it takes whole numbers, "
                 f"1 <= violations <= window <= {LONGEST_WINDOW}"
             )
-        if not (_number(self.margin) and 1 / LARGEST <= self.margin <= LARGEST):
+        if not (is_number(self.margin) and 1 / LARGEST <= self.margin <= LARGEST):
             raise _wrong("margin", self.margin, f"a positive number, {1 / LARGEST:g} to {LARGEST:g}")
         object.__setattr__(self, "margin", float(self.margin))
         _check_horizon(self.horizon)
@@ -127,21 +126,19 @@ class StatisticRule:
         if self.kind not in KINDS:
             raise _wrong("kind", self.kind, _ONE_OF)
         sums = self.kind == "cusum"
-        if not (_number(self.window_s) and 0.0 <= self.window_s <= LONGEST_S and (self.window_s or not sums)):
+        if not (is_number(self.window_s) and 0.0 <= self.window_s <= LONGEST_S and (self.window_s or not sums)):
             least = "a positive number of seconds" if sums else "a number of seconds, 0 for one verdict"
             raise _wrong(f"window_s of {self.kind}", self.window_s, f"{least}, at most {LONGEST_S:g}")
         each = self.threshold if isinstance(self.threshold, (list, tuple)) else (self.threshold,)
-        if not each or not all(_number(t) and 1 / LARGEST <= t <= LARGEST for t in each):
+        if not each or not all(is_number(t) and 1 / LARGEST <= t <= LARGEST for t in each):
             must = f"a positive number, or one for each state, {1 / LARGEST:g} to {LARGEST:g}"
             raise _wrong(f"threshold of {self.kind}", self.threshold, must)
-        if isinstance(self.threshold, (list, tuple)):
+        if each is self.threshold:
             if self.kind in JOINT:
-                raise ModelError(
-                    f"alarm: {self.kind} is one number for all states, so its threshold must be one number"
-                )
-            object.__setattr__(self, "threshold", tuple(map(float, self.threshold)))
+                raise ModelError(f"alarm: {self.kind} is one number for all states; give one threshold")
+            object.__setattr__(self, "threshold", tuple(map(float, each)))
         _check_horizon(self.horizon)
-        if not (_number(self.allowance) and 0.0 <= self.allowance <= LARGEST):
+        if not (is_number(self.allowance) and 0.0 <= self.allowance <= LARGEST):
             raise _wrong("allowance", self.allowance, f"a number, 0 to {LARGEST:g}")
         if self.allowance and not sums:
             raise ModelError(f"alarm: allowance goes with cusum; leave it out of {self.kind}")
@@ -231,19 +228,8 @@ def rule_from_dict(data: Any, name: str = "alarm.rules") -> Rule:
         raise ModelError(f"field '{name}': {str(error).removeprefix('alarm: ')}") from None
 
 
-def _whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool)
-
-
-def _number(value: Any) -> bool:
-    try:
-        return not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value)
-    except OverflowError:
-        return False
-
-
 def _check_horizon(horizon: Any) -> None:
-    if not (_whole(horizon) and 1 <= horizon <= MOST_STEPS):
+    if not (is_whole(horizon) and 1 <= horizon <= MOST_STEPS):
         raise _wrong("horizon", horizon, f"a whole number of steps, 1 to {MOST_STEPS}")
 
 

@@ -27,6 +27,7 @@ from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import apart, plural, shortlist
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
 from uncertain_lti.model.operating_point import recorded
+from uncertain_lti.model.terms import is_whole, object_of
 
 
 @dataclass(frozen=True)
@@ -55,7 +56,7 @@ def cells_for(count: int) -> int:
     return cells if cells >= 4 else 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Occupancy:
     """Which combinations of two signals the fit saw: for each pair of them a grid over their ranges.
 
@@ -97,10 +98,8 @@ class Occupancy:
         own = np.concatenate((before.x_max, before.u_max)) - least
         begin = ((least - low) / span)[:, None] + (own / span)[:, None] * edges
         end = begin + (own / span / self.cells)[:, None]
-        first, last = (
-            np.clip(((at + shift) * self.cells).astype(int), 0, self.cells - 1)
-            for at, shift in ((begin, 1e-9), (end, -1e-9))
-        )
+        ends = begin + 1e-9, end - 1e-9
+        first, last = (np.clip((at * self.cells).astype(int), 0, self.cells - 1) for at in ends)
         cells = np.arange(self.cells)[:, None]
         lies = (cells >= first[:, None]) & (cells <= np.maximum(first, last)[:, None])  # (n + m, larger, own)
         pairs = list(combinations(range(len(low)), 2)) or [(0, 0)]
@@ -113,30 +112,22 @@ class Occupancy:
     @classmethod
     def from_dict(cls, data: Any, size: int) -> Occupancy:
         """From a model file."""
-        if not isinstance(data, dict) or set(data) != {"cells", "occupied"}:
-            raise ModelError("field 'domain.measure' must be an object of 'cells' and 'occupied'")
-        cells, text = data["cells"], data["occupied"]
-        if isinstance(cells, bool) or not isinstance(cells, int) or not 2 <= cells <= 64:
-            raise ModelError(
-                f"field 'domain.measure.cells' is {reprlib.repr(cells)}; it must be a whole number, 2 to 64"
-            )
+        keys = "cells", "occupied"
+        cells, text = (object_of(data, "domain.measure", keys, keys)[key] for key in keys)
+        if not (is_whole(cells) and 2 <= cells <= 64):
+            must = "it must be a whole number, 2 to 64"
+            raise ModelError(f"field 'domain.measure.cells' is {reprlib.repr(cells)}; {must}")
         shape = (pair_count(size), cells, cells)
         try:
             packed = np.frombuffer(b64decode(text, validate=True), dtype=np.uint8)
         except (TypeError, ValueError):
             raise ModelError("field 'domain.measure.occupied' is not base64; fit the model again") from None
-        if len(packed) != -(-math.prod(shape) // 8):
+        if len(packed) != (size_of := -(-math.prod(shape) // 8)):
             raise ModelError(
                 f"field 'domain.measure.occupied' holds {len(packed)} bytes, and {plural(size, 'signal')} with {cells} "
-                f"cells take {-(-math.prod(shape) // 8)}; fit the model again"
+                f"cells take {size_of}; fit the model again"
             )
         return cls(cells, np.unpackbits(packed, count=math.prod(shape)).astype(bool).reshape(shape))
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Occupancy) and np.array_equal(self.occupied, other.occupied)
-
-    def __hash__(self) -> int:
-        return hash(self.occupied.tobytes())
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import WORTH_THREADS, Array, core_count, on_cores
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, refuse_other
+from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import Judge, Runs, arrivals, blended
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.domain import Domain, outside_in_words
@@ -26,7 +27,7 @@ from uncertain_lti.model.horizon import Horizon, Residuals, Run, Windows, unbrok
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns, normalised
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ADDITIVE, Elements, Term
-from uncertain_lti.sampling.transient import Transitions
+from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
 from uncertain_lti.signals.signal_map import SignalMap
 
 
@@ -81,6 +82,21 @@ class Envelope(Elements):
         if self.schedule is None:
             return self.centre_and_half_at(z[:rows], dt)
         return self.centre_and_half_at(z[:rows], dt, None, self.schedule.table, z[self.scheduling_positions])
+
+    def own_signals_of(self, transient: Transient) -> Transient:
+        """A recording with the controls and scheduling signals as this model takes them, refused if it has others."""
+        instead = "read a recording with read_transients first, and give one after the other"
+        refuse_other(transient, Transient, "the recording", instead, ModelError)
+        own = transient.scheduled_on([s.name for s in self.signals.scheduling])
+        own = controls_as(own, self.signals.controls)
+        states, controls, further = own.x.shape[1], own.u.shape[1], own.s.shape[1]
+        if (states, controls, further) != (self.n, self.m, self.q):
+            raise ModelError(
+                f"{own.name}: {plural(states, 'state')} and {plural(controls, 'control')}, and the model has {self.n} "
+                f"and {self.m}; of further scheduling signals it has {further}, and the model {self.q}; read it with "
+                f"the signals of the model"
+            )
+        return own
 
     def normalised_columns(self, steps: Transitions) -> Array:
         """Normalised [x; u; s] (n + m + q, K) of K transitions in recorded units."""
@@ -157,43 +173,26 @@ class Envelope(Elements):
             return np.repeat(own[:, None], z.shape[1], axis=1)
         return np.asarray(blended(own, *self.schedule.corners(z[self.scheduling_positions])))
 
-    def judge_of(self, margin: float, counted: NDArray[np.bool_]) -> Judge:
-        """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count."""
-        law = None if self.residuals is None else self.residuals.law
-        return self._judge(self.tables, margin, counted, None if law is None else law.tables[0])
+    def judge_of(self, margin: float, counted: NDArray[np.bool_], run: bool = False) -> Judge:
+        """What judges one transition after another, as `bounds` does; `counted` (n,): states whose violations count.
 
-    def _judge(
-        self,
-        elements: tuple[Array, Array, Array],
-        margin: float,
-        counted: NDArray[np.bool_],
-        law: Array | None = None,
-    ) -> Judge:
+        `run`: by the elements that are run over the windows of the horizons.
+        """
+        elements = self.run if run and self.run is not None else self
+        law = None if run or self.residuals is None else self.residuals.law
         point, domain = self.operating_point, self.domain
         return Judge(
-            *elements,
-            point.steady,
-            point.scale,
-            domain.least,
-            domain.greatest,
-            margin,
-            counted,
-            None if domain.measure is None else domain.measure.occupied,
-            self.schedule,
-            self.scheduling_positions,
-            [data.known for data in self.block_data],
-            law,
-        )
-
-    def _runner(self) -> Judge:
-        """Of the elements that are run over the windows of the horizons."""
-        return self._judge(self.tables if self.run is None else self.run.tables, 1.0, np.ones(self.n, dtype=bool))
+            *elements.tables, point.steady, point.scale, domain.least, domain.greatest, margin, counted,
+            None if domain.measure is None else domain.measure.occupied, self.schedule, self.scheduling_positions,
+            [data.known for data in self.block_data], None if law is None else law.tables[0],
+        )  # fmt: skip
 
     def runs_of(self, judge: Judge) -> Runs | None:
         """What judges the state several steps after a measured one, as `over_horizons` does, if there are any."""
         if not self.horizons:
             return None
-        return Runs(judge, self.horizons, None if self.run is None else self._runner())
+        every = np.ones(self.n, dtype=bool)
+        return Runs(judge, self.horizons, None if self.run is None else self.judge_of(1.0, every, run=True))
 
     def windows(self, k: NDArray[np.intp], z: Array, dt: Array, steps: Sequence[int]) -> Iterator[Windows]:
         """What is run, over so many transitions in a row, of each length; good until the next one is asked for.
@@ -204,13 +203,12 @@ class Envelope(Elements):
         vectors, n, rows, count = z[self.scheduling_positions], self.n, self.n + self.m, len(dt)
         begin = unbroken_over(k, vectors, self.schedule)
         runs = np.concatenate([z[:n], np.zeros((self.m + 1, count))])
-        runner, edges = self._runner(), np.linspace(0, count, core_count() + 1).astype(int).tolist()
-        done = 0
+        runner = self.judge_of(1.0, np.ones(n, dtype=bool), run=True)
+        edges = np.linspace(0, count, core_count() + 1).astype(int).tolist()
         kept: Array | None = None
-        for length in steps:
+        for done, length in itertools.pairwise([0, *steps]):
             tasks = [(runs, z, dt, done, length, *part) for part in itertools.pairwise(edges)]
             on_cores(runner.advance, tasks, count * (length - done) > WORTH_THREADS)
-            done = length
             start = np.arange(count - length + 1)
             whole = begin[start + (length - 1)] <= start
             run, control, time = runs[:n], runs[n:rows], runs[rows]

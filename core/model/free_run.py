@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import ModelError, refuse_other
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import blended
-from uncertain_lti.sampling.transient import Transient, controls_as
+from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Recalled
 
 LONGEST_RECURSION = 400
@@ -88,14 +88,7 @@ def run_over(model: Any, transient: Transient) -> Array:
 
     Returns (N+1, n): normalised; NaN where there is no run.
     """
-    refuse_other(transient, Transient, "the recording", "give a Transient", ModelError)
-    transient = controls_as(transient.scheduled_on([s.name for s in model.signals.scheduling]), model.signals.controls)
-    given = transient.x.shape[1], transient.u.shape[1], transient.s.shape[1]
-    if given != (model.n, model.m, model.q):
-        raise ModelError(
-            f"{transient.name}: it has {given[0]} states, {given[1]} controls and {given[2]} further scheduling "
-            f"signals, and the model has {model.n}, {model.m} and {model.q}; read it with the signals of the model"
-        )
+    transient = model.own_signals_of(transient)
     x = model.operating_point.normalise_x(transient.x)
     u = model.operating_point.normalise_u(transient.u)
     s = model.operating_point.normalise_s(transient.s)

@@ -33,7 +33,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.schedule import Schedule
-from uncertain_lti.model.terms import Elements, blocks_of, checked, object_of
+from uncertain_lti.model.terms import Elements, blocks_of, checked, is_whole, object_of
 
 Widths = Literal["growing", "constant"]
 """Half-widths that grow with |x| and |u|, or are the same everywhere."""
@@ -135,9 +135,9 @@ class Residuals:
     ) -> None:
         self.relative, self.law, self.other = relative, law, other
         self.mean = checked(mean, "residuals.mean", None)
-        n = len(self.mean) if self.mean.ndim == 1 else 0
-        if self.mean.ndim != 1 or n == 0:
+        if self.mean.ndim != 1 or not self.mean.size:
             raise ModelError(f"residuals.mean has shape {self.mean.shape}; it must have one number per state")
+        n = len(self.mean)
         if law is not None and relative:
             raise ModelError("residuals.relative is true, and there is a law; the utilisation has none")
         self.covariance = checked(covariance, "residuals.covariance", (n, n))
@@ -164,9 +164,7 @@ class Residuals:
 
     def alike(self, form: Residuals) -> Residuals | None:
         """That of the forms which is as another is, with the rest of them; None if neither is."""
-        if self.form == form.form:
-            return self
-        return self.other if self.other is not None and self.other.form == form.form else None
+        return next((one for one in self.forms if one.form == form.form), None)
 
     @property
     def form(self) -> tuple[bool, bool]:
@@ -242,7 +240,7 @@ class Horizon(Elements):
         widths: Widths = "growing",
         residuals: Residuals | None = None,
     ) -> None:
-        if isinstance(steps, bool) or not isinstance(steps, int) or not 2 <= steps <= MOST_STEPS:
+        if not (is_whole(steps) and 2 <= steps <= MOST_STEPS):
             raise ModelError(f"horizons: steps is {steps!r}; it must be a whole number, 2 to {MOST_STEPS}")
         if widths not in get_args(Widths):
             raise ModelError(f"horizon of {steps} steps: widths is {widths!r}; it must be growing or constant")
@@ -275,16 +273,11 @@ class Horizon(Elements):
         found = []
         for i, entry in enumerate(data):
             here = f"horizons[{i}]"
-            object_of(entry, here, ("blocks", "residuals", "steps", "widths"), ("steps", "blocks"))
-            residuals = entry.get("residuals")
-            found.append(
-                cls(
-                    entry["steps"],
-                    **blocks_of(entry["blocks"], f"{here}.blocks", n, m, blocks),
-                    widths=entry.get("widths", "growing"),
-                    residuals=None if residuals is None else Residuals.from_dict(residuals, f"{here}.residuals"),
-                )
-            )
+            given = object_of(entry, here, ("blocks", "residuals", "steps", "widths"), ("steps", "blocks"))
+            given |= blocks_of(given.pop("blocks"), f"{here}.blocks", n, m, blocks)
+            if given.get("residuals") is not None:
+                given["residuals"] = Residuals.from_dict(given["residuals"], f"{here}.residuals")
+            found.append(cls(**given))
         return tuple(found)
 
 

@@ -33,7 +33,6 @@ from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 DISTURBANCE = "disturbance"
 """Name of the input, to be held at 1, that carries c of a model in a state-space system; `drift` in older ones."""
-_VECTORS = tuple(name for name in ARRAYS if SHAPES[name].regressor == "1")
 
 
 def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot: int | None = None) -> Any:
@@ -75,9 +74,8 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot
         raise ModelError(f"knot is {knot}, and the model has no schedule; leave it out")
     if knot is not None and not 0 <= knot < len(model.blocks):
         raise ModelError(f"knot is {knot}; the model has blocks 0 to {len(model.blocks) - 1}")
-    systems = [
-        _system(block, dt, recorded, offset) for block in (model.blocks if knot is None else [model.blocks[knot]])
-    ]
+    blocks = model.blocks if knot is None else [model.blocks[knot]]
+    systems = [_system(block, dt, recorded, offset) for block in blocks]
     return systems if model.schedule is not None and knot is None else systems[0]
 
 
@@ -146,8 +144,7 @@ def from_control(
     """
     A, B = np.array(system.A, dtype=np.float64), np.array(system.B, dtype=np.float64)
     n = len(A)
-    C, D = np.array(system.C), np.array(system.D)
-    if C.shape != (n, n) or not np.array_equal(C, np.eye(n)) or D.any():
+    if not np.array_equal(system.C, np.eye(n)) or np.any(system.D):
         raise ModelError("the system's outputs are not its states; give one with C = I and D = 0")
     if system.dt is True or system.dt is None:
         raise ModelError("the system does not say its step; give it a dt in seconds, or 0 for continuous time")
@@ -173,10 +170,8 @@ def from_control(
                 f"{B.shape[1]}"
             )
         A, B, c = A * X / X[:, None], B * U / X[:, None], c / X
-    zero = np.zeros
-    return model_class(
-        A, B, zero(A.shape) if dA is None else dA, zero(B.shape) if dB is None else dB, c, dc, v, signals=signals
-    )
+    dA, dB = np.zeros(A.shape) if dA is None else dA, np.zeros(B.shape) if dB is None else dB
+    return model_class(A, B, dA, dB, c, dc, v, signals=signals)
 
 
 def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
@@ -207,16 +202,15 @@ def save_mat(model: Any, path: str | os.PathLike[str]) -> None:
     # first, so that a file that was cut has nothing, or everything
     data: dict[str, Any] = {"model_json": json.dumps(model.to_dict())}
     if model.schedule is None:
-        data |= {name: np.atleast_2d(getattr(model, name)) for name in ARRAYS}
-        for name in _VECTORS:
-            data[name] = data[name].T
+        data |= {name: array if array.ndim > 1 else array[:, None] for name, array in model.arrays.items()}
     else:
-        data |= {name: np.moveaxis(getattr(model, name), 0, -1) for name in ARRAYS}
-        data |= _schedule_variables(model)
-    for name, values in (("x_steady", point.x_s), ("x_scale", point.X), ("u_steady", point.u_s), ("u_scale", point.U)):
-        data[name] = values[:, None]
-    for name, group in (("state", model.signals.states), ("control", model.signals.controls)):
+        data |= {name: np.moveaxis(array, 0, -1) for name, array in model.arrays.items()} | _schedule_variables(model)
+    groups = [("state", "x", model.signals.states), ("control", "u", model.signals.controls)]
+    groups += [("scheduling", "s", model.signals.scheduling)] if model.schedule is not None else []
+    for name, letter, group in groups:
         data |= {f"{name}_names": _cells([s.name for s in group]), f"{name}_units": _cells([s.unit for s in group])}
+        data[f"{letter}_steady"] = getattr(point, f"{letter}_s")[:, None]
+        data[f"{letter}_scale"] = getattr(point, letter.upper())[:, None]
     for name, step in (("dt", sampling.dt_median), ("dt_min", sampling.dt_min), ("dt_max", sampling.dt_max)):
         data[name] = math.nan if step is None else step
     with written(path, ModelError) as stream:
@@ -233,9 +227,8 @@ def _cells(values: Sequence[Any]) -> NDArray[np.object_]:
 
 def _schedule_variables(model: Any) -> dict[str, Any]:
     """Variables of a scheduled model other than its arrays."""
-    point, schedule = model.operating_point, model.schedule
+    schedule, facts = model.schedule, model.block_data
     values = schedule.recorded_values(model.signals.signals)
-    facts = model.block_data
     return {
         "schedule_signals": _cells([axis.signal for axis in schedule.axes]),
         "schedule_kinds": _cells(["knots" if axis.knots else "modes" for axis in schedule.axes]),
@@ -243,10 +236,6 @@ def _schedule_variables(model: Any) -> dict[str, Any]:
         "schedule_blocks": np.array(schedule.indices, dtype=np.float64) + 1.0,
         "transitions": np.array([[math.nan if f.transitions is None else f.transitions] for f in facts]),
         "tied_to": np.array([[0.0 if f.tied_to is None else f.tied_to + 1.0] for f in facts]),
-        "scheduling_names": _cells([s.name for s in model.signals.scheduling]),
-        "scheduling_units": _cells([s.unit for s in model.signals.scheduling]),
-        "s_steady": point.s_s[:, None],
-        "s_scale": point.S[:, None],
     }
 
 
@@ -354,12 +343,11 @@ def _named(data: dict[str, Any], n: int, m: int, blocks: int | None) -> dict[str
     whole |= {"states": _signals(data, "state", "x", n), "controls": _signals(data, "control", "u", m)}
     if blocks is None:
         return whole
-    columns = [
-        _column(data, *of, "block") for of in (("transitions", [math.nan] * blocks), ("tied_to", [0.0] * blocks))
-    ]
+    counts = _column(data, "transitions", [math.nan] * blocks, "block")
+    tied_to = _column(data, "tied_to", [0.0] * blocks, "block")
     facts = [
         {"transitions": None if math.isnan(count) else int(count), "tied_to": int(tied) - 1 if tied else None}
-        for count, tied in zip(*columns, strict=True)
+        for count, tied in zip(counts, tied_to, strict=True)
     ]
     scheduling = _signals(data, "scheduling", "s", len(_texts(data.get("scheduling_names", []))))
     return whole | {"blocks": facts} | ({"scheduling": scheduling} if scheduling else {})
@@ -374,7 +362,7 @@ def _schedule(model: Any, kinds: Sequence[str], knots: Sequence[Array]) -> Sched
         at = normalised(there, point.steady[i], point.scale[i])
         if len(there) == len(had):
             at = np.where(there == had, axis.values, at)
-        axes.append(Axis(axis.signal, **{kind: tuple(at.tolist())}))
+        axes.append(Axis(axis.signal, **{kind: at}))
     return Schedule(tuple(axes))
 
 
@@ -396,14 +384,14 @@ def _texts(value: Any) -> list[str]:
 
 
 def _signals(data: dict[str, Any], kind: str, letter: str, count: int) -> list[dict[str, Any]]:
-    columns = {
-        "name": _column(data, f"{kind}_names", [f"{letter}{i + 1}" for i in range(count)], kind, _texts),
-        "unit": _column(data, f"{kind}_units", [""] * count, kind, _texts),
-        "steady": _column(data, f"{letter}_steady", [0.0] * count, kind),
-        "scale": _column(data, f"{letter}_scale", [1.0] * count, kind),
-    }
-    rows = zip(*columns.values(), strict=True)
-    return [{"topic": "", "field": letter} | dict(zip(columns, row, strict=True)) for row in rows]
+    columns = (
+        _column(data, f"{kind}_names", [f"{letter}{i + 1}" for i in range(count)], kind, _texts),
+        _column(data, f"{kind}_units", [""] * count, kind, _texts),
+        _column(data, f"{letter}_steady", [0.0] * count, kind),
+        _column(data, f"{letter}_scale", [1.0] * count, kind),
+    )
+    keys = "topic", "field", "name", "unit", "steady", "scale"
+    return [dict(zip(keys, ("", letter, *row), strict=True)) for row in zip(*columns, strict=True)]
 
 
 def _column(

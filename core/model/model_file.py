@@ -29,7 +29,7 @@ from uncertain_lti.model.horizon import Horizon, Residuals, Run
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import BlockData, Schedule
 from uncertain_lti.model.signature import Signature
-from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, object_of
+from uncertain_lti.model.terms import ARRAYS, REQUIRED, blocks_of, checked, is_number, is_whole, object_of
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.signals.values import TableLayout
 
@@ -70,6 +70,7 @@ def structure(model: Any) -> dict[str, Any]:
         "table": _dict(signals.table),
     }
     box = {name: getattr(domain, name).tolist() for name in ("x_min", "x_max", "u_min", "u_max")}
+    found = {"measure": _dict(domain.measure), "step_max": finite_data(domain.step_max), "anywhere": domain.anywhere}
     whole = {
         "format": FORMATS[0],
         "states": [_signal(s, _STATE) for s in signals.states],
@@ -79,14 +80,7 @@ def structure(model: Any) -> dict[str, Any]:
         "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
         "run": _dict(model.run),
         "domain": {name: [v if math.isfinite(v) else None for v in limits] for name, limits in box.items()}
-        | _known(
-            {
-                "measure": _dict(domain.measure),
-                "step_max": finite_data(domain.step_max),
-                "anywhere": domain.anywhere,
-            },
-            _OF_DOMAIN,
-        ),
+        | _known(found, _OF_DOMAIN),
         "residuals": _dict(model.residuals),
         "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
         if model.alarm == (rule,)
@@ -163,10 +157,6 @@ def arguments(data: Any, source: str) -> dict[str, Any]:
         time=time,
         table=TableLayout.from_dict(said["table"], "sampling.table") if "table" in said else None,
     )
-    for signal in signals.signals:
-        for key in ("steady", "scale"):
-            if getattr(signal, key) == "auto":
-                raise ModelError(f"{key} of '{signal.name}' is auto; a model file holds numbers")
     n, m = len(signals.states), len(signals.controls)
     arrays, regime_data = _blocks(data, n, m) if scheduled else ({name: data.get(name) for name in ARRAYS}, {})
     if not scheduled:
@@ -198,7 +188,7 @@ def _domain(data: Any, n: int, m: int, newer: bool) -> Domain:
     limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
     measure, step_max, anywhere = (box.get(name) for name in _OF_DOMAIN)
     if anywhere is not None and not (
-        isinstance(anywhere, list) and len(anywhere) == n + m and all(isinstance(each, bool) for each in anywhere)
+        isinstance(anywhere, list) and [type(each) for each in anywhere] == [bool] * (n + m)
     ):
         raise ModelError(f"field 'domain.anywhere' must be a list of {n + m} of true and false")
     if step_max is not None and ((step_max := checked(step_max, "domain.step_max", (n,))) < 0.0).any():
@@ -225,7 +215,7 @@ def _blocks(data: dict[str, Any], n: int, m: int) -> tuple[dict[str, Any], dict[
     for r, block in enumerate(data["blocks"]):
         for name, most in (("transitions", math.inf), ("tied_to", schedule.blocks - 1)):
             value = block.get(name)
-            if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most):
+            if value is not None and not (is_whole(value) and 0 <= value <= most):
                 raise ModelError(f"field 'blocks[{r}].{name}' is {reprlib.repr(value)}; it must be a whole number")
         facts.append(BlockData(block.get("transitions"), block.get("tied_to")))
     return arrays, {"schedule": schedule, "block_data": facts}
@@ -250,10 +240,8 @@ def read(path: str | os.PathLike[str]) -> Any:
     if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
         raise ModelError(f"{path}: is no regular file (a pipe or a device), and a model file is one; check the path")
     if (kind := kind_of(path)) and kind != "a model file":
-        cure = {
-            "a folder": "name the file in it",
-            "a signals file": "write a model with `uncertain-lti fit`",
-        }.get(kind, "are the arguments swapped?")
+        cures = {"a folder": "name the file in it", "a signals file": "write a model with `uncertain-lti fit`"}
+        cure = cures.get(kind, "are the arguments swapped?")
         raise ModelError(f"{path}: this is {kind}, and a model file is wanted here; {cure}")
     try:
         if os.path.getsize(path) > MAX_FILE_BYTES:
@@ -292,10 +280,7 @@ def _positive(value: Any, name: str, zero: bool = False) -> float | None:
     """A number of seconds that is positive, or not negative where zero is allowed; None for null."""
     if value is None:
         return None
-    try:
-        number = math.nan if isinstance(value, bool) or not isinstance(value, (int, float)) else float(value)
-    except OverflowError:
-        number = math.nan
+    number = float(value) if is_number(value) else math.nan
     if not (0.0 < number <= LONGEST_S or (zero and number == 0.0)):
         limit = f", at most {LONGEST_S:g}" if number > LONGEST_S else ""
         raise ModelError(f"field '{name}' is {reprlib.repr(value)}; it must be a positive number{limit}")

@@ -45,18 +45,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.kernel.arithmetic import (
-    BY_ACTIVITY,
-    BY_NOISE,
-    BY_RUN,
-    BY_SUM,
-    FLAGS,
-    LONGER,
-    UTILISATION,
-    Repeating,
-    changes,
-    edges,
-)
+from uncertain_lti.kernel import arithmetic as kernel
 from uncertain_lti.model.terms import checked, object_of
 
 _KEYS = ("longest_repeat_s", "largest_run", "largest_sum", "active_beyond", "noisy_steps")
@@ -98,6 +87,7 @@ class Repeats:
         The shapes do not fit one another, or a number is negative or not finite.
     """
 
+    longest_repeat_s: Array
     largest_run: Array
     largest_sum: Array
     active_beyond: Array
@@ -111,19 +101,17 @@ class Repeats:
         active_beyond: ArrayLike | None = None,
         noisy_steps: ArrayLike | None = None,
     ) -> None:
-        self.longest_repeat_s = checked(longest_repeat_s, "frozen.longest_repeat_s", None)
-        if self.longest_repeat_s.ndim != 1:
+        longest = checked(longest_repeat_s, "frozen.longest_repeat_s", None)
+        if longest.ndim != 1:
             raise ModelError("field 'frozen.longest_repeat_s' must be a list with one number per state")
-        shape = self.longest_repeat_s.shape
-        given = zip(_KEYS[1:], (largest_run, largest_sum, active_beyond, noisy_steps), strict=True)
-        for name, values in given:
-            unknown = np.full(shape, 0.0 if name == "noisy_steps" else np.inf)
-            setattr(self, name, unknown if values is None else checked(values, f"frozen.{name}", shape))
-        for name in _KEYS:
-            array = getattr(self, name)
-            array.flags.writeable = False
+        given = longest, largest_run, largest_sum, active_beyond, noisy_steps
+        for name, values in zip(_KEYS, given, strict=True):
+            unknown = np.full(longest.shape, 0.0 if name == "noisy_steps" else np.inf)
+            array = unknown if values is None else checked(values, f"frozen.{name}", longest.shape)
             if (array < 0).any():
                 raise ModelError(f"field 'frozen.{name}' holds a negative number")
+            array.flags.writeable = False
+            setattr(self, name, array)
 
     def __repr__(self) -> str:
         return f"Repeats(longest {', '.join(f'{s:.3g} s' for s in self.longest_repeat_s)})"
@@ -164,13 +152,19 @@ class Repeats:
 class Moved(NamedTuple):
     """One repeat so far.
 
-    `state`: number of the state; `seconds`: since the last fresh sample, s; `why`: why it is frozen, in words; empty
-    for a state that is not.
+    `state`: number of the state; `seconds`: since the last fresh sample, s; `longest`: the longest of the fit, s;
+    `why`: why it is frozen, in words; empty for a state that is not.
     """
 
     state: int
     seconds: float
+    longest: float
     why: str = ""
+
+    @property
+    def words(self) -> str:
+        """What is said of it, after the name of the state."""
+        return repeat_words(self.seconds, self.longest) + f", {self.why}" * bool(self.why)
 
 
 Followed = tuple[NDArray[np.bool_], NDArray[np.int64], Array, Array, Array, Array, Array, Array, NDArray[np.bool_]]
@@ -191,7 +185,7 @@ def followed(
     on = np.append(False, np.diff(at) == 1)[: len(at)]
     with np.errstate(over="ignore", invalid="ignore"):
         centre, half = model.columns_centre_and_half(z, steps.dt)
-        lower, upper = (model.operating_point.recorded_x(bound.T) for bound in edges(centre, half, margin))
+        lower, upper = (model.operating_point.recorded_x(bound.T) for bound in kernel.edges(centre, half, margin))
     outside = model.domain.beyond(z) | model.unknown(z)
     return at, (on, t_ns[at + 1], steps.dt, steps.x, steps.x_next, lower, upper, model.own_rates(z).T, outside)
 
@@ -215,8 +209,8 @@ def repeats_in(model: Any, transient: Any) -> Found:
     """What one recording has of them."""
     steps = transient.transitions()
     windows, noisy = _activity(model, transient, steps)
-    some, largest = changes(transient.x, steps.k)
-    follow = Repeating(np.full((model.n, 7), np.inf), LEAST, REST_S, [False] * model.n, 1.0)
+    some, largest = kernel.changes(transient.x, steps.k)
+    follow = kernel.Repeating(np.full((model.n, 7), np.inf), LEAST, REST_S, [False] * model.n, 1.0)
     if some.any():
         follow.take_all(*followed(model, transient.t_ns, steps, some, 1.0)[1])
     most = follow.most
@@ -235,7 +229,10 @@ def together(n: int, found: Sequence[Found]) -> Repeats:
     """What recordings have of exact repeats, from what each of them has."""
     longest, run, total, active = np.max([np.zeros((4, n)), *(one.most for one in found)], axis=0)
     windows = np.concatenate([np.zeros((0, n)), *(one.windows for one in found)])
-    usual = _usual(windows, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2))
+    known = [column[~np.isnan(column)] for column in windows.T]
+    each = zip(known, np.where(longest < WINDOW_S, ACTIVE, ACTIVE / 2), strict=True)
+    # a half-width where there are few
+    usual = np.array([np.quantile(some, share) if len(some) >= WINDOWS else 1.0 for some, share in each])
     noisy = np.array([np.zeros(n), *(one.noisy for one in found)])
     beyond = np.maximum(usual, MORE_ACTIVE * active)
     run, total, beyond = (np.minimum(values, LARGEST) for values in (run, total, beyond))  # JSON has no infinity
@@ -278,15 +275,6 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
         activity[(2 * repeats >= counts[:, None]) | ~np.isfinite(activity)] = np.nan
         found.append(activity[whole])
     return np.concatenate([np.zeros((0, model.n)), *found]), np.maximum(noisy, -1.0)
-
-
-def _usual(windows: Array, shares: Array) -> Array:
-    """Of each column what this share of its numbers is below; a half-width at least where they are few."""
-    found = np.full(windows.shape[1], np.inf)
-    for i, (column, share) in enumerate(zip(windows.T, shares, strict=True)):
-        known = column[~np.isnan(column)]
-        found[i] = np.quantile(known, share) if len(known) >= WINDOWS else 1.0
-    return found
 
 
 FARTHER = 2.0
@@ -348,7 +336,7 @@ class FrozenWatch:
         noisy = np.where(longest == 0.0, repeats.noisy_steps, 0.0)
         by_noise = np.where(noisy >= NOISY, USUAL_S, np.inf), np.where(noisy >= SLOW_NOISY, SLOW_S, np.inf)
         thresholds = np.vstack([usual, longest, np.where(beyond < LARGEST, beyond, np.inf), *by_noise]).T
-        self._follow = Repeating(thresholds, LEAST, max(REST_S, REST * dt), counted, margin)
+        self._follow = kernel.Repeating(thresholds, LEAST, max(REST_S, REST * dt), counted, margin)
         self.forget()
 
     def forget(self) -> None:
@@ -358,12 +346,7 @@ class FrozenWatch:
         self._on = False  # something repeats
 
     def look(
-        self,
-        t_ns: int,
-        dt: float,
-        before: Sequence[float],
-        after: Sequence[float],
-        bounds: Callable[[], Bounds],
+        self, t_ns: int, dt: float, before: Sequence[float], after: Sequence[float], bounds: Callable[[], Bounds]
     ) -> Looked:
         """Take one transition."""
         if not any(map(eq, before, after)):
@@ -373,19 +356,17 @@ class FrozenWatch:
             self.forget()
             return Looked(withheld=withheld)
         self._on = True
-        each = [
-            (Moved(i, s, self._why(i, code, size)), code)
-            for i, s, code, size in self._follow.take(t_ns, dt, before, after, *bounds())
-        ]
-        frozen = tuple(moved for moved, code in each if code != LONGER)
-        now = {moved.state for moved in frozen}
+        longest, taken = self.repeats.longest_repeat_s, self._follow.take(t_ns, dt, before, after, *bounds())
+        moved = [Moved(i, s, longest[i], self._why(i, code, size)) for i, s, code, size in taken]
+        frozen = tuple(one for one in moved if one.why)
+        now = {one.state for one in frozen}
         withheld, self._frozen = self._rows(self._frozen | now), now
-        return Looked(frozen, withheld, tuple(moved for moved, code in each if code == LONGER))
+        return Looked(frozen, withheld, tuple(one for one in moved if not one.why))
 
     def look_all(self, given: Followed) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Callable[[int, int], str]]:
         """As `look`, many transitions: codes and rows withheld (K, n), and why a state is frozen after one of them."""
         codes, sizes = self._follow.take_all(*given)
-        frozen = codes > LONGER
+        frozen = codes > kernel.LONGER
         stale = frozen | (np.roll(frozen, 1, axis=0) & given[0][:, None])
         withheld = np.zeros(frozen.shape, dtype=bool)
         for j in np.flatnonzero(stale.any(axis=0)):
@@ -398,14 +379,14 @@ class FrozenWatch:
     def _why(self, i: int, code: int, size: float) -> str:
         """Why a state is frozen, in words; empty if it is not."""
         repeats = self.repeats
-        if code == BY_RUN:
+        if code == kernel.BY_RUN:
             return _moved("the model moves it", size, repeats.largest_run[i])
-        if code == BY_SUM:
+        if code == kernel.BY_SUM:
             return _moved("the model's steps add up", size, repeats.largest_sum[i])
-        if code == BY_ACTIVITY:
+        if code == kernel.BY_ACTIVITY:
             active = f"{size:.3g} half-widths, and beyond {repeats.active_beyond[i]:.3g} it always moved"
             return f"while the machine is active: its rate by the model changes by {active}"
-        if code == BY_NOISE:
+        if code == kernel.BY_NOISE:
             return f"while at constant controls noise changed it {repeats.noisy_steps[i]:.0f} times in the fit"
         return ""
 
@@ -441,9 +422,9 @@ class Partly:
     __slots__ = ("_values", "contained", "outside_domain", "unknown_regime", "violation")
 
     def __init__(self, judgement: Any, withheld: Sequence[int], counted: NDArray[np.bool_]) -> None:
-        self._values = np.array([judgement.numbers(kind) for kind in range(UTILISATION + 1)], dtype=np.float64)
+        self._values = np.array([judgement.numbers(kind) for kind in range(kernel.UTILISATION + 1)], dtype=np.float64)
         self._values[:, list(withheld)] = np.nan
-        left = self._values[FLAGS] == 1.0
+        left = self._values[kernel.FLAGS] == 1.0
         self.contained, self.violation = not left.any(), bool((left & counted).any())
         self.outside_domain, self.unknown_regime = judgement.outside_domain, judgement.unknown_regime
 
@@ -454,11 +435,6 @@ class Partly:
     def packed(self) -> bytes:
         """As of `Judgement`."""
         return self._values.tobytes()
-
-
-def frozen_words(name: str, moved: Moved, repeats: Repeats) -> str:
-    """What is said of a frozen state."""
-    return f"{name} {repeat_words(moved.seconds, repeats.longest_repeat_s[moved.state])}, {moved.why}"
 
 
 def repeat_words(seconds: float, longest: float) -> str:

@@ -199,12 +199,8 @@ class Schedule:
     def recorded_values(self, signals: Sequence[Signal]) -> list[Array]:
         """Knots or modes of each axis in recorded units."""
         named = {signal.name: signal for signal in signals}
-        return [
-            np.asarray(
-                recorded(np.array(axis.values), float(named[axis.signal].steady), float(named[axis.signal].scale))
-            )
-            for axis in self.axes
-        ]
+        each = [(np.array(axis.values), named[axis.signal]) for axis in self.axes]
+        return [np.asarray(recorded(values, float(of.steady), float(of.scale))) for values, of in each]
 
     def block_name(self, r: int, signals: Sequence[Signal]) -> str:
         """Where one block holds, in recorded units, such as `fan_speed = 0.92`."""
@@ -233,10 +229,10 @@ class Schedule:
             here = f"schedule[{i}]"
             if not isinstance(entry, dict) or not isinstance(entry.get("signal"), str):
                 raise ModelError(f"field '{here}' must be an object with 'signal' and 'knots' or 'modes'")
-            object_of(entry, here, known=("knots", "modes", "signal"))
-            values = {k: entry[k] for k in ("knots", "modes") if k in entry}
+            values = object_of(entry, here, known=("knots", "modes", "signal"))
+            signal = values.pop("signal")
             for key, value in values.items():
                 if not isinstance(value, list) or any(isinstance(v, (bool, str)) or v is None for v in value):
                     raise ModelError(f"field '{here}.{key}' must be a list of numbers")
-            axes.append(Axis(entry["signal"], **{k: tuple(v) for k, v in values.items()}))
+            axes.append(Axis(signal, **values))
         return cls(tuple(axes))

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
-from uncertain_lti.model.terms import checked
+from uncertain_lti.model.terms import checked, is_whole, object_of
 
 MOST_SIGNATURES = 256
 _KEYS = ("label", "recordings", "verdicts", "steps", "moments")
@@ -57,8 +57,8 @@ class Signature:
         self.label = label
         self.steps = tuple(steps)
         name = f"signatures[{label}]"
-        whole = [isinstance(v, int) and not isinstance(v, bool) for v in (*self.steps, recordings, verdicts)]
-        if not (all(whole) and self.steps and self.steps[0] >= 1 and recordings >= 1 and verdicts >= 0):
+        whole = all(map(is_whole, (*self.steps, recordings, verdicts)))
+        if not (whole and self.steps and self.steps[0] >= 1 and recordings >= 1 and verdicts >= 0):
             raise ModelError(f"field '{name}' must have whole numbers as steps, recordings and verdicts")
         if any(b <= a for a, b in zip(self.steps, self.steps[1:], strict=False)):
             raise ModelError(f"field '{name}.steps' must rise")
@@ -73,21 +73,17 @@ class Signature:
 
     def to_dict(self) -> dict[str, Any]:
         """As it is in a model file."""
-        return {name: getattr(self, name) for name in _KEYS[:3]} | {
-            "steps": list(self.steps),
-            "moments": self.moments.tolist(),
-        }
+        found = {name: getattr(self, name) for name in _KEYS}
+        return found | {"steps": list(self.steps), "moments": self.moments.tolist()}
 
     @classmethod
     def list_from(cls, data: Any) -> tuple[Signature, ...]:
         """From a model file."""
-        if not isinstance(data, list) or not all(isinstance(entry, Mapping) for entry in data):
+        if not isinstance(data, list):
             raise ModelError("field 'signatures' must be a list of objects")
-        for entry in data:
-            if set(entry) != set(_KEYS):
-                raise ModelError(f"an entry of 'signatures' must have {', '.join(_KEYS)}")
-            if not isinstance(entry["steps"], list):
-                raise ModelError("'steps' of an entry of 'signatures' must be a list")
+        for i, entry in enumerate(data):
+            if not isinstance(object_of(entry, f"signatures[{i}]", _KEYS, _KEYS)["steps"], list):
+                raise ModelError(f"field 'signatures[{i}].steps' must be a list")
         return tuple(cls(**entry) for entry in data)
 
 
@@ -104,10 +100,8 @@ def checked_signatures(signatures: Sequence[Signature], n: int) -> tuple[Signatu
 
 def closeness(a: Signature, b: Signature) -> float:
     """How alike two signatures are."""
-    common = [
-        (a.moments[i], b.moments[b.steps.index(h)])
-        for i, h in enumerate(a.steps)
-        if h in b.steps and a.moments[i].any() and b.moments[b.steps.index(h)].any()
-    ]
+    other = dict(zip(b.steps, b.moments, strict=True))
+    pairs = [(own, other[h]) for h, own in zip(a.steps, a.moments, strict=True) if h in other]
+    common = [(p, q) for p, q in pairs if p.any() and q.any()]
     cosines = [float(np.sum(p * q) / np.sqrt(np.sum(p * p) * np.sum(q * q))) for p, q in common]
     return sum(cosines) / len(cosines) if cosines else 0.0

@@ -19,6 +19,7 @@ Programmes, bounds, model file, monitor and reports take the terms from `TERMS`.
 
 from __future__ import annotations
 
+import math
 import reprlib
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -163,11 +164,8 @@ class Elements:
 
     def blocks_to_list(self, names: Sequence[str] = ARRAYS) -> list[dict[str, Any]]:
         """Of each block the arrays of these names, as they are in a model file."""
-        lead = self.A.ndim > 2
-        return [
-            {name: (getattr(self, name)[r] if lead else getattr(self, name)).tolist() for name in names}
-            for r in range(len(self.A) if lead else 1)
-        ]
+        blocks = range(len(self.A)) if self.A.ndim > 2 else [...]
+        return [{name: getattr(self, name)[r].tolist() for name in names} for r in blocks]
 
 
 def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_width: bool = False) -> Array:
@@ -189,6 +187,19 @@ def checked(value: ArrayLike, name: str, shape: tuple[int, ...] | None, half_wid
     if half_width and (array < 0).any():
         raise ModelError(f"field '{name}' holds a negative half-width")
     return array
+
+
+def is_whole(value: Any) -> bool:
+    """Whether it is a whole number, and no truth value."""
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a finite number, and no truth value."""
+    try:
+        return not isinstance(value, bool) and isinstance(value, (int, float)) and math.isfinite(value)
+    except OverflowError:
+        return False
 
 
 def _numbers_only(value: Any) -> bool:

@@ -23,19 +23,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import ModelError, SignalError
+from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
 from uncertain_lti.model import free_run as nominal
 from uncertain_lti.model import interchange
-from uncertain_lti.model.alarm_rule import (
-    JOINT,
-    AlarmRule,
-    Rule,
-    StatisticRule,
-    checked_rules,
-    with_containment,
-)
+from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, Rule, StatisticRule, checked_rules, with_containment
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.envelope import Envelope
 from uncertain_lti.model.horizon import Horizon, Residuals, Run, checked_horizons
@@ -151,11 +144,9 @@ class UncertainLTI(Envelope):
         if run is not None:
             self.fits(run, "run")
         if signals is None:
-            signals = SignalMap(
-                tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n)),
-                tuple(Signal(f"u{j + 1}", "", f"u{j + 1}") for j in range(m)),
-                source="model",
-            )
+            states = tuple(Signal(f"x{i + 1}", "", f"x{i + 1}") for i in range(n))
+            controls = tuple(Signal(f"u{j + 1}", "", f"u{j + 1}") for j in range(m))
+            signals = SignalMap(states, controls, source="model")
         if (len(signals.states), len(signals.controls)) != (n, m):
             raise ModelError(
                 f"{plural(len(signals.states), 'state')} and {plural(len(signals.controls), 'control')} are named for "
@@ -165,18 +156,17 @@ class UncertainLTI(Envelope):
         self.operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
         names = [s.name for s in signals.signals]
         self.scheduling_positions = list(schedule.positions(names)) if schedule is not None else []
-        for name in names[n + m :]:
-            if schedule is None or name not in [axis.signal for axis in schedule.axes]:
-                raise ModelError(f"scheduling signal '{name}' schedules nothing; leave it out")
-        self.block_data = tuple(block_data or (BlockData() for _ in range(lead[0] if lead else 1)))
-        if len(self.block_data) != (lead[0] if lead else 1):
-            raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(*lead or (1,), 'block')}")
+        if idle := sorted({*range(n + m, len(names))} - {*self.scheduling_positions}):
+            raise ModelError(f"scheduling signal '{names[idle[0]]}' schedules nothing; leave it out")
+        blocks = 1 if schedule is None else schedule.blocks
+        self.block_data = tuple(block_data or [BlockData()] * blocks)
+        if len(self.block_data) != blocks:
+            raise ModelError(f"{plural(len(self.block_data), 'block')} of data for {plural(blocks, 'block')}")
         self.sampling = sampling or Sampling()
-        unbounded = Domain(np.full(n, -np.inf), np.full(n, np.inf), np.full(m, -np.inf), np.full(m, np.inf))
-        self.domain = domain or unbounded
-        self.residuals = residuals
+        everywhere = np.full(n, np.inf), np.full(m, np.inf)
+        self.domain = domain or Domain(-everywhere[0], everywhere[0], -everywhere[1], everywhere[1])
+        self.residuals, self.repeats = residuals, repeats
         self.alarm = self._alarm(alarm, alarm_rule)
-        self.repeats = repeats
         self.signatures = checked_signatures(signatures, n)
         if repeats is not None and len(repeats.longest_repeat_s) != n:
             raise ModelError(f"field 'frozen' has {len(repeats.longest_repeat_s)} numbers for {plural(n, 'state')}")
@@ -243,9 +233,8 @@ class UncertainLTI(Envelope):
         """Each block as a model of its own, without a schedule; of a model without one, itself."""
         if self.schedule is None:
             return (self,)
-        return tuple(
-            self._unscheduled({name: getattr(self, name)[r] for name in ARRAYS}) for r in range(self.schedule.blocks)
-        )
+        each = [{name: array[r] for name, array in self.arrays.items()} for r in range(self.schedule.blocks)]
+        return tuple(map(self._unscheduled, each))
 
     def at(self, **values: float) -> UncertainLTI:
         """The uncertain linear model that holds at one point of the schedule.
@@ -274,23 +263,19 @@ class UncertainLTI(Envelope):
             raise ModelError(f"give a value of {' and of '.join(names)}, and nothing else")
         if odd := [name for name in names if not math.isfinite(values[name])]:
             raise ModelError(f"{odd[0]} is {values[odd[0]]}; give a finite number")
-        point = self.operating_point
-        recorded_values = np.zeros(len(point.steady))
-        recorded_values[self.scheduling_positions] = [values[name] for name in names]
-        if unlisted := self.why_unlisted(recorded_values.tolist()):
+        point, of_each = self.operating_point, self.signals.signals
+        sample = np.array([values.get(signal.name, 0.0) for signal in of_each])
+        if unlisted := self.why_unlisted(sample.tolist()):
             raise ModelError(f"{unlisted}; give one of them")
-        s = normalised(recorded_values, point.steady, point.scale)[self.scheduling_positions]
-        places, weights = self.schedule.corners(s[:, None])
-        return self._unscheduled({name: blended(getattr(self, name), places, weights)[..., 0] for name in ARRAYS})
+        s = normalised(sample, point.steady, point.scale)[self.scheduling_positions]
+        corners = self.schedule.corners(s[:, None])
+        return self._unscheduled({name: blended(a, *corners)[..., 0] for name, a in self.arrays.items()})
 
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
+        signals = replace(self.signals.scheduled_on(()), schedule=())
         return UncertainLTI(
-            **arrays,
-            signals=replace(self.signals.scheduled_on(()), schedule=()),
-            sampling=self.sampling,
-            domain=self.domain,
-            alarm_rule=self.alarm_rule,
+            **arrays, signals=signals, sampling=self.sampling, domain=self.domain, alarm_rule=self.alarm_rule
         )
 
     @property
@@ -304,14 +289,12 @@ class UncertainLTI(Envelope):
         return tuple(s.name for s in self.signals.controls)
 
     def __repr__(self) -> str:
-        text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; "
-        text += f"{plural(self.m, 'control')}"
-        if self.m:
-            text += f": {', '.join(self.control_names)}"
+        text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; {plural(self.m, 'control')}"
+        text += f": {', '.join(self.control_names)}" * bool(self.m)
         if self.schedule is not None:
             text += f"; {plural(self.schedule.blocks, 'block')} over {self.schedule.words}"
         if self.horizons:
-            text += f"; horizons of {', '.join(str(horizon.steps) for horizon in self.horizons)} steps"
+            text += f"; horizons of {', '.join(map(str, self.steps))} steps"
         if "criterion" in self.fit_summary:
             count = plural(self.fit_summary.get("transitions"), "transition")
             text += f"; fitted by {self.fit_summary['criterion']} to {count}"
@@ -347,10 +330,7 @@ class UncertainLTI(Envelope):
         ModelError
             Shapes do not fit.
         """
-        x = np.asarray(x, dtype=np.float64)
-        u = np.asarray(u, dtype=np.float64)
-        dt = np.asarray(dt, dtype=np.float64)
-        s = np.zeros(0) if s is None else np.asarray(s, dtype=np.float64)
+        x, u, dt, s = (np.asarray(a, dtype=np.float64) for a in (x, u, dt, np.zeros(0) if s is None else s))
         if x.shape[-1:] != (self.n,) or u.shape[-1:] != (self.m,):
             raise ModelError(f"x has shape {x.shape} and u {u.shape}; they must end in {self.n} and {self.m}")
         if s.shape[-1:] != (self.q,):
@@ -570,6 +550,6 @@ class UncertainLTI(Envelope):
             return cls(**arguments(data, source))
         except RecursionError:
             raise ModelError(f"{source}: is nested too deeply; is this a model file?") from None
-        except (ModelError, SignalError) as error:
+        except UncertainLTIError as error:
             text = str(error).removeprefix(source).removeprefix(": ")
             raise ModelError(f"{source}: {' '.join(text.split())}") from None  # names may hold line breaks

@@ -327,12 +327,12 @@ class Armed(NamedTuple):
     """Which samples of a recording may raise the alarm.
 
     `counts` (N+1,): whether the verdict on the sample counts; otherwise there is no alarm after it; `cleared` (N+1,):
-    whether the alarm starts over before the verdict on the sample; `asked`: samples that are judged, default all.
+    whether the alarm starts over before the verdict on the sample; `asked` (N+1,): whether the sample is judged.
     """
 
     counts: NDArray[np.bool_]
     cleared: NDArray[np.bool_]
-    asked: slice | None = None
+    asked: NDArray[np.bool_]
 
 
 class Arming:
@@ -346,11 +346,7 @@ class Arming:
 
     def __init__(self, condition: Condition | None, grace_ns: int, value: float | None = None) -> None:
         self.condition, self.value = condition, value
-        self.on: bool | None = None
-        if condition is None:
-            self.on = True
-        elif value is not None:
-            self.on = condition.holds(value)
+        self.on = condition is None or (None if value is None else condition.holds(value))
         self._grace = grace_ns
         self._from: int | None = None  # the first instant that counts
         self._counted = False  # whether the last instant did
@@ -388,10 +384,7 @@ class Arming:
         return self._counted
 
     def over(
-        self,
-        t_ns: NDArray[np.int64],
-        before: NDArray[np.intp] | Sequence[int] = (),
-        values: ArrayLike = (),
+        self, t_ns: NDArray[np.int64], before: NDArray[np.intp] | Sequence[int] = (), values: ArrayLike = ()
     ) -> Armed:
         """`learn` and `at` over the samples of a recording, as the live session calls them one after the other.
 
@@ -399,9 +392,9 @@ class Arming:
         decided before each value of the condition's field came, in order; `values` (K,): these values.
         """
         count = len(t_ns)
+        (counts, asked), cleared = np.ones((2, count), dtype=bool), np.zeros(count, dtype=bool)
         if self.condition is None and not self._grace:
-            return Armed(np.ones(count, dtype=bool), np.zeros(count, dtype=bool))
-        counts, cleared = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+            return Armed(counts, cleared, asked)
         arrived = zip(np.asarray(before).tolist(), np.asarray(values, dtype=np.float64).tolist(), strict=True)
         due, value = next(arrived, (count, 0.0))
         back, restarts = (marks.tolist() for marks in back_and_restarts(t_ns))
@@ -413,14 +406,14 @@ class Arming:
             if restarts[k]:
                 self.restart(int(t_ns[k - 1]))
             counts[k] = self.at(instant, back[k])
-        return Armed(counts, cleared | ~counts)
+        return Armed(counts, cleared | ~counts, asked)
 
     def why_off(self) -> str:
         """Why alarms do not count, in words; empty if they do."""
-        if self.on is None and self.value is not None and self.condition is not None:
-            return f"alarms are off: {self.condition.topic} comes without a number in {self.condition.field.text}"
-        if self.on is None:
-            return f"alarms are off: it is not known whether {self.condition}"
-        if not self.on:
+        if self.on or self.condition is None:
+            return ""
+        if self.on is not None:
             return f"alarms are off until {self.condition}"
-        return ""
+        if self.value is None:
+            return f"alarms are off: it is not known whether {self.condition}"
+        return f"alarms are off: {self.condition.topic} comes without a number in {self.condition.field.text}"

@@ -110,15 +110,11 @@ class DeployedMonitor:
         if count and not len(inside):
             raise ModelError(f"{transient.name}: no sample lies between the times asked for; it has {t[-1]:g} s")
         a, b = (int(inside[0]), int(inside[-1]) + 1) if count else (0, 0)
-        arming = Arming(self.condition, to_ns(self.grace))
-        came, heard = np.asarray(before, dtype=np.intp) - a, np.asarray(values, dtype=np.float64)
-        for value in heard[came < 0][-1:].tolist():
-            arming.learn(value)
-        later = came >= 0
-        armed = arming.over(transient.t_ns[a:b], came[later], heard[later])
+        came = np.maximum(np.asarray(before, dtype=np.intp) - a, 0)
+        armed = Arming(self.condition, to_ns(self.grace)).over(transient.t_ns[a:b], came, values)
         if (a, b) != (0, count):
             around = a, count - b
-            armed = Armed(np.pad(armed.counts, around), np.pad(armed.cleared, around), slice(a, b))
+            armed = Armed(*(np.pad(marks, around) for marks in armed))
         verdicts = self.monitor.check(transient, armed)
         if self.latch:
             verdicts = dataclasses.replace(verdicts, alarm=np.logical_or.accumulate(verdicts.alarm))
@@ -126,17 +122,16 @@ class DeployedMonitor:
 
     def words(self) -> str:
         """What differs from a monitor without conditions."""
-        said = [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
-        said += condition_words(self.condition, self.grace, self.latch)
-        said += [] if self.start is None else [f"from {self.start:g} s"]
-        said += [] if self.stop is None else [f"to {self.stop:g} s"]
+        said = conditions_in_words(self.monitor, self.condition, self.grace, self.latch)
+        said += [f"{name} {t:g} s" for name, t in (("from", self.start), ("to", self.stop)) if t is not None]
         return ", ".join(said)
 
 
-def condition_words(condition: Condition | None, grace: float, latch: bool) -> list[str]:
-    """When an alarm counts and how long it lasts, in words."""
-    said = {f"as long as {condition}": condition, f"grace {grace:g} s": grace, "latched": latch}
-    return [words for words, holds in said.items() if holds]
+def conditions_in_words(monitor: EnvelopeMonitor, condition: Condition | None, grace: float, latch: bool) -> list[str]:
+    """Which violations count for the alarm, and how long it lasts, in words."""
+    masked = ", ".join(monitor.masked)
+    said = {f"masked: {masked}": masked, f"as long as {condition}": condition, f"grace {grace:g} s": grace}
+    return [words for words, holds in (said | {"latched": latch}).items() if holds]
 
 
 class Days:

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
 from typing import Any
@@ -23,46 +24,25 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
-from uncertain_lti.base.text import plural
-from uncertain_lti.kernel.arithmetic import (
-    FLAGS,
-    JUDGED,
-    LEFT,
-    LONGER,
-    LOWER,
-    OUTSIDE,
-    REPEATS,
-    RESIDUAL,
-    UNKNOWN,
-    UNLISTED,
-    UPPER,
-    UTILISATION,
-    VIOLATION,
-    Judgement,
-    all_carried,
-)
+from uncertain_lti.kernel import arithmetic as kernel
+from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, all_carried
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, with_containment
 from uncertain_lti.model.operating_point import normalise_columns, normalised
 from uncertain_lti.model.repeats import Bounds, FrozenWatch, Partly, followed, needs
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Alarm, Armed, back_and_restarts, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Armed, Arming, back_and_restarts, steps_back
 from uncertain_lti.monitor.verdict import Foreseen, Verdict, Verdicts
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step, all_finite
-from uncertain_lti.sampling.transient import Transient, Transitions, controls_as
+from uncertain_lti.sampling.transient import Transient, Transitions
 
 
-def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed | None) -> list[tuple[int, int]]:
+def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed) -> list[tuple[int, int]]:
     """[start, stop) of samples over which the alarm goes on from a cleared one; others raise none."""
-    count = len(t_ns)
-    _, cleared = back_and_restarts(t_ns)
-    counts = np.ones(count, dtype=bool)
-    if armed is not None:
-        counts, cleared = armed.counts, cleared | armed.cleared
-    edges = np.flatnonzero(cleared | np.append(True, counts[1:] != counts[:-1])[:count])
-    if not count:
-        return []
-    return [(int(a), int(b)) for a, b in zip(edges, [*edges[1:], count], strict=True) if counts[a]]
+    counts, count = armed.counts, len(t_ns)
+    _, restarts = back_and_restarts(t_ns)
+    edges = np.flatnonzero(restarts | armed.cleared | np.append(True, counts[1:] != counts[:-1])[:count])
+    return [(a, b) for a, b in pairwise([*edges.tolist(), count]) if counts[a]]
 
 
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
@@ -115,7 +95,7 @@ class EnvelopeMonitor:
     masked: tuple[str, ...] = cython.declare(object, visibility="readonly")
     frozen_watch: FrozenWatch | None = cython.declare(object, visibility="readonly")
     _counted: Any
-    _every: Any
+
     _judge: Any
     _runs: Any
     _nothing: Any
@@ -140,14 +120,10 @@ class EnvelopeMonitor:
         if rules is not None:
             model = model.replace(alarm=rules)
         self.model = model
-        rule = model.alarm_rule
-        self.rule = AlarmRule(
-            rule.violations if violations is None else violations,
-            rule.window if window is None else window,
-            rule.margin if margin is None else margin,
-        )
-        other = (violations, window, margin) != (None, None, None)
-        every = with_containment(model.alarm, self.rule) if other else model.alarm
+        given: dict[str, Any] = {"violations": violations, "window": window, "margin": margin}
+        given = {name: value for name, value in given.items() if value is not None}
+        self.rule = replace(model.alarm_rule, **given)
+        every = with_containment(model.alarm, self.rule) if given else model.alarm
         names = model.state_names
         for name in masked:
             if name not in names:
@@ -156,7 +132,7 @@ class EnvelopeMonitor:
         if len(self.masked) == len(names):
             raise ModelError("every state of the model is masked; leave at least one that can raise the alarm")
         self._counted = np.array([name not in masked for name in names])
-        self._every = np.arange(model.n)
+
         self._judge = model.judge_of(self.rule.margin, self._counted)
         self.alarms = Alarm(every, model, self._counted)
         self._runs = model.runs_of(self._judge)
@@ -196,12 +172,6 @@ class EnvelopeMonitor:
             return None
         dt = self.model.sampling.dt_median or 0.0
         return FrozenWatch(self.model.repeats, self.rule.margin, self._counted.tolist(), needs(self.model), dt)
-
-    @cython.cfunc
-    def _forget_repeats(self) -> None:
-        self._frozen_alarm = False
-        if self.frozen_watch is not None:
-            self.frozen_watch.forget()
 
     def _bounds_of(self, step: Step, judgement: Judgement) -> Bounds:
         """What the watch asks for if a state repeats."""
@@ -253,7 +223,8 @@ class EnvelopeMonitor:
         Verdict
             Its `lower` and `upper` are the bounds.
         """
-        return self.look(Step(Status.OK, t_ns, 0, dt, z, z[: len(self._counted)]))
+        step = Step(Status.OK, t_ns, 0, dt, z, z[: len(self._counted)])
+        return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def foresee(self, t_ns: int, z: Sequence[float], dt: float) -> Foreseen | None:
         """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are.
@@ -276,21 +247,6 @@ class EnvelopeMonitor:
         if bounds is None or not all_finite(bounds):
             return None
         return Foreseen(t_ns + max(self.model.steps) * round(dt * 1e9), bounds)
-
-    def look(self, step: Step) -> Verdict:
-        """Verdict on a complete step, not counted for the alarm.
-
-        Parameters
-        ----------
-        step : Step
-            With a complete transition.
-
-        Returns
-        -------
-        Verdict
-            With the alarm as it was.
-        """
-        return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
     def steps_back(self, step: Step) -> bool:
         """Whether time steps back with a sample that `judge` has not taken yet.
@@ -358,12 +314,14 @@ class EnvelopeMonitor:
             looked = watch.look(step.t_ns, step.dt, step.before, step.after, bounds)
             self._frozen_alarm = armed and bool(looked.frozen)
             if withheld := looked.withheld:
-                if self._counted[np.delete(self._every, withheld)].any():
+                if np.delete(self._counted, withheld).any():
                     judgement = Partly(judgement, withheld, self._counted)
                 else:
                     judgement, status = None, Status.FROZEN
         elif judgement is None and not status.dropped:
-            self._forget_repeats()
+            self._frozen_alarm = False
+            if watch is not None:
+                watch.forget()
         longer = self._nothing
         if self._runs is not None:
             if judgement is not None and not withheld:
@@ -406,31 +364,16 @@ class EnvelopeMonitor:
         ModelError
             The transient has other numbers of states or controls than the model.
         """
-        instead = "read a recording with read_transients first, and give one after the other"
-        refuse_other(transient, Transient, "the recording", instead, ModelError)
         model, point = self.model, self.model.operating_point
-        transient = controls_as(transient, model.signals.controls)
-        if transient.x.shape[1] != model.n or transient.u.shape[1] != model.m:
-            raise ModelError(
-                f"{transient.name}: {plural(transient.x.shape[1], 'state')} and "
-                f"{plural(transient.u.shape[1], 'control')}, and the "
-                f"model has {model.n} and {model.m}"
-            )
-        transient = transient.scheduled_on([s.name for s in model.signals.scheduling])
-        if transient.s.shape[1] != model.q:
-            raise ModelError(
-                f"{transient.name}: {plural(transient.s.shape[1], 'further scheduling signal')}, and the model has "
-                f"{model.q}; read it with the signals of the model"
-            )
+        transient = model.own_signals_of(transient)
         step = None if isinstance(model.signals.step, str) else model.signals.step
         if transient.step != step:
             transient = transient.replace(step=step or "recorded")
         steps = transient.transitions()
-        count, n, asked = len(transient), model.n, None
-        if armed is not None and armed.asked is not None:
-            asked = np.zeros(count, dtype=bool)
-            asked[armed.asked] = True
-            steps = steps.take(asked[steps.k] & asked[steps.k + 1])
+        count, n = len(transient), model.n
+        armed = Arming(None, 0).over(transient.t_ns) if armed is None else armed
+        if not armed.asked.all():
+            steps = steps.take(armed.asked[steps.k] & armed.asked[steps.k + 1])
         fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)
         unfitted_step = np.zeros(count, dtype=bool)
         if not fitted.all():
@@ -439,7 +382,9 @@ class EnvelopeMonitor:
         marks = np.zeros(count, dtype=np.uint8)
         first = (RESIDUAL, UTILISATION) if self.alarms.needs_residual else (UTILISATION,)
         seen = self._numbers(transient, steps, first, marks)
-        judged, left, violated, unlisted_mode = ((marks & mark) > 0 for mark in (JUDGED, LEFT, VIOLATION, UNLISTED))
+        judged, left, violated, unlisted_mode = (
+            (marks & mark) > 0 for mark in (kernel.JUDGED, kernel.LEFT, kernel.VIOLATION, kernel.UNLISTED)
+        )
         if np.count_nonzero(judged) < len(steps.k):
             steps = steps.take(judged[steps.k + 1])
         frozen, withheld, repeating, why = self._look_all(transient, steps, marks)
@@ -447,7 +392,9 @@ class EnvelopeMonitor:
         if withheld.any():
             part = np.asarray(withheld.any(axis=1))
             rows = np.flatnonzero(part)
-            flags = np.asarray(self._numbers(transient, steps.take(part[steps.k + 1]), (FLAGS,))[FLAGS][rows] == 1.0)
+            flags = np.asarray(
+                self._numbers(transient, steps.take(part[steps.k + 1]), (kernel.FLAGS,))[kernel.FLAGS][rows] == 1.0
+            )
             judged &= ~withheld[:, self._counted].all(axis=1)
             flags &= ~withheld[rows] & judged[rows, None]
             left[rows], violated[rows] = flags.any(axis=1), (flags & self._counted).any(axis=1)
@@ -467,7 +414,7 @@ class EnvelopeMonitor:
             found = model.over_horizons(whole.k, model.normalised_columns(whole), whole.dt, x_next.T)
             for values, one in zip((longer, longer_residual), found, strict=True):
                 values[:, arrival] = one.transpose(1, 0, 2)
-        outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (OUTSIDE, UNKNOWN))
+        outside, unknown_regime = (judged & ((marks & mark) > 0) for mark in (kernel.OUTSIDE, kernel.UNKNOWN))
         each, dt = np.zeros((count, len(self.alarms.rules)), dtype=bool), np.zeros(count)
         dt[steps.k + 1] = steps.dt
         rows_of = [seen[UTILISATION], *longer, seen[RESIDUAL], *longer_residual]
@@ -483,11 +430,11 @@ class EnvelopeMonitor:
 
         alarm = over(each)
         if why:
-            alarm |= frozen.any(axis=1) & (True if armed is None else armed.counts)
+            alarm |= frozen.any(axis=1) & armed.counts
         return Verdicts(
             transient, numbers, seen[UTILISATION], judged, left, outside, alarm, unfitted_step, unlisted_mode,
             unknown_regime, frozen, withheld, repeating, statistics, each, self.alarms, longer.transpose(1, 0, 2),
-            longer_residual.transpose(1, 0, 2), why, asked, None if armed is None else armed.counts,
+            longer_residual.transpose(1, 0, 2), why, armed.asked, armed.counts,
         )  # fmt: skip
 
     def _look_all(
@@ -496,16 +443,12 @@ class EnvelopeMonitor:
         """`frozen`, `withheld`, `repeating`, `why_frozen` of `Verdicts`, by the watch of `judge`."""
         frozen, withheld, repeating = (np.zeros((len(transient), self.model.n), dtype=bool) for _ in range(3))
         why: dict[tuple[int, int], str] = {}
-        watch = self._watch()
-        if watch is None:
-            return frozen, withheld, repeating, why
-
-        some = steps.rows(marks, 1) & REPEATS > 0
-        if some.any():
+        watch, some = self._watch(), steps.rows(marks, 1) & kernel.REPEATS > 0
+        if watch is not None and some.any():
             at, given = followed(self.model, transient.t_ns, steps, some, self.rule.margin)
             codes, withheld[at + 1], because = watch.look_all(given)
-            frozen[at + 1], repeating[at + 1] = codes > LONGER, codes == LONGER
-            for row, state in np.argwhere(codes > LONGER).tolist():
+            frozen[at + 1], repeating[at + 1] = codes > kernel.LONGER, codes == kernel.LONGER
+            for row, state in np.argwhere(codes > kernel.LONGER).tolist():
                 why[int(at[row]) + 1, state] = because(row, state)
         return frozen, withheld, repeating, why
 

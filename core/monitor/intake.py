@@ -58,28 +58,6 @@ class _Way:
         self.name, self.send = name, publisher.send
         self.slow, self.tried, self.until = 0, -math.inf, -math.inf
 
-    @cython.cfunc
-    def is_slow(self, now: cython.double) -> cython.bint:
-        """Whether sending has been slow lately."""
-        return self.slow >= _PATIENCE and now - self.tried < _FORGET
-
-
-@cython.cclass
-class _Heard:
-    """Ways to the readers of vectors that somebody listens to, and what makes their messages of a verdict."""
-
-    ways: list[Any]
-    encoder: Encoder
-
-    def __init__(self, ways: Sequence[Any], encoder: Encoder) -> None:
-        self.ways, self.encoder = list(ways), encoder
-
-    @cython.cfunc
-    def lay_out(self, verdict: Any, ways: list[Any], messages: list[bytes]) -> None:
-        """Add the messages of a verdict, or of what is predicted, and the way that each goes."""
-        ways += self.ways
-        messages += self.encoder(verdict)
-
 
 @cython.cclass
 class Sender:
@@ -97,7 +75,9 @@ class Sender:
     _reason_sent: str = cython.declare(object)
     _doubted: cython.double  # until when what messages take is measured by the processor's time
     _known: cython.bint  # who listens; otherwise it must be found out
-    _given: Any  # None where nobody listens, for a message without a verdict, one with, and what is predicted
+    _given: (
+        Any  # of a message without a verdict: ways of what somebody listens to, and its encoder; None if nobody does
+    )
     _judged: Any
     _predicted: Any
     _foreseen: Any
@@ -111,7 +91,6 @@ class Sender:
         self._ways, self._doubted = {}, -math.inf
         self._known = self._alarm_heard = self._reason_heard = False
         self._reason_sent = ""
-        self._given = self._judged = self._predicted = self._foreseen = None
 
     def open(self, publishers: Mapping[str, Publisher]) -> None:
         """Send through other publishers from now on."""
@@ -127,10 +106,10 @@ class Sender:
         """There are more or fewer listeners, or nothing is sent for now; which ways are slow is found out again."""
         self._known, self._ways = False, {}
 
-    def _heard(self, *when: str) -> Any:
+    def _heard(self, *when: str) -> tuple[list[Any], Encoder] | None:
         outputs = self._messages.outputs
         names = [name for name in outputs if outputs[name].when in when and self._publishers[name].listeners]
-        return _Heard([self._ways[name] for name in names], self._messages.encoder(names)) if names else None
+        return ([self._ways[name] for name in names], self._messages.encoder(names)) if names else None
 
     def _listen(self) -> None:
         """Choose the vectors that somebody listens to, and lay out their messages."""
@@ -149,7 +128,6 @@ class Sender:
         A subscriber that stands still can make sending on its topics a hundred times slower, so that inputs would be
         lost. Then messages of these topics are held back as far as they would take too much of the processor.
         """
-        heard: _Heard
         if not self._known:
             self._listen()
         ways: list[Any] = []
@@ -159,24 +137,29 @@ class Sender:
             judged: cython.bint = verdict.judged
             heard = self._judged if judged else self._given
             if heard is not None:
-                heard.lay_out(verdict, ways, messages)
+                self._lay_out(heard, verdict, ways, messages)
             beats = beats or judged
         if beats and self._alarm_heard and not turned:
             self.alarm_sent = now
             ways.append(self._ways[VIOLATION.name])
             messages.append(TRUE if session.alarm else FALSE)
         if opened and self._predicted is not None and (expected := session.predict()) is not None:
-            heard = self._predicted
-            heard.lay_out(expected, ways, messages)
+            self._lay_out(self._predicted, expected, ways, messages)
         if opened and self._foreseen is not None and (foreseen := session.foresee()) is not None:
-            heard = self._foreseen
-            heard.lay_out(foreseen, ways, messages)
+            self._lay_out(self._foreseen, foreseen, ways, messages)
         if messages:
             self._send(ways, messages)
         if turned:
             self.send_alarm(session.alarm, now)
         if self._reason_heard and (beats or turned or "no verdict:" in session.reasons.text):
             self.send_reason(session.reasons.text)  # else it is that of an earlier sample: `Session.reason` has more
+
+    @cython.cfunc
+    def _lay_out(self, heard: tuple[list[Any], Any], verdict: Any, ways: list[Any], messages: list[bytes]) -> None:
+        """Add the messages of a verdict, or of what is predicted, and the way that each goes."""
+        to, encode = heard
+        ways += to
+        messages += encode(verdict)
 
     @cython.cfunc
     def _send(self, ways: list[Any], messages: list[bytes]) -> None:
@@ -224,11 +207,11 @@ class Sender:
 
     def slow_topics(self) -> list[str]:
         """Outputs whose messages are held back in part, as sending them takes too long."""
+        way: _Way
         now, found = time.monotonic(), []
         for way in self._ways.values():
-            known: _Way = way
-            if known.is_slow(now):
-                found.append(known.name)
+            if way.slow >= _PATIENCE and now - way.tried < _FORGET:
+                found.append(way.name)
         return found
 
     @property
@@ -292,7 +275,8 @@ class Intake:
             late = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
             messages = session.accept(topic, arrival_ns, data, now, sent_ns, late)
         except Exception as error:
-            self._note(session, topic, error)
+            self._failed(f"on a message of {topic}", error)
+            session.failed()
         else:
             self._take_all(session, messages, now)
 
@@ -313,12 +297,8 @@ class Intake:
             try:
                 self._take(session, topic, arrival_ns, data, now)
             except Exception as error:
-                self._note(session, topic, error)
-
-    @cython.cfunc
-    def _note(self, session: Any, topic: str, error: Exception) -> None:
-        self._failed(f"on a message of {topic}", error)
-        session.failed()
+                self._failed(f"on a message of {topic}", error)
+                session.failed()
 
     @cython.cfunc
     def _take(self, session: Any, topic: str, arrival_ns: int, data: bytes, now: float) -> None:

@@ -200,22 +200,19 @@ class Explainer:
         self.pattern: Pattern | None = None
         self._first: tuple[str, ...] = ()
 
-    def push(self, table: Array, lower: Array, upper: Array, quiet: int, outside: bool = False) -> bool:
+    def push(self, table: Array, lower: Array, upper: Array, quiet: int, outside: bool = False) -> None:
         """Take a verdict with an alarm.
 
         `table` (H, n): utilisation for one step and for each horizon; `lower, upper` (n,): bounds of one step, recorded
         units.
         """
-        begins = self.pattern is None or quiet > APART
-        if begins:
+        if self.pattern is None or quiet > APART:
             self.pattern = Pattern(self._steps, self._model.n)
             left = np.any(np.abs(table) > 1.0, axis=0).tolist()
             self._first = tuple(n for n, out in zip(self._model.state_names, left, strict=True) if out)
-        assert self.pattern is not None
         if self.pattern.verdicts < MOST:
             with np.errstate(over="ignore", invalid="ignore"):
                 self.pattern.add(table, (upper - lower) * self._per_width, outside)
-        return begins
 
     def likeness(self) -> Likeness | None:
         """What the alarm looks like."""

@@ -63,31 +63,22 @@ class Output:
 
 
 FLAGS = Output(
-    "flags",
-    VECTOR_TYPE,
-    "message",
+    "flags", VECTOR_TYPE, "message",
     "for every clock message: `position` 0 contained, 1 violated, NaN no verdict, per state; `velocity` 1: the sample "
     "before lies outside the fitted domain",
-    position="flags",
-    velocity="outside_domain",
-    view="steps",
-    title="0 contained, 1 violated",
-)
+    position="flags", velocity="outside_domain", view="steps", title="0 contained, 1 violated",
+)  # fmt: skip
 VIOLATION = Output(
-    "violation",
-    FLAG_TYPE,
-    "message",
+    "violation", FLAG_TYPE, "message",
     "the alarm: m of the last n verdicts violated; false also while nothing is known; every verdict, and at least "
     "every `heartbeat`, with a deadline offered",
     view="alarm",
-)
+)  # fmt: skip
 REASON = Output(
-    "reason",
-    TEXT_TYPE,
-    "changed",
+    "reason", TEXT_TYPE, "changed",
     "in words, which rule, state and horizon hold the alarm, or why there is no verdict; when it changes, and once to "
     "whoever subscribes later (transient local)",
-)
+)  # fmt: skip
 OUTPUTS = (
     FLAGS,
     VIOLATION,
@@ -95,53 +86,38 @@ OUTPUTS = (
     Output("upper", VECTOR_TYPE, "judged", "the upper bound that was judged", position="upper", view="bound"),
     Output("state", VECTOR_TYPE, "judged", "the sample that was judged", position="state", view="sample"),
     Output(
-        "utilisation",
-        VECTOR_TYPE,
-        "judged",
-        "where between its bounds each state lies, -1 to 1 inside",
-        position="utilisation",
-        view="states",
-        title="utilisation: -1 and 1 at the bounds",
+        "utilisation", VECTOR_TYPE, "judged", "where between its bounds each state lies, -1 to 1 inside",
+        position="utilisation", view="states", title="utilisation: -1 and 1 at the bounds",
         limits=(("upper bound", 1.0), ("lower bound", -1.0)),
     ),
     Output(
-        "horizon_utilisation",
-        VECTOR_TYPE,
-        "judged",
+        "horizon_utilisation", VECTOR_TYPE, "judged",
         "of a model with horizons, the utilisation after one step and after each number of steps; `name` is "
         "`state@steps`, NaN where fewer transitions follow one another",
-        position="horizon_utilisation",
-        of="horizons",
+        position="horizon_utilisation", of="horizons",
     ),
     Output(
-        "statistics",
-        VECTOR_TYPE,
-        "judged",
+        "statistics", VECTOR_TYPE, "judged",
         "of an alarm with statistics, each over its threshold: beyond 1 and -1 it raises the alarm; `name` is "
         "`kind/state`, `kind@steps/state` at a horizon, and `chi2/joint` of all states together",
-        position="statistics",
-        of="statistics",
+        position="statistics", of="statistics",
     ),
     REASON,
     Output(
-        "predicted_lower",
-        VECTOR_TYPE,
-        "predicted",
+        "predicted_lower", VECTOR_TYPE, "predicted",
         "on receipt of a sample, the lower bound one median step on, with the control known so far; only while "
         "somebody subscribes",
         position="lower",
     ),
     Output("predicted_upper", VECTOR_TYPE, "predicted", "the same for the upper bound", position="upper"),
     Output(
-        "horizon_predicted_lower",
-        VECTOR_TYPE,
-        "predicted over",
+        "horizon_predicted_lower", VECTOR_TYPE, "predicted over",
         "of a model with horizons, on receipt of a sample, the lower bound as many median steps on as the longest "
         "horizon has, if the controls known so far stay; only while somebody subscribes",
         position="lower",
     ),
     Output("horizon_predicted_upper", VECTOR_TYPE, "predicted over", "the same for the upper bound", position="upper"),
-)
+)  # fmt: skip
 """Every output, those of every clock message first."""
 
 RECORDED = tuple(output for output in OUTPUTS if not output.when.startswith("predicted"))
@@ -192,18 +168,15 @@ class NamedVector:
         body = bytearray(struct.pack("<iII", 0, 0, 1) + b"\x00")  # stamp, an empty frame_id
         _counted(body, len(names))
         for name in names:
-            try:
-                text = name.encode() + b"\x00"
-            except UnicodeEncodeError:
-                raise ModelError(f"signal {name!r} cannot be sent as text; rename it") from None
-            if b"\x00" in text[:-1]:
+            text = name.encode(errors="replace") + b"\x00"
+            if text[:-1].decode() != name or "\x00" in name:
                 raise ModelError(f"signal {name!r} cannot be sent as text; rename it")
             _counted(body, len(text))
             body += text
         self.position = _numbers(body, len(names))
         self.velocity = _numbers(body, len(names) if velocities else 0)
         _numbers(body, 0)
-        self.template = bytes((0, 1, 0, 0)) + bytes(body)
+        self.template = _CDR + bytes(body)
         width = 8 * len(names)
         self._start = self.template[:_ENCAPSULATION]
         self._names = self.template[_ENCAPSULATION + _STAMP.size : self.position]
@@ -244,14 +217,11 @@ class _Row:
     tails: dict[Any, bytes]  # by what it repeats for each state; None for no verdict
 
     def __init__(self, output: Output, vector: NamedVector, head: int, n: int) -> None:
-        self.head, self.statistics = head, output.of == "statistics"
+        self.head, self.statistics, self.tail, self.tails = head, output.of == "statistics", vector.tail(), {}
         self.start = 0 if self.statistics else place(output.position, n).start
         self.stop = self.start + 8 * vector.count
-        self.tail, self.velocity, self.tails = b"", output.velocity, {}
-        if not output.velocity:
-            self.tail = vector.tail()
-            return
-        for mark, number in ((False, 0.0), (True, 1.0), (None, math.nan)):
+        self.velocity = output.velocity
+        for mark, number in ((False, 0.0), (True, 1.0), (None, math.nan)) if output.velocity else ():
             self.tails[mark] = vector.tail(struct.pack(f"<{vector.count}d", *[number] * vector.count))
 
 
@@ -301,7 +271,7 @@ class VerdictMessages:
     def __init__(
         self,
         names: Mapping[str, Sequence[str]],
-        make_vector: Callable[[Sequence[str], bool], NamedVector] | None = None,
+        make_vector: Callable[[Sequence[str], bool], NamedVector] = NamedVector,
     ) -> None:
         self._n, foresees = len(names["states"]), bool(names["horizons"])
         self.outputs = {
@@ -309,8 +279,8 @@ class VerdictMessages:
             for output in OUTPUTS
             if output.position and names[output.of] and (foresees or output.when != "predicted over")
         }
-        kinds = {(output.of, bool(output.velocity)) for output in self.outputs.values()}
-        self._vectors = {(of, marked): (make_vector or NamedVector)(names[of], marked) for of, marked in sorted(kinds)}
+        kinds = sorted({(output.of, bool(output.velocity)) for output in self.outputs.values()})
+        self._vectors = {(of, marked): make_vector(names[of], marked) for of, marked in kinds}
 
     def encoder(self, names: Sequence[str]) -> Encoder:
         """What makes the messages of some outputs."""

@@ -11,7 +11,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import math
+from collections.abc import Iterator, Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
 from uncertain_lti.model.domain import jumps, jumps_in_words
+from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, row_of
 from uncertain_lti.monitor.verdict import Verdict, Verdicts
@@ -47,10 +50,6 @@ def why_not(status: Status, model: UncertainLTI) -> str:
     return text
 
 
-Values = Callable[[], tuple[Sequence[float], Sequence[float], Sequence[float]]]
-"""[x; u; s] before a transition, x and the flags after it; they are asked for only if the words need them."""
-
-
 class Reasons:
     """What is said of one sample after another.
 
@@ -74,71 +73,54 @@ class Reasons:
         self._held = self.by = ""
 
     def take(self, verdict: Verdict, alarm: bool) -> str:
-        """`push` of a verdict of the monitor."""
+        """Take one verdict of the monitor, and the alarm after it."""
         if verdict.status.dropped:
             return self.text
-
-        def values() -> tuple[list[float], list[float], list[float]]:
-            return verdict.before, verdict.numbers("state"), verdict.numbers("flags")
-
-        frozen = [moved.state for moved in verdict.frozen]
-        unknown, raised = verdict.unknown_regime, verdict.raised if alarm else ()
-        return self.push(alarm, verdict.status, unknown, raised, frozen, verdict.withheld, values)
-
-    def push(
-        self, alarm: bool, status: Status, unknown_regime: bool, raised: Sequence[Raised], frozen: Sequence[int],
-        withheld: Sequence[int], values: Values,
-    ) -> str:  # fmt: skip
-        """Take one sample that was not dropped.
-
-        `alarm`: the alarm after it; `status`: OK with a verdict; `unknown_regime`: the verdict is on a regime that was
-        not fitted; `raised`: which rules raise the alarm; `frozen`: states that are; `withheld`: states without a
-        verdict, as their rows need a frozen one; `values`: of the transition.
-        """
-        judged, names = status is Status.OK, self._model.state_names
+        judged, names = verdict.status is Status.OK, self._model.state_names
+        raised = verdict.raised if alarm and judged else ()
         if not alarm:
             self._blamed, self._jumps, self._held = {}, [], ""
-        elif frozen or (judged and raised):
-            by = [f"frozen: {', '.join(names[i] for i in frozen)}"] if frozen else []
-            by += [self._rules_that(raised, values)] if judged and raised else []
+        elif verdict.frozen or raised:
+            by = [f"frozen: {', '.join(names[moved.state] for moved in verdict.frozen)}"] if verdict.frozen else []
+            by += [self._rules_that(raised, verdict)] if raised else []
             self._held = "; ".join(by)
         elif judged and not self._held.startswith("latched"):
             self._held = "latched until ~/reset" + (f", raised by {self._held}" if self._held else "")
         self.by = self._held or self.by
         said = [f"alarm: {self._held}" if self._held else "alarm"] if alarm else []
         if not judged:
-            said.append(f"no verdict: {self._why(status, values)}")
+            said.append(f"no verdict: {self._why(verdict)}")
         elif not alarm:
             said.append(QUIET)
-        if judged and withheld:
-            said.append(f"no verdict on {', '.join(names[i] for i in withheld)}")
-        if judged and unknown_regime:
+        if judged and verdict.withheld:
+            said.append(f"no verdict on {', '.join(names[i] for i in verdict.withheld)}")
+        if judged and verdict.unknown_regime:
             said.append("a regime that was not fitted")
         self.text = "; ".join(said)
         return self.text
 
-    def _rules_that(self, raised: Sequence[Raised], values: Values) -> str:
+    def _rules_that(self, raised: Sequence[Raised], verdict: Verdict) -> str:
         """The rules that hold the alarm, with the states blamed and the first jump since these do."""
         held = dict.fromkeys(reason.label for reason in raised)
         if held.keys() != self._blamed.keys():
             self._blamed, self._jumps = {label: [] for label in held}, []
-        self._jumps = self._jumps or jumps_in_words(self._model, *values())
+        self._jumps = self._jumps or jumps_in_words(
+            self._model, verdict.before, verdict.numbers("state"), verdict.numbers("flags")
+        )
         for reason in raised:
             if reason.state and reason.state not in self._blamed[reason.label]:
                 self._blamed[reason.label].append(reason.state)
-        by = [
-            self.words[label] + (f": {', '.join(states)}" if states else "") for label, states in self._blamed.items()
-        ]
-        return "; ".join([*by, *self._jumps])
+        blamed = [(self.words[label], ", ".join(states)) for label, states in self._blamed.items()]
+        return "; ".join([*(f"{rule}: {states}" if states else rule for rule, states in blamed), *self._jumps])
 
-    def _why(self, status: Status, values: Values) -> str:
+    def _why(self, verdict: Verdict) -> str:
+        status = verdict.status
         if status is Status.MODE:
-            return self._model.why_unlisted(values()[0]) or WHY[status]
+            return self._model.why_unlisted(verdict.before) or WHY[status]
         if status is Status.MISSING:
-            before, after, _ = values()
             of = [*(signal.name for signal in self._model.signals), *self._model.state_names]
-            lacking = dict.fromkeys(name for name, v in zip(of, [*before, *after], strict=True) if v != v)
-            if lacking:
+            values = zip(of, [*verdict.before, *verdict.numbers("state")], strict=True)
+            if lacking := dict.fromkeys(name for name, value in values if value != value):
                 return f"{', '.join(lacking)} missing, stale, not valid or not finite"
         return why_not(status, self._model)
 
@@ -148,15 +130,16 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
     reasons, said = Reasons(model, verdicts.alarms.rules), ""
     transient, statuses = verdicts.transient, verdicts.statuses()
     for k in np.flatnonzero(_may_change(verdicts, model, statuses)).tolist():
-
-        def values(k: int = k) -> tuple[list[float], list[float], list[float]]:
-            before = np.concatenate([transient.x[k - 1], transient.u[k - 1], transient.s[k - 1]])
-            return before.tolist(), transient.x[k].tolist(), verdicts.flags[k].tolist()
-
-        alarm, unknown = bool(verdicts.alarm[k]), bool(verdicts.unknown_regime[k])
-        raised = verdicts.raised(k) if alarm else ()
-        frozen, withheld = (np.flatnonzero(states[k]).tolist() for states in (verdicts.frozen, verdicts.withheld))
-        text = reasons.push(alarm, statuses[k], unknown, raised, frozen, withheld, values)
+        verdict: Any = SimpleNamespace(
+            status=statuses[k],
+            unknown_regime=verdicts.unknown_regime[k],
+            raised=verdicts.raised(k) if verdicts.alarm[k] else (),
+            frozen=[Moved(i, math.nan, math.nan) for i in np.flatnonzero(verdicts.frozen[k]).tolist()],
+            withheld=np.flatnonzero(verdicts.withheld[k]).tolist(),
+            before=np.concatenate([transient.x[k - 1], transient.u[k - 1], transient.s[k - 1]]).tolist(),
+            numbers=lambda name, k=k: getattr(verdicts, name)[k].tolist(),
+        )
+        text = reasons.take(verdict, bool(verdicts.alarm[k]))
         if text != said:
             yield k, text
             said = text

@@ -22,9 +22,9 @@ from typing import Any
 
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
-from uncertain_lti.model.repeats import Moved, frozen_words, repeat_words
+from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.deployed import Days, condition_words
+from uncertain_lti.monitor.deployed import Days, conditions_in_words
 from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.outputs import JUDGED
@@ -33,7 +33,7 @@ from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
 from uncertain_lti.monitor.stream import topic_types as topic_types
 from uncertain_lti.monitor.verdict import Verdict
 from uncertain_lti.recordings.message_reader import UnreadableError
-from uncertain_lti.sampling.clock import MISSING, TOO_OLD, Counters, Status
+from uncertain_lti.sampling.clock import LATE, MISSING, TOO_OLD, Counters, Status
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal import Signal
 
@@ -68,21 +68,18 @@ class Session(Stream):
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call."""
-        period = self.pass_over(now)
+        period = self.pass_over()
         if period.verdicts and self.last is not None and not period.alarm:
             self.days.take(self.last.t_ns, period.largest)
-        without = self.without_verdict(now)
-        reports = [self._report_monitor(period, now, without, state_timeout, problems)]
-        for i, name in enumerate(self.model.state_names):
-            reports.append(self._report_state(i, name, period, without, state_timeout))
-        return reports
+        monitor = self._report_monitor(period, now, state_timeout, problems)
+        states = range(self.model.n)
+        return [monitor, *(self._report_state(i, period, self.without_verdict(now), state_timeout) for i in states)]
 
-    def _report_monitor(
-        self, period: Period, now: float, without: float, timeout: float, problems: Sequence[str]
-    ) -> Report:
-        never = [topic for topic in self.types if self.heard(topic) is None]
+    def _report_monitor(self, period: Period, now: float, timeout: float, problems: Sequence[str]) -> Report:
+        without, never = self.without_verdict(now), [topic for topic in self.types if self.heard(topic) is None]
         complaints, calm = list(problems), list[str]()
         lacking = self.lacking(period.counters)
+        came_late = Counters(self.sampler.counters - period.counters).of(LATE)
         if period.last_unknown is not None:
             why = self.model.why_unknown(period.last_unknown.before)
             complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
@@ -104,12 +101,12 @@ class Session(Stream):
             which = ", ".join(f"{kind} {n}" for kind, n in dropped.items())
             coarse = self.coarse_clock(period.statuses[Status.EQUAL])
             complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
-        if late := self.late - period.late:
-            complaints.append(f"{late} messages came too late")
-        if self.unreadable.total() > period.unreadable:
+        if came_late:
+            complaints.append(f"{sum(came_late.values())} messages came too late")
+        if period.unreadable:
             complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
-        if self.future.total() > period.future:
-            complaints.append(f"{self.future.total() - period.future} stamps lie over {FUTURE:g} s in the future")
+        if period.future:
+            complaints.append(f"{period.future} stamps lie over {FUTURE:g} s in the future")
         if off := self.arming.why_off():
             (complaints if self.arming.on is None else calm).append(off)
         complaints += [jump for jump in period.jumps[:SHOWN] if jump not in self.reasons.by]
@@ -118,8 +115,7 @@ class Session(Stream):
         if self.latched and not self.monitor.alarm:
             complaints.insert(0, "alarm: latched until ~/reset")
         calm += self.days.words
-        silent = self.silent_for(now)
-        frozen = [self.frozen_text(moved) for moved in period.frozen.values()]
+        silent, frozen = self.silent_for(now), [self.frozen_text(moved) for moved in period.frozen.values()]
         if frozen and self.monitor.alarm and silent <= timeout:
             level = ERROR
             complaints.insert(0, f"alarm: frozen: {'; '.join(frozen)}")
@@ -150,10 +146,11 @@ class Session(Stream):
         text = self.reasons.text
         if self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
-        never = [topic for topic in self.types if self.heard(topic) is None]
-        silent = self.silent_for(now) > timeout
-        why = f"no message on {self.sampler.clock}" if silent else "no sample could be judged"
-        why = f"nothing received on {', '.join(never)}" if never else why
+        why = "no sample could be judged"
+        if never := [topic for topic in self.types if self.heard(topic) is None]:
+            why = f"nothing received on {', '.join(never)}"
+        elif self.silent_for(now) > timeout:
+            why = f"no message on {self.sampler.clock}"
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
@@ -194,8 +191,7 @@ class Session(Stream):
 
     def frozen_text(self, moved: Moved) -> str:
         """What is said of a frozen state."""
-        assert self.model.repeats is not None
-        return frozen_words(self.model.state_names[moved.state], moved, self.model.repeats)
+        return f"{self.model.state_names[moved.state]} {moved.words}"
 
     def lacking(self, before: Counter[str]) -> list[Signal]:
         """Signals that samples had no value of since some counters."""
@@ -227,11 +223,11 @@ class Session(Stream):
         """The alarm rule in words, with everything that it depends on."""
         rule = self.rule
         parts = [f"alarm when {self.rule_text()}", f"margin {self.monitor.rule.margin:g}"]
-        parts += [f"masked: {', '.join(self.monitor.masked)}"] if self.monitor.masked else []
-        parts += condition_words(self.arming.condition, rule.grace, rule.latch)
+        parts += conditions_in_words(self.monitor, self.arming.condition, rule.grace, rule.latch)
         return ", ".join(parts)
 
-    def _report_state(self, i: int, name: str, period: Period, without: float, timeout: float) -> Report:
+    def _report_state(self, i: int, period: Period, without: float, timeout: float) -> Report:
+        name = self.model.state_names[i]
         masked, violated = name in self.monitor.masked, period.violations[i]
         values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i]), "masked": str(int(masked))}
         if self.last is not None:
@@ -240,26 +236,21 @@ class Session(Stream):
             }
             if not period.verdicts:  # the clock is slower than the reports
                 violated = int(self.last.numbers("flags")[i] == 1.0)
-        age = f"last verdict {without:.1f} s ago: "
         if i in period.frozen:
-            level, message = ERROR, f"frozen: {self.frozen_text(period.frozen[i]).removeprefix(name).lstrip()}"
+            level, message = ERROR, f"frozen: {period.frozen[i].words}"
         elif without > timeout:
             level, message = STALE, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet"
         elif (lost := period.withheld[i]) and lost >= period.verdicts:
             level, message = WARN, "no verdict: it needs a state that is frozen"
-        elif violated:
-            level = OK if masked else ERROR if period.alarm else WARN
-            message = f"outside its bounds in {violated} of {period.verdicts} verdicts"
-            message = message if period.verdicts else f"{age}outside its bounds"
         elif self.last is None:
             level, message = STALE, "no verdict yet"
         else:
-            level, message = OK, f"{age}within its bounds"
-            if period.verdicts:
-                message = f"within its bounds in {period.verdicts} verdicts"
-        if i in period.repeating and i not in period.frozen and self.model.repeats is not None:
-            longest = self.model.repeats.longest_repeat_s[i]
-            level, message = max(level, WARN), f"{message}; {repeat_words(period.repeating[i].seconds, longest)}"
+            level = OK if masked or not violated else ERROR if period.alarm else WARN
+            where, some = ("outside its bounds", f"{violated} of ") if violated else ("within its bounds", "")
+            message = f"{where} in {some}{period.verdicts} verdicts"
+            message = message if period.verdicts else f"last verdict {without:.1f} s ago: {where}"
+        if i in period.repeating and i not in period.frozen:
+            level, message = max(level, WARN), f"{message}; {period.repeating[i].words}"
         return Report(level, name, f"{message} (masked)" if masked else message, values)
 
     def counts(self, now: float) -> dict[str, str]:
@@ -274,7 +265,6 @@ class Session(Stream):
             "latched": str(int(self.latched)),
             "armed": {True: "1", False: "0", None: "unknown"}[self.arming.on],
             "alarms": str(self.alarms),
-            "unexpected errors": str(self.failures),
             "verdicts": str(self.verdicts),
             "violations": repr(rule.violations),
             "window": repr(rule.window),
@@ -306,7 +296,7 @@ class Session(Stream):
 class _Matter:
     """Something that changes, and its value in the last line logged."""
 
-    def __init__(self, logged: Any) -> None:
+    def __init__(self, logged: Any = None) -> None:
         self.logged = logged
         self._lines, self._at = float(_BURST), -math.inf
 
@@ -335,22 +325,16 @@ class EventLog:
 
     def __init__(self, log: Callable[[int, str], None]) -> None:
         self._log = log
-        self._matters = defaultdict[str, _Matter](lambda: _Matter(None))
-        self._alarm_since = 0.0
-        self._start(False, Counter(), Counter(), 0.0)
-
-    def _start(self, alarm: bool, counters: Counter[str], unreadable: Counter[str], now: float) -> None:
-        self._alarm = self._named = alarm  # the latter: whether the start of this alarm was logged
-        self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
-        self._counters, self._unreadable = counters, unreadable
-        self._ceased, self._judged = now, False
-        self._cause = ("", now)  # why there are no verdicts, and since when
+        self._alarm, self._alarm_since = False, 0.0
 
     def begin(self, session: Session, now: float) -> None:
         """A session starts, with no sample."""
-        self._start(session.alarm, Counter(session.sampler.counters), Counter(session.unreadable), now)
-        self._matters.clear()
-        self._matters["arming"] = _Matter(True)
+        self._alarm = self._named = session.alarm  # the latter: whether the start of this alarm was logged
+        self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
+        self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
+        self._ceased, self._judged = now, False
+        self._cause = ("", now)  # why there are no verdicts, and since when
+        self._matters = defaultdict[str, _Matter](_Matter, arming=_Matter(True))
 
     def turned(self, session: Session, verdicts: Iterable[Verdict], now: float, why: str = "") -> None:
         """Log the alarm if it has changed: its start with the states that left their bounds, its end if the start was.

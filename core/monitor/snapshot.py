@@ -16,12 +16,13 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import BinaryIO
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
+from uncertain_lti.base.files import whole_file
 from uncertain_lti.monitor.outputs import FALSE, FLAG_TYPE, REASON, RECORDED, TRUE, VerdictMessages, text_message
 from uncertain_lti.monitor.reason import Reasons
 from uncertain_lti.monitor.verdict import Verdict
@@ -101,50 +102,46 @@ class Scene:
     definition: Callable[[str], str]
     reasons: Reasons | None = None
 
-    def write(self, path: Path) -> None:
+    def write(self, stream: BinaryIO) -> None:
         """Write an MCAP file."""
         messages = VerdictMessages(self.names)
         encode = {name: messages.encoder([name]) for name in messages.outputs}
         has = len(self.names["states"]), len(self.names["horizons"]), tuple(self.names["statistics"])
-        with open(path, "xb") as stream:
-            writer = McapWriter(stream, "uncertain-lti")
-            writer.metadata("uncertain_lti", self.notes)
+        writer = McapWriter(stream, "uncertain-lti")
+        writer.metadata("uncertain_lti", self.notes)
 
-            def declare(topic: str, kind: str) -> int:
-                return writer.channel(writer.schema(kind, "ros2msg", self.definition(kind).encode()), topic)
+        def declare(topic: str, kind: str) -> int:
+            return writer.channel(writer.schema(kind, "ros2msg", self.definition(kind).encode()), topic)
 
-            inputs = {topic: declare(topic, kind) for topic, kind in self.inputs.items()}
-            outputs = {
-                output: declare(self.outputs[output.name], output.type)
-                for output in RECORDED
-                if output.name in self.outputs and (not output.position or output.name in encode)
-            }
-            reason = outputs.pop(REASON, None)
-            log_time, said = 0, ""
-            for entry in self.entries:
-                log_time = max(log_time, entry.arrival_ns)  # a clock that is set back must not reorder messages
-                if entry.topic not in inputs:
-                    continue  # of the previous model
-                writer.message(inputs[entry.topic], log_time, entry.data)
-                for verdict in entry.verdicts:
-                    horizons = verdict.n * (1 + verdict.horizons) if verdict.horizons else 0
-                    if (verdict.n, horizons, verdict.statistic_names) != has:
-                        continue
-                    for output, channel in outputs.items():
-                        if output.when == "judged" and not verdict.judged:
-                            continue
+        inputs = {topic: declare(topic, kind) for topic, kind in self.inputs.items()}
+        outputs = {
+            output: declare(self.outputs[output.name], output.type)
+            for output in RECORDED
+            if output.name in self.outputs and (not output.position or output.name in encode)
+        }
+        reason = outputs.pop(REASON, None)
+        log_time, said = 0, ""
+        for entry in self.entries:
+            log_time = max(log_time, entry.arrival_ns)  # a clock that is set back must not reorder messages
+            if entry.topic not in inputs:
+                continue  # of the previous model
+            writer.message(inputs[entry.topic], log_time, entry.data)
+            for verdict in entry.verdicts:
+                horizons = verdict.n * (1 + verdict.horizons) if verdict.horizons else 0
+                if (verdict.n, horizons, verdict.statistic_names) != has:
+                    continue
+                for output, channel in outputs.items():
+                    if verdict.judged or output.when != "judged":
                         alarm = TRUE if entry.alarm else FALSE
                         data = alarm if output.type == FLAG_TYPE else encode[output.name](verdict)[0]
                         writer.message(channel, log_time, data)
-                    if reason is None or self.reasons is None:
-                        continue
-                    text = self.reasons.take(verdict, entry.alarm)
-                    if text != said:
-                        writer.message(reason, log_time, text_message(text))
-                        said = text
-            writer.finish()
-            stream.flush()
-            os.fsync(stream.fileno())
+                if reason is None or self.reasons is None:
+                    continue
+                text = self.reasons.take(verdict, entry.alarm)
+                if text != said:
+                    writer.message(reason, log_time, text_message(text))
+                    said = text
+        writer.finish()
 
 
 class Album:
@@ -160,7 +157,7 @@ class Album:
         self._folder = Path(folder).expanduser()
         stem = re.sub(r"\W+", "_", node_name.strip("/"), flags=re.ASCII)
         self._stem, self._keep, self._limit = stem, keep, limit
-        self._pattern = re.compile(rf"{re.escape(stem)}-\d{{8}}T\d{{6}}\.\d{{6}}Z\.mcap(\.part)?", re.ASCII)
+        self._pattern = re.compile(rf"{re.escape(stem)}-\d{{8}}T\d{{6}}\.\d{{6}}Z\.mcap", re.ASCII)
         self._thread: threading.Thread | None = None
         self.written = 0
         self.last = self.problem = ""
@@ -168,7 +165,7 @@ class Album:
             self._folder.mkdir(parents=True, exist_ok=True)
             if not os.access(self._folder, os.W_OK | os.X_OK):
                 raise PermissionError(13, "Permission denied")
-            for path in self._files(".part"):
+            for path in self._folder.glob(f".{stem}-*.mcap-*.tmp"):
                 path.unlink()  # of a process that was killed
         except OSError as error:
             raise ModelError(
@@ -204,14 +201,13 @@ class Album:
             self._thread.join(10.0)
 
     def _write(self, scene: Scene, path: Path) -> None:
-        part = path.with_name(f"{path.name}.part")
         try:
-            scene.write(part)
-            size = part.stat().st_size
-            if size > self._limit:
-                raise ModelError(f"{path.name}: {size} bytes are more than snapshot.megabytes allows; raise it")
-            self._make_room(size)
-            os.replace(part, path)
+            with whole_file(path) as stream:
+                scene.write(stream)
+                size = stream.tell()
+                if size > self._limit:
+                    raise ModelError(f"{path.name}: {size} bytes are more than snapshot.megabytes allows; raise it")
+                self._make_room(size)
             self.last = str(path)
             self.written += 1
         except (OSError, UncertainLTIError) as error:
@@ -220,17 +216,11 @@ class Album:
             self.problem = f"snapshot {path}: not written: {why}"
         except Exception as error:  # the node goes on, and reports it
             self.problem = f"snapshot {path}: not written: {error!r}"
-        finally:
-            with suppress(OSError):
-                part.unlink(missing_ok=True)
-
-    def _files(self, ending: str) -> list[Path]:
-        """Files of this node, oldest first."""
-        found = [p for p in self._folder.iterdir() if p.name.endswith(ending) and self._pattern.fullmatch(p.name)]
-        return sorted((p for p in found if p.is_file() and not p.is_symlink()), key=lambda p: p.name)
 
     def _make_room(self, size: int) -> None:
-        files = self._files(".mcap")
+        """Remove files of this node, the oldest first."""
+        files = sorted(p for p in self._folder.iterdir() if self._pattern.fullmatch(p.name))
+        files = [path for path in files if path.is_file() and not path.is_symlink()]
         sizes = [path.stat().st_size for path in files]
         while files and (len(files) >= self._keep or sum(sizes) + size > self._limit):
             files.pop(0).unlink(missing_ok=True)

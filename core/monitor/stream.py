@@ -55,20 +55,19 @@ MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
 class Period:
     """What has happened since the last report.
 
-    `began`: steady time, s; `verdicts`: verdicts given in it; `outside`: those from outside the fitted domain;
-    `unknown`: of these those of a regime that was not fitted; `last_unknown`: the last of them; `last_outside`: the
-    last of the others; `last_unlisted`: the last in it on a mode that the model does not list; `alarm`: the alarm
-    was raised at some time in it; `frozen, repeating`: by number of the state, the last repeat of those that were
+    `counters`: of the sampler when it began; `alarm`: the alarm was raised at some time in it; `largest` (n,): largest
+    |utilisation|; `unreadable, future`: messages that could not be read, or were stamped so; `verdicts`: verdicts
+    given in it; `outside`: those from outside the fitted domain; `unknown`: of these those of a regime that was not
+    fitted; `last_unknown`: the last of them; `last_outside`: the last of the others; `last_unlisted`: the last in it on
+    a mode that the model does not list; `frozen, repeating`: by number of the state, the last repeat of those that were
     frozen, and of others that repeat for longer than ever in the fit; `withheld`: by number of the state, samples
-    without a verdict on it as it needs a frozen one; `violations`: by number of the state; `largest` (n,): largest
-    |utilisation|; `jumps`: the first jumps larger than any of the fit, in words; `statuses`: of the samples in it;
-    `counters, late, unreadable, future`: of the sampler, and of messages, when it began.
+    without a verdict on it as it needs a frozen one; `violations`: by number of the state; `jumps`: the first jumps
+    larger than any of the fit, in words; `statuses`: of the samples in it.
     """
 
-    began: float
-    counters: Counter[str] = field(default_factory=Counter)
-    alarm: bool = False
-    late: int = 0
+    counters: Counter[str]
+    alarm: bool
+    largest: array[float]
     unreadable: int = 0
     future: int = 0
     verdicts: int = 0
@@ -81,7 +80,6 @@ class Period:
     withheld: Counter[int] = field(default_factory=Counter)
     repeating: dict[int, Moved] = field(default_factory=dict)
     violations: Counter[int] = field(default_factory=Counter)
-    largest: array[float] = field(default_factory=lambda: array("d"))
     jumps: list[str] = field(default_factory=list)
     statuses: Counter[Status] = field(default_factory=Counter)
 
@@ -106,14 +104,6 @@ def topic_types(model: UncertainLTI, source: str, type_fields: TypeFields) -> di
     return types
 
 
-def _held(model: UncertainLTI, signals: Sequence[int]) -> float:
-    """How long the last values of these signals may be used, s."""
-    if any(i < model.n for i in signals):
-        return 0.0
-    holds = [model.signals[i].max_hold for i in signals]
-    return max(math.inf if hold is None else hold for hold in holds)
-
-
 @cython.cclass
 class Stream:
     """Samples and judges the messages of one model, and keeps count.
@@ -127,44 +117,28 @@ class Stream:
     `caught_up`: what the last catching up came to, in words; empty as long as no message was put in order.
     """
 
+    __dict__: dict[str, Any]  # what is not needed for every message; the others need no look-up
     model: UncertainLTI = cython.declare(object, visibility="public")
     rule: Rule = cython.declare(object, visibility="readonly")
     monitor: EnvelopeMonitor = cython.declare(object, visibility="readonly")
     sampler: Sampler = cython.declare(object, visibility="readonly")
-    explainer: Explainer = cython.declare(object, visibility="public")
     reasons: Reasons = cython.declare(object, visibility="readonly")
     arming: Arming = cython.declare(object, visibility="readonly")
     period: Period = cython.declare(object, visibility="readonly")
     received: dict[str, int] = cython.declare(dict, visibility="readonly")
-    unreadable: Counter[str] = cython.declare(object, visibility="readonly")
-    future: Counter[str] = cython.declare(object, visibility="readonly")
-    why_unreadable: dict[str, str] = cython.declare(object, visibility="readonly")
-    violations: list[int] = cython.declare(list, visibility="readonly")
     last: Verdict | None = cython.declare(object, visibility="readonly")
     latched: bool = cython.declare(cython.bint, visibility="public")
     enable_topic: str = cython.declare(object, visibility="readonly")
-    enable_type: str = cython.declare(object, visibility="readonly")
-    caught_up: str = cython.declare(object, visibility="readonly")
     verdicts: int = cython.declare(object, visibility="readonly")
     alarms: int = cython.declare(object, visibility="readonly")
-    failures: int = cython.declare(object, visibility="readonly")
-    reordered: int = cython.declare(object, visibility="readonly")
-    _model_types: Mapping[str, str] = cython.declare(object, visibility="readonly")
-    _type_fields: TypeFields = cython.declare(object, visibility="readonly")
-    _make_reader: MakeReader = cython.declare(object, visibility="readonly")
     _readers: dict[str, MessageReader] = cython.declare(dict, visibility="readonly")
-    _held: dict[str, float]
     _heard: dict[str, float]
     _newest: dict[str, bytes] = cython.declare(dict, visibility="readonly")  # the last message of each topic
-    _stamped: list[str]
-    _window: cython.double
     _stall: cython.double
-    _began: cython.double
     _judged: cython.double
     _came: cython.double
     _quiet: cython.Py_ssize_t  # verdicts without an alarm since the last one with
     _catches_up: Any
-    _behind: Any
     _reads_condition: Any
 
     def __init__(
@@ -185,7 +159,6 @@ class Stream:
             topic: make_reader(types[topic], [FieldPath(signals.signals[i].field) for i in signals.on(topic)])
             for topic in signals.topics
         }
-        self._held = {topic: _held(model, signals.on(topic)) for topic in signals.topics}
         stamped = [topic for topic in signals.topics if signals.time[topic] == "header"]
         self._stamped = [topic for topic in stamped if topic != signals.clock]
         waits = signals.clock in stamped and bool(self._stamped) and catch_up > 0.0  # arrivals are in order as they are
@@ -203,16 +176,16 @@ class Stream:
         self.why_unreadable: dict[str, str] = {}
         self.future: Counter[str] = Counter()
         self.received: dict[str, int] = {}  # setting an item of a Counter is slow
-        self.verdicts = self.alarms = self.failures = 0
+        self.verdicts = self.alarms = 0
         self.violations = [0] * self.model.n
         self.last: Verdict | None = None
         self._heard: dict[str, float] = {}
-        self._began, self._judged = now, -math.inf
-        self._came = now
+        self._began, self._judged, self._came = now, -math.inf, now
         self._behind: dict[str, deque[float]] = {}
-        self._catches_up = self._catch_up(self._stamped, start=True) if math.isfinite(self._stall) else None
+        awaited = [self.sampler.clock, *self._stamped]
+        self._catches_up = CatchUp(awaited, self._window, start=True) if math.isfinite(self._stall) else None
         self.reordered, self.caught_up = 0, ""
-        self.period = Period(now, largest=self._no_peaks())
+        self.pass_over()
 
     def _start(self) -> None:
         self.sampler = Sampler(self.model.signals)
@@ -297,11 +270,6 @@ class Stream:
         self._newest.pop(self.enable_topic, None)  # it was of another type
 
     @property
-    def enable_type_is_given(self) -> bool:
-        """Whether the model or the rule has the type of the condition's topic; otherwise publishers have."""
-        return bool(self.rule.enable_type) or self.enable_topic in self._model_types
-
-    @property
     def types(self) -> dict[str, str]:
         """Topics to listen to with their types, as far as these are known."""
         types = dict(self._model_types)
@@ -330,10 +298,6 @@ class Stream:
         latched, counters = self.latched, self.sampler.counters
         self._start()
         self.latched, self.sampler.counters = latched, counters
-        self.failures += 1
-
-    def _catch_up(self, awaited: Sequence[str], start: bool) -> CatchUp:
-        return CatchUp([self.sampler.clock, *awaited], self._window, start)
 
     @property
     def lags(self) -> dict[str, float]:
@@ -366,7 +330,7 @@ class Stream:
             if now - before <= self._stall:
                 return ((topic, arrival_ns, data),)
             lately = [t for t in self._stamped if self._heard.get(t, -math.inf) >= before - self._stall]
-            self._catches_up = self._catch_up(lately, start=False)
+            self._catches_up = CatchUp([self.sampler.clock, *lately], self._window, start=False)
         if topic in self._readers:
             self._heard[topic] = now
         self._catches_up.put((topic, arrival_ns, data), sent_ns, late, now)
@@ -411,6 +375,7 @@ class Stream:
             return _NOTHING, False
         if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
             self.future[topic] += 1
+            self.period.future += 1
         sampler = self.sampler
         if topic != sampler.clock:
             sampler.push(topic, arrival_ns, stamp_ns, values)  # decides nothing
@@ -459,6 +424,7 @@ class Stream:
     @cython.cfunc
     def _note_unreadable(self, topic: str, error: UnreadableError) -> None:
         self.unreadable[topic] += 1
+        self.period.unreadable += 1
         self.why_unreadable[topic] = str(error)[:200]
 
     @cython.cfunc
@@ -548,8 +514,12 @@ class Stream:
         return self._heard.get(topic)
 
     def held(self, topic: str) -> float:
-        """How long the last values of a topic may be used."""
-        return self._held.get(topic, math.inf)  # infinite for that of the enable condition
+        """How long the last values of a topic may be used, s; for ever of that of the enable condition."""
+        on = self.model.signals.on(topic)
+        if any(i < self.model.n for i in on):
+            return 0.0
+        holds = [self.model.signals[i].max_hold for i in on]
+        return max((math.inf if hold is None else hold for hold in holds), default=math.inf)
 
     def without_verdict(self, now: float) -> float:
         """Time since the last verdict, or since the start."""
@@ -559,12 +529,8 @@ class Stream:
         """Time since the last message of the clock topic."""
         return now - self._heard.get(self.sampler.clock, self._began)
 
-    def pass_over(self, now: float) -> Period:
+    def pass_over(self) -> Period:
         """Begin another period for `report`."""
-        counts = self.late, self.unreadable.total(), self.future.total()
-        period, largest = self.period, self._no_peaks()
-        self.period = Period(now, Counter(self.sampler.counters), self.alarm, *counts, largest=largest)
+        period = self.period
+        self.period = Period(Counter(self.sampler.counters), self.alarm, array("d", bytes(8 * self.model.n)))
         return period
-
-    def _no_peaks(self) -> array[float]:
-        return array("d", bytes(8 * self.model.n))

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cache
 from typing import Any
 
@@ -358,12 +358,12 @@ class Verdicts:
         Utilisation by each of the model's horizons; NaN where its window is broken.
     longer_residual : array (N+1, horizons, n)
         x_next - centre, normalised, by each of them.
-    why_frozen : dict, optional
+    why_frozen : dict
         Of each sample and number of a state that is frozen there, in words why it is.
-    asked : array (N+1,) of bool, optional
-        Whether a verdict was asked for; default all.
-    armed : array (N+1,) of bool, optional
-        Whether the alarm could be raised; default always.
+    asked : array (N+1,) of bool
+        Whether a verdict was asked for.
+    armed : array (N+1,) of bool
+        Whether the alarm could be raised.
     """
 
     transient: Transient
@@ -384,9 +384,9 @@ class Verdicts:
     alarms: Alarm
     longer_utilisation: Array
     longer_residual: Array
-    why_frozen: dict[tuple[int, int], str] = field(default_factory=dict)
-    asked: NDArray[np.bool_] | None = None
-    armed: NDArray[np.bool_] | None = None
+    why_frozen: dict[tuple[int, int], str]
+    asked: NDArray[np.bool_]
+    armed: NDArray[np.bool_]
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
@@ -404,16 +404,10 @@ class Verdicts:
             bad = np.flatnonzero(self.flags[:, i] == 1.0)
             given = judged & ~np.isnan(self.flags[:, i])
             count, width = int(given.sum()), (self.upper - self.lower)[given, i]
-            rows.append(
-                [
-                    named(name, unit),
-                    str(len(bad)),
-                    f"{1 - len(bad) / count:.3%}" if count else "–",
-                    number_text(float(width.mean())) if count else "–",
-                    number_text(float(width.max())) if count else "–",
-                    f"{transient.t[bad[0]]:.4f} s" if len(bad) else "–",
-                ]
-            )
+            first = f"{transient.t[bad[0]]:.4f} s" if len(bad) else "–"
+            mean, largest = (float(width.mean()), float(width.max())) if count else (None, None)
+            inside = f"{1 - len(bad) / count:.3%}" if count else "–"
+            rows.append([named(name, unit), str(len(bad)), inside, number_text(mean), number_text(largest), first])
         return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
     def statuses(self) -> list[Status]:
@@ -431,16 +425,10 @@ class Verdicts:
             if kinds[k] is Status.OK:  # but for the two below, a value is beyond what the arithmetic carries
                 kinds[k] = Status.MISSING
         frozen = self.withheld.any(axis=1) & ~self.judged
-        for which, kind in (
-            (self.unfitted_step, Status.STEP),
-            (self.unlisted_mode, Status.MODE),
-            (frozen, Status.FROZEN),
-        ):
-            for k in np.flatnonzero(which):
+        which = {Status.STEP: self.unfitted_step, Status.MODE: self.unlisted_mode, Status.FROZEN: frozen}
+        for kind, marks in (which | {Status.UNASKED: ~self.asked}).items():
+            for k in np.flatnonzero(marks):
                 kinds[k] = kind
-        if self.asked is not None:
-            for k in np.flatnonzero(~self.asked):
-                kinds[k] = Status.UNASKED
         return kinds
 
     @property

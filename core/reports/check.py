@@ -140,7 +140,7 @@ def _not_judged(verdicts: Verdicts) -> list[str]:
         Status.STEP.value: verdicts.unfitted_step,
         Status.MODE.value: verdicts.unlisted_mode,
         Status.FROZEN.value: withheld & ~verdicts.judged,
-        Status.UNASKED.value: np.array([]) if verdicts.asked is None else ~verdicts.asked,
+        Status.UNASKED.value: ~verdicts.asked,
         "frozen in part": withheld & verdicts.judged,
     }
     return [*unused(verdicts.transient), *(f"{int(n.sum())} {word}" for word, n in counts.items() if n.any())]
@@ -306,7 +306,7 @@ def _nulls(values: Array) -> list[Any]:
 def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) -> str:
     """Why a check says nothing of the machine; empty if it does."""
     judged = data["verdicts"]
-    steps = max((data["samples"] if verdicts.asked is None else int(verdicts.asked.sum())) - 1, 1)
+    steps = max(int(verdicts.asked.sum()) - 1, 1)
     if not judged:
         met = Counter(verdicts.statuses())
         most = max(met, key=lambda s: (s not in (Status.FIRST, Status.UNASKED), met[s]), default=Status.FIRST)
@@ -317,7 +317,7 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     if judged < JUDGED * steps:
         why = f" ({', '.join(data['no_verdict'])})" if data["no_verdict"] else ""
         return f"only {judged} of {steps} steps could be judged{why}"
-    if verdicts.armed is not None and not (verdicts.armed & verdicts.judged).any():
+    if not (verdicts.armed & verdicts.judged).any():
         remedy = "give others, or check a recording in which the machine is in use"
         return f"the alarm was armed at no verdict: --enable did not hold, or --grace was not over; {remedy}"
     if (outside := data["outside_domain_share"]) > _vouched(model):
