@@ -121,7 +121,8 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     for source in sources:
         if source.candidates and not source.rate > 0:
             source.reason, source.candidates = "no time passes between its messages", []
-        _sift(source)
+        elif source.candidates:
+            _sift(source)
     return sources
 
 
@@ -144,10 +145,8 @@ def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tupl
 def run_column(bags: Sequence[Recording]) -> str:
     """Column of tables that tells the runs in one file apart."""
     tables = [bag for bag in bags if isinstance(bag, Table)]
-    if not tables or len(tables) < len(bags):
-        return ""
-    told = (name for name in tables[0].columns_by_field if all(_tells_runs(table, name) for table in tables))
-    return next(told, "")
+    names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
+    return next((name for name in names if all(_tells_runs(table, name) for table in tables)), "")
 
 
 def _tells_runs(table: Table, name: str) -> bool:
@@ -232,8 +231,6 @@ def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) 
 
 def _sift(source: Source) -> None:
     """Say of each number whether it moves; angles in place of the quaternions that are some."""
-    if not source.candidates:
-        return
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
     parts = {c.path: c for c in source.candidates}
     for base in bases:
@@ -242,49 +239,42 @@ def _sift(source: Source) -> None:
         norm = np.sqrt(sum(np.concatenate(r.values) ** 2 for r in read)) if len(read) == 4 else np.zeros(1)
         unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
         is_rotation = len(unit) > 0 and unit.mean() > 0.9
-        for candidate in source.candidates:
-            of_base = candidate.path.startswith(f"{base}.") or candidate.path.endswith(f"({base})")
-            if of_base and candidate.path.endswith(f"({base})") != is_rotation:
-                candidate.reason = "|"  # the other form of the same numbers has its line
-    source.candidates = [c for c in source.candidates if c.reason != "|"]
+        source.candidates = [  # the other form of the same numbers has its line
+            c
+            for c in source.candidates
+            if not (c.path.startswith(f"{base}.") if is_rotation else c.path.endswith(f"({base})"))
+        ]
     for candidate in source.free:
-        _ignore(candidate)
-        _judge(candidate, source)
+        if found := codes(np.concatenate([np.empty(0), *candidate.values])):  # numbers that stand for none
+            candidate.ignore = tuple(sorted(found))
+            candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
+        candidate.reason = _unfit(candidate, source)
     _wrapped(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
         source.reason += f" and {len(source.candidates) - 3} more" * (len(source.candidates) > 3)
 
 
-def _ignore(candidate: Candidate) -> None:
-    """Take numbers that stand for none out of the values."""
-    found = codes(np.concatenate([np.empty(0), *candidate.values]))
-    if found:
-        candidate.ignore = tuple(sorted(found))
-        candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
-
-
-def _judge(candidate: Candidate, source: Source) -> None:
+def _unfit(candidate: Candidate, source: Source) -> str:
+    """Why a number is no signal; "" if nothing is against it."""
     if not candidate.values:
-        candidate.reason = "not read"
-        return
-    values = np.concatenate(candidate.values)
-    finite = values[np.isfinite(values)]
+        return "not read"
+    values, finite = np.concatenate(candidate.values), candidate.finite
     if not len(finite):
-        candidate.reason = "never a number"
-    elif finite.min() == finite.max():
-        candidate.reason = f"always {finite[0] + 0.0:.6g}"
-    elif len(finite) < 0.5 * len(values):
+        return "never a number"
+    if finite.min() == finite.max():
+        return f"always {finite[0] + 0.0:.6g}"
+    if len(finite) < 0.5 * len(values):
         what = "rows only, so fill its empty cells with the number above" if source.type == TYPE else "messages only"
-        candidate.reason = f"a number in {len(finite)} of {len(values)} {what}"
-    elif (moved := len(finite) - int(np.unique(finite, return_counts=True)[1].max())) < max(3, len(finite) // 500):
-        candidate.reason = f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
-    elif source.role == "state" and len(np.unique(finite)) < 3:
-        candidate.reason = TWO_VALUES
-    elif source.role != "control" and _counts(values, np.concatenate(source.arrival)):
-        candidate.reason = "grows as a clock or a counter does"
-    elif max(abs(float(finite.min())), abs(float(finite.max()))) > 1e15:
-        candidate.reason = "holds numbers beyond 1e15"
+        return f"a number in {len(finite)} of {len(values)} {what}"
+    counts = np.unique(finite, return_counts=True)[1]
+    if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
+        return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
+    if source.role == "state" and len(counts) < 3:
+        return TWO_VALUES
+    if source.role != "control" and _counts(values, np.concatenate(source.arrival)):
+        return "grows as a clock or a counter does"
+    return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
 def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:

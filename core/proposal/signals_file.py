@@ -114,8 +114,7 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
 
 def set_own_scale(candidate: Candidate) -> None:
     """Median and range, for one in a comment."""
-    finite = np.concatenate(candidate.values)
-    finite = finite[np.isfinite(finite)]
+    finite = candidate.finite
     candidate.steady, candidate.scale = float(np.median(finite)), _listed(float(np.ptp(finite)))
 
 
