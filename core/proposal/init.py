@@ -92,7 +92,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
                 facts[fact.info.topic] = fact
     sources = []
     for topic, fact in facts.items():
-        total = sum(bag.topics[topic].count for bag in bags if topic in bag.topics)
+        total = sum(_messages(bag, topic) for bag in bags)
         if fact.info.type == TYPE:
             sources += _of_table(fact, total, all(topic in b.topics for b in bags))
             continue
@@ -105,7 +105,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
             source.reason = "no signal of a machine by its name or type"
         elif total < (3 if source.role == "control" else FEWEST):
             source.reason = f"{plural(total, 'message')} only"
-        elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
+        elif not all(_messages(bag, topic) for bag in bags):
             source.reason = _APART
         elif any(b.topics[topic].type != fact.info.type for b in bags):
             source.reason = "of different types in these recordings"
@@ -126,6 +126,10 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     return sources
 
 
+def _messages(bag: Recording, topic: str) -> int:
+    return bag.topics[topic].count if topic in bag.topics else 0
+
+
 def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tuple[str, str, Array, Array]], list[str]]:
     """Every number of a recording that moves.
 
@@ -134,9 +138,7 @@ def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tupl
     sources = read_sources([bag], progress)
     chosen = [(s, c) for s in sources if not s.reason for c in s.candidates if not c.reason]
     start = min((int(s.arrival[0][0]) for s, _ in chosen), default=0)
-    found = [
-        (s.topic, c.path, np.asarray((s.arrival[0] - start) * 1e-9, dtype=np.float64), c.values[0]) for s, c in chosen
-    ]
+    found = [(s.topic, c.path, np.multiply(s.arrival[0] - start, 1e-9), c.values[0]) for s, c in chosen]
     left = [f"{s.topic}: {s.reason}" for s in sources if s.reason]
     left += [f"{s.topic} {c.path}: {c.reason}" for s in sources if not s.reason for c in s.candidates if c.reason]
     return found, left
@@ -168,16 +170,11 @@ def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
     beside = {bare(field) for field in fact.fields}
     for field in fact.fields:
         by_role.setdefault(role_of_column(field, beside), []).append(field)
-    sources = []
+    reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if everywhere else _APART
+    topic, sources = fact.info.topic, []
     for role, fields in by_role.items():
-        source = Source(fact.info.topic, TYPE, role, False, None)
-        if rows < FEWEST:
-            source.reason = f"{plural(rows, 'row')} only"
-        elif not everywhere:
-            source.reason = _APART
-        else:
-            source.candidates = _candidates(fact.info.topic, fields)
-        sources.append(source)
+        candidates = [] if reason else _candidates(topic, fields)
+        sources.append(Source(topic, TYPE, role, False, None, candidates=candidates, reason=reason))
     return sources
 
 
@@ -187,7 +184,7 @@ def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
     left = MOST_VALUES
     for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
         for candidate in source.free:
-            left -= max(1, sum(bag.topics[source.topic].count for bag in bags))
+            left -= max(1, sum(_messages(bag, source.topic) for bag in bags))
             if left < 0:
                 candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
 
@@ -384,13 +381,11 @@ def propose(
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
-        remedy = "record the machine at work, and longer, or name the topics of its states in `uncertain-lti init"
-        remedy += " --states`"
+        nothing = f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})"
         if any(s.reason == _APART for s in sources):
-            remedy = "give recordings of one machine, with the same topics"
-        raise BagError(
-            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); {remedy}"
-        )
+            raise BagError(f"{nothing}; give recordings of one machine, with the same topics")
+        named = "name the topics of its states in `uncertain-lti init --states`"
+        raise BagError(f"{nothing}; record the machine at work, and longer, or {named}")
     chosen, doubt = choose(measured, commands, like)
     doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
@@ -406,12 +401,12 @@ def propose(
     set_operating_point(chosen, used, sources)
     for candidate in ready:
         set_own_scale(candidate)
-    warnings += [doubt] if doubt else []
+    warnings += [doubt] * bool(doubt)
     if not commands:
         unread = (s for s in sources if s.role == "control" and s.unreadable)
         warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]
     for topic in (s.topic for s in sources if s.role == "control"):
-        lacking = [str(bag.path) for bag in bags if topic not in bag.topics or not bag.topics[topic].count]
+        lacking = [str(bag.path) for bag in bags if not _messages(bag, topic)]
         if 0 < len(lacking) < len(bags):
             without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
             warnings.append(f"{without}, so it is no control; leave those recordings out")
@@ -445,9 +440,9 @@ def _members(
     (like,) = one
     found = {}
     for member in dict.fromkeys(c.element for c in moving.values() if c.element):
-        alike = [moving.get((c.topic, c.path.replace(f"[{like}]", f"[{member}]"))) for c in group]
-        if None not in alike:
-            found[member] = [c for c in alike if c is not None]
+        places = [(c.topic, c.path.replace(f"[{like}]", f"[{member}]")) for c in group]
+        if moving.keys() >= set(places):
+            found[member] = [moving[place] for place in places]
     return found if len(found) > 1 else {}
 
 
