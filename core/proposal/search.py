@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -225,17 +225,11 @@ class KnotCandidate:
     def row(self, base: Score | None, signal: str) -> dict[str, Any]:
         """Its line in the table."""
         row: dict[str, Any] = {"knots": self.count}
-        if self.model is not None:
-            row["at"] = knots_of(self.model, signal)
+        row |= {} if self.model is None else {"at": knots_of(self.model, signal)}
         if self.score is None or base is None:
-            return {**row, "refused": self.refused}
-        return {
-            **row,
-            "outside": self.score.share,
-            "excess": self.score.excess(base),
-            "width": self.score.width / base.width,
-            "jumps": self.score.figure / base.figure,
-        }
+            return row | {"refused": self.refused}
+        row |= {"outside": self.score.share, "excess": self.score.excess(base)}
+        return row | {"width": self.score.width / base.width, "jumps": self.score.figure / base.figure}
 
 
 def choose_knots(
@@ -275,14 +269,9 @@ def choose_knots(
             candidates.append(KnotCandidate(count, model, refused=str(error)))
             break  # more knots would be refused likewise
         facts = _what(left)
-    chosen, base = chosen_of(candidates), candidates[0]
-    return chosen, {
-        "signal": signal,
-        **facts,
-        "candidates": [c.row(base.score, signal) for c in candidates],
-        "chosen": chosen.count,
-        "reason": _reason_for_knots(candidates, chosen),
-    }
+    chosen, rows = chosen_of(candidates), [c.row(candidates[0].score, signal) for c in candidates]
+    table = {"signal": signal, **facts, "candidates": rows, "chosen": chosen.count}
+    return chosen, table | {"reason": _reason_for_knots(candidates, chosen)}
 
 
 def knots_of(model: UncertainLTI, signal: str) -> list[float]:
@@ -390,31 +379,34 @@ def choose_horizons(
         transients = thinned(transients, _OF_HORIZONS, 20 * max(lengths, default=1))
     dropped: dict[int, str] = {}
     kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)
-    asked = bool(rule.steps or rule.seconds)
+    asked, nothing = bool(rule.steps or rule.seconds), ""
     found: dict[int, list[HorizonCandidate]] = {}
     facts: dict[str, Any] = {"left_out": "recording", "units": 0, "candidates": [], "chosen": {}}
     for kind in kinds:
         if progress is not None:
             progress(f"{kind} half-widths over {', '.join(map(str, lengths))} steps")
         model = fit(transients, describe_data=False, horizons=lengths, widths=kind, drop_horizons=True, **options)
-        dropped |= {steps: _why_dropped(model, steps) for steps in lengths if steps not in model.steps}
+        said = model.fit_summary.get("messages", [])
+        for steps in (steps for steps in lengths if steps not in model.steps):
+            begin = f"no horizon of {steps} steps: "
+            dropped[steps] = next((text.removeprefix(begin) for text in said if text.startswith(begin)), "")
         try:
             one, left = score_of(transients, model, groups, FOLDS, options)
         except FitError as error:
-            _refuse_missing(model.steps, lengths if asked else (), dropped)
-            chosen: dict[int, Widths] = {h.steps: "constant" for h in model.horizons} if asked else {}
-            facts |= {"chosen": {str(h): w for h, w in chosen.items()}, "reason": f"nothing can be left out: {error}"}
-            return chosen, facts
+            nothing = f"nothing can be left out: {error}"
+            break
         facts |= _what(left)
         for j, horizon in enumerate(model.horizons):
             found.setdefault(horizon.steps, []).append(_judged_horizon(left, j, horizon.steps, kind))
-    _refuse_missing(found, lengths if asked else (), dropped)
-    chosen, facts["candidates"] = _decided(found, one, asked)
-    facts |= {
-        "chosen": {str(steps): widths for steps, widths in chosen.items()},
-        "reason": _reason_for_horizons(chosen, found, dropped),
-    }
-    return chosen, facts
+    there = model.steps if nothing else found
+    if missing := [steps for steps in lengths if asked and steps not in there]:
+        raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
+    if nothing:
+        chosen: dict[int, Widths] = {steps: "constant" for steps in model.steps if asked}
+    else:
+        chosen, facts["candidates"] = _decided(found, one, asked)
+    facts["chosen"] = {str(steps): widths for steps, widths in chosen.items()}
+    return chosen, facts | {"reason": nothing or _reason_for_horizons(chosen, found, dropped)}
 
 
 def _judged_horizon(left: Validation, j: int, steps: int, kind: Widths) -> HorizonCandidate:
@@ -429,18 +421,6 @@ def _judged_horizon(left: Validation, j: int, steps: int, kind: Widths) -> Horiz
     )
 
 
-def _refuse_missing(there: Collection[int], asked: Sequence[int], dropped: Mapping[int, str]) -> None:
-    if missing := [h for h in asked if h not in there]:
-        raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
-
-
-def _why_dropped(model: UncertainLTI, steps: int) -> str:
-    """What the fit says of a horizon that was asked for and is not in the model."""
-    begin = f"no horizon of {steps} steps: "
-    said = [text for text in model.fit_summary.get("messages", []) if text.startswith(begin)]
-    return said[0].removeprefix(begin) if said else ""
-
-
 def _decided(
     found: Mapping[int, Sequence[HorizonCandidate]], base: Score, asked: bool
 ) -> tuple[dict[int, Widths], list[dict[str, Any]]]:
@@ -453,30 +433,24 @@ def _decided(
         best, other = ordered[0], ordered[-1]
         if other is not best and other.holds(best) and other.width <= PAYS * best.width:
             best = other
-        why = "asked for" if asked else ""
-        if not asked:
-            if not best.judged.sum():
-                why = "no left-out part is so long"
-            elif not best.holds(base):
-                why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
-            elif not best.per_step <= PAYS * reached:
-                why = "sees no slower changes than the horizon before it"
-        taken = asked or not why
+        taken = asked
+        if asked:
+            why = "asked for"
+        elif not best.judged.sum():
+            why = "no left-out part is so long"
+        elif not best.holds(base):
+            why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
+        elif not best.per_step <= PAYS * reached:
+            why = "sees no slower changes than the horizon before it"
+        else:
+            why, taken = "holds, and sees slower changes", True
         if taken:
             chosen[steps], reached = best.widths, best.per_step
         instead = "growing ones are narrower" if best.widths == "growing" else "constant ones hold as well"
-        rows += [
-            {
-                "steps": steps,
-                "widths": one.widths,
-                "outside": one.share,
-                "width": one.width,
-                "per_step": one.per_step,
-                "taken": taken and one is best,
-                "why": (why or "holds, and sees slower changes") if one is best else instead,
-            }
-            for one in ordered
-        ]
+        for one in ordered:
+            row: dict[str, Any] = {"steps": steps, "widths": one.widths, "outside": one.share, "width": one.width}
+            row |= {"per_step": one.per_step, "taken": taken and one is best, "why": why if one is best else instead}
+            rows.append(row)
     return chosen, rows
 
 
