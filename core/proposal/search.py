@@ -31,7 +31,7 @@ from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.monitor_fit import ALONE, CLEARLY, FOLDS, fit_monitored
+from uncertain_lti.validation.monitor_fit import CLEARLY, FOLDS, fit_monitored
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import by_unit, fitted_parts
 from uncertain_lti.validation.result import Validation
@@ -136,7 +136,7 @@ def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, st
         figures: dict[At, float] = {}
         for at in _promising_ends(few, tried["arrival"]):
             panel = fit_monitored(tried.get(at, few), **options).panel
-            if panel is None or panel.units < UNITS or len(panel.unlike) > ALONE * panel.units:
+            if panel is None or panel.units < UNITS or not panel.vouched:
                 return "departure", ""
             figures[at] = panel.figure
     except UncertainLTIError:  # a control is a state, or too little is left
