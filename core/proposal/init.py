@@ -370,8 +370,12 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
-    if not (states or controls or like) and is_plant(sources):
-        return _of_plant(bags, sources, runs, warnings)
+    if not (states or controls or like) and is_plant(sources):  # names are those of the columns
+        chosen, used = plant_signals(sources)
+        if not chosen:
+            raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
+        text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
+        return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     switches = [] if controls else take_switches(sources)
@@ -418,15 +422,6 @@ def propose(
         warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
     text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
-
-
-def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str, warnings: Sequence[str]) -> Proposal:
-    """The proposal for process data; names are those of the columns."""
-    chosen, used = plant_signals(sources)
-    if not chosen:
-        raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
-    text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
-    return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
 
 
 def _members(
