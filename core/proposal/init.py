@@ -113,8 +113,6 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
             source.candidates = _candidates(topic, fact.fields)
             if not source.candidates:
                 source.reason = "no number in it"
-        if source.reason:
-            source.candidates = []
     _limit(bags, sources)
     for bag in bags:
         _read(bag, [s for s in sources if s.candidates], progress)
@@ -461,8 +459,8 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
     for one in chosen:
         of = group[names.index(one.of)]
         memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
-        lag, rate = memory.kind == "lag", memory.kind == "rate"
-        recalled = replace(of, name=one.name, path=memory.of(of.path), steady=of.steady if lag else 0.0, delay=0)
-        recalled.unit += "/s" if of.unit and rate else ""
+        steady = of.steady if memory.kind == "lag" else 0.0
+        unit = f"{of.unit}/s" if of.unit and memory.kind == "rate" else of.unit
+        recalled = replace(of, name=one.name, path=memory.of(of.path), steady=steady, unit=unit, delay=0)
         lines.append(entry(recalled, comment=gain))
     return lines
