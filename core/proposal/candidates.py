@@ -198,7 +198,7 @@ class Steps:
         freedom = len(self.X) - known - 2
         if freedom < 5:
             return np.zeros(len(more))
-        X = self.X / np.maximum(np.abs(self.X).max(axis=0, initial=0.0), 1e-300)
+        X = self.X / size_of(self.X)
         x, y = left(np.hstack([X[:, kept], self.U]), X[:, more], self.dX[:, kept])
         without = (y**2).sum(axis=0)
         gain = (x.T @ y) ** 2 / np.maximum((x**2).sum(axis=0), 1e-300)[:, None]
@@ -221,13 +221,17 @@ def _without(x: Array, y: Array) -> Array:
     return np.asarray((rest**2).sum(axis=0))
 
 
+def size_of(values: Array) -> Array:
+    """Largest magnitude of each column (k,), to divide by."""
+    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300))
+
+
 def left(Z: Array, *of: Array) -> tuple[Array, ...]:
     """What a least-squares fit on [1, Z] leaves of some columns, (N, k) each.
 
     `Z` (N, j): regressors; Returns (N, k): one array for each that is given.
     """
-    size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
-    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size]))
+    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size_of(Z)]))
     return tuple(Y - Q @ (Q.T @ Y) for Y in of)
 
 

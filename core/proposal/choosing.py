@@ -34,6 +34,7 @@ from uncertain_lti.proposal.candidates import (
     from_both_ends,
     is_physical,
     most_shown,
+    size_of,
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
@@ -71,22 +72,17 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     return [pool[i] for i in sorted(kept)]
 
 
-_SHIFTS = (0, 1, -1)
-"""Samples by which a function of a candidate may be off."""
 FOLLOWS = 0.15
 """Standard deviation around a smooth function, as a share, from which on it is none."""
-
-
-def _shifted(of: Array, values: Array, shift: int) -> tuple[Array, Array]:
-    return of[max(shift, 0) : len(of) + min(shift, 0)], values[max(-shift, 0) : len(values) - max(shift, 0)]
 
 
 def functions(X: Array) -> NDArray[np.bool_]:
     """Whether [i, j] j is a smooth function of i, at the same instants or one sample off, but for noise; X (N, n)."""
     found = np.zeros((X.shape[1], X.shape[1]), dtype=bool)
     moving = np.flatnonzero(np.ptp(X[1:-1], axis=0) > 0)
-    for i, shift in product(moving.tolist(), _SHIFTS):
-        a, b = _shifted(X[:, i], X[:, moving], shift)
+    values = X[:, moving]
+    for i, (now, after) in product(moving.tolist(), ((0, 0), (1, 0), (0, 1))):
+        a, b = X[now : len(X) - after, i], values[after : len(X) - now]
         a = (a - a.mean()) / a.std()
         basis = np.column_stack([np.ones_like(a), a, a**2, a**3])
         rest = b - basis @ np.linalg.lstsq(basis, b, rcond=None)[0]
@@ -212,8 +208,6 @@ def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
 
 def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
     a, b = np.concatenate(one.values), np.concatenate(other.values)
-    if one.topic != other.topic or len(a) != len(b):
-        return False
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
     if len(a) <= 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -266,21 +260,18 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
                 candidate.reason, candidate.ready = source.reason, "state"
     pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], every, like)
     used = drop_copies(used)
-    steps = steps_of(pool, every, used)
-    pool = drop_functions(steps, pool)
-    pool, doubt = drop_noise(pool, every, used)
-    steps = steps_of(pool, every, used)
-    N = len(steps.X)
+    pool, doubt = drop_noise(drop_functions(steps_of(pool, every, used), pool), every, used)
+    N = len(steps_of(pool, every, used).X)
     room = max(2, N // PER_UNKNOWN)
     used = _strongest(_driven(pool, every, used, 0), used, _Room(room // 2, "controls"))
     steps = steps_of(pool, every, used)
-    states_room = _Room(room - len(used), "states")
+    states_room, driven = _Room(room - len(used), "states"), _driven(pool, every, used)
     if N < FEWEST:
         keep = pool[:MOST]
-    elif _is_pose(pool):
-        keep = _steered(pool, states_room, _driven(pool, every, used))
+    elif all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool):  # place and attitude of a body
+        keep = _steered(pool, states_room, driven)
     else:
-        keep = _coupled(steps, pool, states_room, _driven(pool, every, used).max(axis=0, initial=0.0))
+        keep = _coupled(steps, pool, states_room, driven.max(axis=0, initial=0.0))
     drop_idle_controls(steps_of(keep, every, used), used, _driven(keep, every, used, 0)[1:].max(axis=1, initial=0.0))
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
@@ -308,14 +299,9 @@ def _driven(
     steps = steps_of(pool, every, [*used, *used], [0] * m + [-1] * m)
     if not m or len(steps.X) < FEWEST:
         return found
-    U, V = np.hsplit(steps.U / _spread(steps.U).T, 2)
+    U, V = np.hsplit(steps.U / size_of(steps.U), 2)
     servo = from_both_ends(steps.X, U, V, steps.dX, np.ones(m, dtype=bool))[0]
     return np.where(servo, most(Steps(steps.X, V, steps.dX)), found)
-
-
-def _is_pose(pool: Sequence[Candidate]) -> bool:
-    """Place and attitude of a body, all of which move together somehow."""
-    return all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool)
 
 
 def _one_element(
@@ -421,16 +407,11 @@ def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence
         if N < PER_UNKNOWN * (len(states) + len(used)):
             return
         u = steps.U.T.reshape(LONGEST_DELAY + 1, len(used), N)
-        found = lags(steps.X.T / _spread(steps.X), u / _spread(u[0].T)[None], steps.dX.T, np.ones(N))
+        found = lags((steps.X / size_of(steps.X)).T, u / size_of(u[0].T)[:, None], steps.dX.T, np.ones(N))
         if not found:
             return
         first = max(found, key=lambda j: found[j][1])
         used[first].delay += found[first][0]
-
-
-def _spread(values: Array) -> Array:
-    """Size of each column, (k, 1), to divide by."""
-    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300)[:, None])
 
 
 MOST_VALUES = 8
@@ -566,9 +547,9 @@ def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> li
 
 def _told(candidate: Candidate, controls: Sequence[Candidate]) -> float:
     """Share of the variance that a linear function of the controls of the same row tells; 0 if the rest lasts."""
-    y, U = np.concatenate(candidate.values), np.column_stack([np.concatenate(c.values) for c in [candidate, *controls]])
-    good = np.isfinite(U).all(axis=1)
-    y, U = y[good], np.column_stack([U[good, 1:], np.ones(good.sum())])
+    columns = np.column_stack([np.concatenate(c.values) for c in [candidate, *controls]])
+    columns = columns[np.isfinite(columns).all(axis=1)]
+    y, U = columns[:, 0], np.column_stack([columns[:, 1:], np.ones(len(columns))])
     if len(y) < FEWEST * U.shape[1] or y.var() == 0:
         return 0.0
     rest = y - U @ np.linalg.lstsq(U, y, rcond=None)[0]

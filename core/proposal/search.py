@@ -26,7 +26,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.candidates import from_both_ends, left
+from uncertain_lti.proposal.candidates import from_both_ends, left, size_of
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule
@@ -92,15 +92,11 @@ def _geometric(values: ArrayLike) -> float:
 
 
 def score_of(
-    transients: Sequence[Transient],
-    model: UncertainLTI,
-    groups: Sequence[Any] | str | None,
-    folds: int,
-    options: Mapping[str, Any],
+    transients: Sequence[Transient], model: UncertainLTI, groups: Sequence[Any] | str | None, options: Mapping[str, Any]
 ) -> tuple[Score, Validation]:
     """What was left out of the fit with these options, on the schedule of the model. Raises FitError if nothing was."""
     own = {name: value for name, value in options.items() if name != "schedule"}
-    left = leave_out(transients, full=model, groups=groups, folds=folds, **own)
+    left = leave_out(transients, full=model, groups=groups, folds=FOLDS, **own)
     return Score.of(left, learn(left, fitted_parts(model, transients)).figure), left
 
 
@@ -168,7 +164,7 @@ def _promising_ends(transients: Sequence[Transient], arrival: Sequence[Transient
     free = np.array([a != b for a, b in zip(transients[0].ends, arrival[0].ends, strict=True)], dtype=bool)
     if not free.any() or len(X) < ENOUGH * (X.shape[1] + 2 * U.shape[1]):
         return []
-    size = np.maximum(np.abs(U).max(axis=0, initial=0.0), 1e-300)
+    size = size_of(U)
     U, V, dX = U / size, (V / size)[:, free], after - X
     aligned, move, late = from_both_ends(X, U, V, dX, free)
     rest = {"arrival": left(np.hstack([X, U[:, ~free], V]), dX)[0], "both": move - late}
@@ -261,7 +257,7 @@ def choose_knots(
             model = fit(transients, schedule=asked, describe_data=False, **options)
             if candidates and (tied := sum(data.tied_to is not None for data in model.block_data)):
                 raise FitError(f"{tied} of {plural(len(model.block_data), 'block')} would have too little data")
-            score, left = score_of(transients, model, groups, FOLDS, options)
+            score, left = score_of(transients, model, groups, options)
             candidates.append(KnotCandidate(count, model, score))
         except FitError as error:
             if not candidates and model is None:
@@ -391,7 +387,7 @@ def choose_horizons(
             begin = f"no horizon of {steps} steps: "
             dropped[steps] = next((text.removeprefix(begin) for text in said if text.startswith(begin)), "")
         try:
-            one, left = score_of(transients, model, groups, FOLDS, options)
+            one, left = score_of(transients, model, groups, options)
         except FitError as error:
             nothing = f"nothing can be left out: {error}"
             break

@@ -31,6 +31,7 @@ from uncertain_lti.identification.evidence import autocorrelation, late_controls
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
+from uncertain_lti.proposal.candidates import size_of
 from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of, thinned
 from uncertain_lti.sampling.clock import longest_step
@@ -38,7 +39,7 @@ from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 from uncertain_lti.signals.values import Additive
-from uncertain_lti.validation.monitor_fit import CLEARLY, FOLDS, fit_monitored, point_of
+from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
 
 PROMISING, SIGNALS = 0.9, 2
@@ -191,7 +192,7 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
     def scored(memories: tuple[Remembered, ...]) -> Score:
         runs = thinned(remember(transients, memories), 5 * TRANSITIONS)
         model = fitting.fit(runs, schedule={}, describe_data=False, additive=additive)
-        return score_of(runs, model, None, FOLDS, {"additive": additive})[0]
+        return score_of(runs, model, None, {"additive": additive})[0]
 
     chosen: tuple[Remembered, ...] = ()
     try:
@@ -220,7 +221,7 @@ def promise(transients: Sequence[Transient]) -> dict[str, float]:
         np.concatenate([getattr(step, name) for step in steps]) for name in ("x", "u", "s", "x_next", "dt")
     )
     z = np.column_stack([x, u])
-    phi = dt * np.vstack([(z / np.maximum(np.abs(z).max(axis=0, initial=0.0), 1e-300)).T, np.ones(len(z))])
+    phi = dt * np.vstack([(z / size_of(z)).T, np.ones(len(z))])
     if len(z) < 9 * len(phi):
         return dict.fromkeys(names, 1.0)
     move = x_next - x
