@@ -443,7 +443,7 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     few = {name: counts for name, counts in columns.items() if len(counts) <= _LABELS}  # no angle of attack
     for name, counts in few.items():
         for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
-            if candidate.path.partition("[")[0] == name:
+            if candidate.kind == name:
                 candidate.reason = "a label by its name, and no signal of the machine"
         if len(counts) > 1:
             usual, number = counts.most_common(1)[0]
@@ -482,16 +482,13 @@ def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str
     """Give the roles that a person asks for in place of those by name; a source that has both is split in two."""
     asked = {"state": states, "control": controls}
     met: dict[str, set[Candidate]] = {role: set() for role in asked}
+    every = [(s, c) for s in sources for c in s.candidates]
     for role, pattern in ((role, pattern) for role, patterns in asked.items() for pattern in patterns):
         topic, _, field = pattern.partition(":")
-        found = [
-            c
-            for s in sources
-            for c in s.candidates
-            if fnmatchcase(s.topic, topic) and (not field or fnmatchcase(_plain(c.path), _plain(field)))
-        ]
+        of_topic = [c for s, c in every if fnmatchcase(s.topic, topic)]
+        found = [c for c in of_topic if fnmatchcase(_plain(c.path), _plain(field or "*"))]
         if not any(not c.reason for c in found):
-            fields = [f"{s.topic}:{c.path}" for s in sources for c in s.candidates if pattern == c.path]
+            fields = [f"{s.topic}:{c.path}" for s, c in every if pattern == c.path]
             why = f"; topics there: {shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)}"
             if found:
                 why = f"; {found[0].path} is {found[0].reason}"
