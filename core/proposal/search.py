@@ -102,11 +102,8 @@ def score_of(
 
 def _what(left: Validation) -> dict[str, Any]:
     """What was left out at a time, and how often."""
-    many = left.units > FOLDS
-    return {
-        "left_out": f"{FOLDS}th part of the {left.what}s" if many else left.what,
-        "units": FOLDS if many else left.units,
-    }
+    what = f"{FOLDS}th part of the {left.what}s" if left.units > FOLDS else left.what
+    return {"left_out": what, "units": min(left.units, FOLDS)}
 
 
 ENOUGH, COMPARED = 20, 20_000
@@ -251,9 +248,8 @@ def choose_knots(
             break
         if progress is not None and candidates:
             progress(f"{plural(count, 'knot')} on {signal}")
-        model = None
+        model, asked = None, {signal: count, **beside} if candidates else beside
         try:
-            asked = {signal: count, **beside} if candidates else beside
             model = fit(transients, schedule=asked, describe_data=False, **options)
             if candidates and (tied := sum(data.tied_to is not None for data in model.block_data)):
                 raise FitError(f"{tied} of {plural(len(model.block_data), 'block')} would have too little data")
