@@ -307,7 +307,7 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     apart = validation.what != "block" and int(unit_numbers(parts).max()) + 1 >= TELLING
     stretch = lengths[len(lengths) // 10]
     rules = rules_for(validation.model, stretch, dt, apart)
-    model, left, fitted = _narrowest(validation.model, rules, parts, fitted, dt, validation.what)
+    model, left, fitted = _narrowest(validation, rules, parts, fitted, dt)
     rules = rules_for(model, stretch, dt, apart)
     evidence, shown, unlike = _gathered(rules, left, fitted, dt)
     found = evidence.with_alarms(rules, validation.what, shown)
@@ -320,19 +320,14 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
 
 
 def _narrowest(
-    model: UncertainLTI,
-    rules: Sequence[StatisticRule],
-    parts: Sequence[Part],
-    fitted: Sequence[Part],
-    dt: float,
-    what: str,
+    validation: Validation, rules: Sequence[StatisticRule], parts: Sequence[Part], fitted: Sequence[Part], dt: float
 ) -> tuple[UncertainLTI, Sequence[Part], Sequence[Part]]:
     """The model with the form of its residuals in which the joint statistics of one step leave the least room.
 
     Room is the volume that a joint statistic allows to a residual: the root of the determinant of its covariance, in
     utilisation times half-widths, and of its threshold. Returns what is left out and fitted in that form, too.
     """
-    joint = [rule for rule in rules if rule.kind == "chi2" and rule.horizon == 1]
+    model, joint = validation.model, [rule for rule in rules if rule.kind == "chi2" and rule.horizon == 1]
     forms = () if model.residuals is None else model.residuals.forms
     best, least = (model, parts, fitted), math.inf
     for form in forms if joint else forms[:1]:
@@ -343,7 +338,9 @@ def _narrowest(
             roots = np.diagonal(form.whitening(np.ones(model.n, dtype=bool)))
             half = evidence.widths[1] / 2.0 / model.operating_point.X if form.relative else np.ones(model.n)
             sizes = np.log(half[roots > 0.0] / roots[roots > 0.0])
-            room = float(sizes.sum() / max(len(sizes), 1) + np.log(evidence.thresholds(joint, model.n, what)).mean())
+            room = float(
+                sizes.sum() / max(len(sizes), 1) + np.log(evidence.thresholds(joint, model.n, validation.what)).mean()
+            )
         if room < least:
             best, least = (own, left, seen), room
     return best
