@@ -25,7 +25,6 @@ from uncertain_lti.proposal.tune import (
     recall,
     remember,
     with_delays,
-    with_memories,
 )
 from uncertain_lti.signals.field_path import FieldPath, Memory, parse_memory
 from uncertain_lti.signals.signal_map import Signal
@@ -190,14 +189,6 @@ def test_no_memory_is_a_candidate_where_every_state_is_measured() -> None:
     assert not any(one.of.startswith("x") for some in memory_candidates(runs) for one in some)
 
 
-@pytest.mark.parametrize(
-    ("memories", "words"),
-    [({"m": ("swin", Memory("lag"))}, "is swing meant"), ({"push": ("swing", Memory("lag"))}, "already")],
-)
-def test_a_memory_of_nothing_or_under_a_taken_name_is_refused(memories: dict[str, object], words: str) -> None:
-    refuses(TransientError, words, with_memories, oscillating(1), memories)  # type: ignore[arg-type]
-
-
 def test_a_delayed_control_is_that_of_a_signals_file_with_the_delay() -> None:
     """Samples and signals alike, and what the monitor replays from them."""
     run = oscillating(1)
@@ -210,12 +201,6 @@ def test_a_delayed_control_is_that_of_a_signals_file_with_the_delay() -> None:
     np.testing.assert_array_equal(twice.u[4:, 0], run.u[:-4, 0])
     arrays = Transient(run.t_ns, run.x, run.u)
     np.testing.assert_array_equal(with_delays(arrays, {"u1": 3}).u, late.u)
-
-
-@pytest.mark.parametrize(("name", "words"), [("swing", "there is no control"), ("push_before", "takes no delay")])
-def test_what_is_no_control_or_a_memory_takes_no_delay(name: str, words: str) -> None:
-    run = remember([oscillating(1)], [Remembered("push", Memory("lag"))])[0]
-    refuses(TransientError, words, with_delays, run, {name: 1})
 
 
 def test_the_lag_of_a_delayed_signal_is_as_much_longer_and_it_has_no_other_memory() -> None:

@@ -183,7 +183,7 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(learnt, runs):
         assert energy.thresholds(2)[i] > max(window) * (1 - 0.06)  # a window of 10.5 steps
     rules, evidence = [replace(rule, threshold=1.0) for rule in panel.rules], panel.evidence
     limits = np.concatenate(evidence.thresholds(rules, 2, "recording"))
-    levels = [(np.hstack(sizes_of(rules, part)) / limits).max(axis=1) for part in parts]
+    levels = [(sizes_of(rules, part) / limits).max(axis=1) for part in parts]
     near = min(1.0, max(0.95 * sorted(each.max() for each in levels)[-3], 0.75))  # just below the third largest
     assert evidence.near.tolist() == [rising(v > near, p.starts) for v, p in zip(levels, parts, strict=True)]
     weights = [part.judged for part in parts]
@@ -193,7 +193,7 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(learnt, runs):
     middle_half = np.average([part.median_width for part in parts], axis=0, weights=weights) / 2
     offsets = middle_half * np.sqrt(energy.thresholds(2))
     assert panel.figure == pytest.approx(np.exp(np.log(offsets).mean()), rel=1e-12)
-    assert panel.within == pytest.approx(DT)
+    assert evidence.dt == pytest.approx(DT)
 
 
 @pytest.mark.parametrize(
@@ -298,7 +298,8 @@ def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
 def test_the_hours_that_would_show_a_rate_show_it():
     hours, asked = 6.0, 0.1
     limit = rate_interval(np.zeros(8), hours, CONFIDENCE, one_sided=True)[1]
-    panel = Panel((), limit, 0, hours, 8, "recording", np.ones(1), 1.0, 1.0, None, asked=asked)
+    evidence = Evidence(np.ones((8, 1)), np.ones(1), np.ones(1), 100, np.ones((2, 1)), 100, hours, DT)
+    panel = Panel((), limit, "recording", np.ones(1), 1.0, evidence, asked=asked)
     needed = panel.needed_hours
     assert needed > hours and rate_interval(np.zeros(8), needed, CONFIDENCE, one_sided=True)[1] == pytest.approx(asked)
 
@@ -424,8 +425,9 @@ def test_states_that_are_blind_are_named(learnt):
     assert "is over ten times the recorded range" in worth(full, replace(panel, biases=1e6 * span))[1]
     assert worth(full, replace(panel, biases=0.041 * span))[1].endswith("jumps of 4.1 % of the recorded range")
     assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0))[0]
-    assert "(0 in 28.8 s left out" in promises(full, replace(panel, hours=0.008, alarms=0))[0]
-    far = promises(full, replace(panel, within=0.5, biases=np.array([0.25, 11.0]) * span))[1]
+    quiet = replace(panel.evidence, hours=0.008, counts=np.zeros(3), dt=0.5)
+    assert "(0 in 28.8 s left out" in promises(full, replace(panel, evidence=quiet))[0]
+    far = promises(full, replace(panel, evidence=quiet, biases=np.array([0.25, 11.0]) * span))[1]
     assert far.startswith("sees within 0.5 s a jump of x1 ")
     assert far.endswith("; of x2 not even a jump of ten times the recorded range")
     said = promises(full, replace(panel, biases=11.0 * span))[1]

@@ -17,7 +17,7 @@ import pytest
 from uncertain_lti import SignalMap, Transient
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.identification import fit
-from uncertain_lti.proposal.tune import with_memories
+from uncertain_lti.proposal.tune import Remembered, with_memories
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal import members_of
 
@@ -94,5 +94,5 @@ def test_own_leaves_each_state_its_own_signals_and_those_of_none() -> None:
             assert not apart or (row[j] == 0 and half[j] == 0)
             assert apart or (name[:2] == state[:2] and "_u" in name) or row[j] != 0
     assert all(model.B[i, i] >= 0 for i in range(3))
-    more = fit(with_memories(run, {"j1_before": ("j1", Memory("lag"))}))
+    more = fit(with_memories(run, [Remembered("j1", Memory("lag"))]))
     assert np.flatnonzero(more.B[:, -1]).tolist() == [1, 3] and not more.dB[[0, 2], -1].any()

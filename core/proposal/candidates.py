@@ -79,6 +79,12 @@ class Candidate:
         return self.topic, alike
 
     @property
+    def finite(self) -> Array:
+        """Its numbers in all recordings."""
+        values = np.concatenate([np.empty(0), *self.values])
+        return np.asarray(values[np.isfinite(values)])
+
+    @property
     def kind(self) -> str:
         """Path without the entry: `position` of `position[j0]`."""
         return self.path.partition("[")[0]
@@ -133,6 +139,12 @@ class Source:
                 return mine, theirs
         return self.arrival[number], clock.arrival[number]
 
+    def parted(self, some: Collection[Candidate], role: str) -> Source:
+        """Some of its numbers, which leave it for a topic of their own."""
+        found = replace(self, candidates=[c for c in self.candidates if c in some], role=role, reason="")
+        self.candidates = [c for c in self.candidates if c not in some]
+        return found
+
     @property
     def free(self) -> list[Candidate]:
         """Candidates without a reason against them."""
@@ -158,22 +170,14 @@ class Steps:
     U: Array
     dX: Array
 
-    def effect(self, on: Sequence[int], of: Sequence[int] | None = None, given: Sequence[int] | None = None) -> Array:
-        """F statistic in the next step of some states: of the controls, or of other states.
-
-        Given the states `given` (default all), and the controls unless these are what is asked for.
-        """
-        n, m = self.X.shape[1], self.U.shape[1]
-        tested = list(range(n, n + m)) if of is None else list(of)
-        known = [j for j in (range(n) if given is None else given) if j not in tested]
-        if of is not None:
-            known += range(n, n + m)
-        Z, Y = np.hstack([self.X, self.U]), self.dX[:, list(on)]
-        freedom = len(Z) - len(known) - len(tested) - 1
-        if freedom < 5 or not tested:
-            return np.zeros(len(on))
-        without, full = residual(Z[:, known], Y), residual(Z[:, [*known, *tested]], Y)
-        return _statistic(without, full, Y, len(tested), freedom)
+    def effect(self) -> Array:
+        """F statistic of the controls together, given the states, in the next step of each state (n,)."""
+        (N, n), m = self.X.shape, self.U.shape[1]
+        freedom = N - n - m - 1
+        if freedom < 5 or not m:
+            return np.zeros(n)
+        without, full = residual(self.X, self.dX), residual(np.hstack([self.X, self.U]), self.dX)
+        return _statistic(without, full, self.dX, m, freedom)
 
     def effect_of_each(self) -> Array:
         """F statistic of each control, given the others, in the next step of each state (m, n)."""
@@ -186,15 +190,15 @@ class Steps:
         return np.array([_statistic(one, full, self.dX, 1, freedom) for one in without]).reshape(m, n)
 
     def coupling(self, kept: Sequence[int], rest: Sequence[int]) -> Array:
-        """Larger F statistic of `effect(kept, of=[j], given=kept)` and `effect([j], of=kept, given=[j])`.
+        """Larger F statistic of each other state in the next step of those kept, and of these in that of the other.
 
-        Returns (len(rest),): of each j of them.
+        Given what it is compared with, and the controls. Returns (len(rest),).
         """
         known, more = len(kept) + self.U.shape[1], list(rest)
         freedom = len(self.X) - known - 2
         if freedom < 5:
             return np.zeros(len(more))
-        X = self.X / np.maximum(np.abs(self.X).max(axis=0, initial=0.0), 1e-300)
+        X = self.X / size_of(self.X)
         x, y = left(np.hstack([X[:, kept], self.U]), X[:, more], self.dX[:, kept])
         without = (y**2).sum(axis=0)
         gain = (x.T @ y) ** 2 / np.maximum((x**2).sum(axis=0), 1e-300)[:, None]
@@ -217,13 +221,17 @@ def _without(x: Array, y: Array) -> Array:
     return np.asarray((rest**2).sum(axis=0))
 
 
+def size_of(values: Array) -> Array:
+    """Largest magnitude of each column (k,), to divide by."""
+    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300))
+
+
 def left(Z: Array, *of: Array) -> tuple[Array, ...]:
     """What a least-squares fit on [1, Z] leaves of some columns, (N, k) each.
 
     `Z` (N, j): regressors; Returns (N, k): one array for each that is given.
     """
-    size = np.maximum(np.abs(Z).max(axis=0, initial=0.0), 1e-300)
-    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size]))
+    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size_of(Z)]))
     return tuple(Y - Q @ (Q.T @ Y) for Y in of)
 
 
@@ -311,10 +319,13 @@ def held(candidate: Candidate, source: Source, number: int, clock: Source, oldes
 def explained(state: Source, controls: Sequence[Source]) -> float:
     """How clearly some topics show in the next step of the best of a topic's numbers."""
     every = {s.topic: s for s in [state, *controls]}
-    steps = steps_of(state.free, every, [c for s in controls for c in s.free])
-    if len(steps.X) < FEWEST:
-        return 0.0
-    return float(np.max(steps.effect(range(len(state.free))), initial=0.0))
+    return most_shown(state.free, every, [c for s in controls for c in s.free])
+
+
+def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: Sequence[Candidate]) -> float:
+    """How clearly some numbers show in the next step of the best of others."""
+    steps = steps_of(states, every, controls)
+    return float(np.max(steps.effect(), initial=0.0)) if len(steps.X) >= FEWEST else 0.0
 
 
 # Words in the name of a topic or of its type; the last word of a name counts most.
@@ -383,10 +394,9 @@ def role_by_name(topic: str, type_name: str) -> str:
             return "state"
         if _REFERENCE.search(text):
             return "reference"
-        if (_ABOVE if text == name != last else _COMMAND).search(text):
+        bare_twist = text == last and kind == "twist" and text.endswith("vel")  # what drives a base
+        if bare_twist or (_ABOVE if text == name != last else _COMMAND).search(text):
             return "control"
-        if text == last and kind == "twist" and text.endswith("vel"):
-            return "control"  # a bare Twist is what drives a base
         if _STATE.search(text):
             return "state"
     return ""
@@ -433,7 +443,7 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     few = {name: counts for name, counts in columns.items() if len(counts) <= _LABELS}  # no angle of attack
     for name, counts in few.items():
         for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
-            if candidate.path.partition("[")[0] == name:
+            if candidate.kind == name:
                 candidate.reason = "a label by its name, and no signal of the machine"
         if len(counts) > 1:
             usual, number = counts.most_common(1)[0]
@@ -449,13 +459,10 @@ def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls."""
     found = []
     for table in (s for s in sources if s.type == TYPE and s.role == "state"):
-        switches = [c for c in table.candidates if c.reason == TWO_VALUES]
-        if not switches:
-            continue
+        if switches := [c for c in table.candidates if c.reason == TWO_VALUES]:
+            found.append(table.parted(switches, "switch"))
         for candidate in switches:
             candidate.reason = ""
-        table.candidates = [c for c in table.candidates if c not in switches]
-        found.append(replace(table, candidates=switches, role="switch", reason=""))
     return found
 
 
@@ -473,18 +480,15 @@ def at_rest(sources: Sequence[Source]) -> str:
 
 def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
     """Give the roles that a person asks for in place of those by name; a source that has both is split in two."""
-    asked = [("state", p) for p in states] + [("control", p) for p in controls]
-    met: dict[str, set[Candidate]] = {"state": set(), "control": set()}
-    for role, pattern in asked:
+    asked = {"state": states, "control": controls}
+    met: dict[str, set[Candidate]] = {role: set() for role in asked}
+    every = [(s, c) for s in sources for c in s.candidates]
+    for role, pattern in ((role, pattern) for role, patterns in asked.items() for pattern in patterns):
         topic, _, field = pattern.partition(":")
-        found = [
-            c
-            for s in sources
-            for c in s.candidates
-            if fnmatchcase(s.topic, topic) and (not field or fnmatchcase(_plain(c.path), _plain(field)))
-        ]
+        of_topic = [c for s, c in every if fnmatchcase(s.topic, topic)]
+        found = [c for c in of_topic if fnmatchcase(_plain(c.path), _plain(field or "*"))]
         if not any(not c.reason for c in found):
-            fields = [f"{s.topic}:{c.path}" for s in sources for c in s.candidates if pattern == c.path]
+            fields = [f"{s.topic}:{c.path}" for s, c in every if pattern == c.path]
             why = f"; topics there: {shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)}"
             if found:
                 why = f"; {found[0].path} is {found[0].reason}"
@@ -497,11 +501,9 @@ def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str
     for source in list(sources):
         mine = met["control"].intersection(source.candidates)
         if mine and met["state"].intersection(source.candidates):
-            held = [c for c in source.candidates if c in mine]
-            sources.append(replace(source, candidates=held, role="control", reason=""))
-            source.candidates = [c for c in source.candidates if c not in mine]
+            sources.append(source.parted(mine, "control"))
     for source in sources:
-        for role, patterns in (("state", states), ("control", controls)):
+        for role, patterns in asked.items():
             mine, why = met[role].intersection(source.candidates), f"not asked for by --{role}s"
             if mine:
                 source.role, source.reason = role, ""
@@ -528,12 +530,9 @@ def _held_columns(table: Source) -> Source | None:
         return None
     changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
     held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows)]
-    rest = replace(table, candidates=[c for c in table.candidates if c not in held])
-    found = replace(table, candidates=held, role="guess")
-    if not held or not rest.free or explained(rest, [found]) <= SHOWS:
-        return None
-    table.candidates = rest.candidates
-    return found
+    rest = [c for c in table.free if c not in held]
+    shows = held and rest and most_shown(rest, {table.topic: table}, held) > SHOWS
+    return table.parted(held, "guess") if shows else None
 
 
 def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
@@ -553,12 +552,10 @@ def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]
         best = max(controls, key=lambda s: explained(s, [c for c in controls if c is not s]))
         controls, states = [c for c in controls if c is not best], [best]
     if not controls and not any(s.role == "control" for s in sources) and len(states) + len(unknown) > 1:
-        by_effect = max(
-            (s for s in unnamed if len(states) > 1 or s not in states),  # what is measured by its name is no command
-            key=lambda s: max((explained(o, [s]) for o in states if o is not s), default=0.0),
-            default=None,
-        )
-        if by_effect is not None and max(explained(o, [by_effect]) for o in states if o is not by_effect) > SHOWS:
+        maybe = (s for s in unnamed if len(states) > 1 or s not in states)  # what is measured by its name is no command
+        effects = {s: max((explained(o, [s]) for o in states if o is not s), default=0.0) for s in maybe}
+        if effects and max(effects.values()) > SHOWS:
+            by_effect = max(effects, key=effects.__getitem__)
             by_effect.role = "guess"
             controls, states = [by_effect], [s for s in states if s is not by_effect]
             unknown = [s for s in unknown if s is not by_effect]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from typing import NamedTuple
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,8 @@ from uncertain_lti.proposal.candidates import (
     explained,
     from_both_ends,
     is_physical,
+    most_shown,
+    size_of,
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
@@ -50,71 +52,46 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     """
     if len(steps.X) < FEWEST:
         return pool
-    n = len(pool)
-    shows = steps.effect(range(n)) if steps.U.shape[1] else np.zeros(n)
     kept: list[int] = []
-    may = _may_follow(steps.X)
+    function = functions(steps.X)
 
-    def function(of: int, which: int) -> bool:
-        return bool(may[of, which]) and _function(steps.X[:, of], steps.X[:, which])
+    def drop(i: int, source: int) -> None:
+        of = pool[source]
+        place = of.path if of.topic == pool[i].topic else f"{of.topic} {of.path}"
+        pool[i].reason = f"says what {place} says already"
 
-    for i in np.argsort(-np.log(np.maximum(shows, 1.0)).round(1), kind="stable").tolist():
-        source = next((j for j in kept if function(j, i)), None)
+    for i in np.argsort(-np.log(np.maximum(steps.effect(), 1.0)).round(1), kind="stable").tolist():
+        source = next((j for j in kept if function[j, i]), None)
         if source is not None:
-            pool[i].reason = f"says what {_place(pool[source], pool[i])} says already"
+            drop(i, source)
             continue
-        for j in [j for j in kept if function(i, j)]:  # x stays, its square goes
+        for j in [j for j in kept if function[i, j]]:  # x stays, its square goes
             kept.remove(j)
-            pool[j].reason = f"says what {_place(pool[i], pool[j])} says already"
+            drop(j, i)
         kept.append(i)
     return [pool[i] for i in sorted(kept)]
 
 
-def _place(candidate: Candidate, other: Candidate) -> str:
-    return candidate.path if candidate.topic == other.topic else f"{candidate.topic} {candidate.path}"
-
-
-_SHIFTS = (0, 1, -1)
-"""Samples by which a function of a candidate may be off."""
 FOLLOWS = 0.15
 """Standard deviation around a smooth function, as a share, from which on it is none."""
 
 
-def _shifted(of: Array, values: Array, shift: int) -> tuple[Array, Array]:
-    return of[max(shift, 0) : len(of) + min(shift, 0)], values[max(-shift, 0) : len(values) - max(shift, 0)]
-
-
-def _may_follow(X: Array) -> NDArray[np.bool_]:
-    """For which [of, values] `_function` may hold, (n, n): of all the others its many small fits are not needed."""
-    spread = X.std(axis=0)
-    z = (X - X.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    may = np.zeros((z.shape[1], z.shape[1]), dtype=bool)
-    for j, a in enumerate(z.T):
-        basis = np.linalg.qr(np.column_stack([np.ones_like(a), a, a**2, a**3]))[0]
-        for shift in _SHIFTS:
-            q, b = _shifted(basis, z, shift)
-            q = q if shift == 0 else np.linalg.qr(q)[0]
-            size = np.einsum("ki,ki->i", b, b)
-            rest = size - np.einsum("ji,ji->i", told := q.T @ b, told)
-            may[j] |= rest <= 1.1 * FOLLOWS**2 * (size - len(b) * b.mean(axis=0) ** 2)
-    return may
-
-
-def _function(of: Array, values: Array) -> bool:
-    """Whether these values (N,) are a smooth function of others at the same instants, or one sample off, but noise."""
-    for shift in _SHIFTS:
-        a, b = _shifted(of, values, shift)
-        if np.ptp(a) == 0 or np.ptp(b) == 0:
-            return False
+def functions(X: Array) -> NDArray[np.bool_]:
+    """Whether [i, j] j is a smooth function of i, at the same instants or one sample off, but for noise; X (N, n)."""
+    found = np.zeros((X.shape[1], X.shape[1]), dtype=bool)
+    moving = np.flatnonzero(np.ptp(X[1:-1], axis=0) > 0)
+    values = X[:, moving]
+    for i, (now, after) in product(moving.tolist(), ((0, 0), (1, 0), (0, 1))):
+        a, b = X[now : len(X) - after, i], values[after : len(X) - now]
         a = (a - a.mean()) / a.std()
         basis = np.column_stack([np.ones_like(a), a, a**2, a**3])
         rest = b - basis @ np.linalg.lstsq(basis, b, rcond=None)[0]
-        share = float(rest.std() / b.std())
-        memory = float(np.corrcoef(rest[1:], rest[:-1])[0, 1]) if rest.std() > 0 else 0.0
-        moves = float(np.diff(b).std() / b.std())
-        if share < 0.02 or (share < FOLLOWS and memory < 0.3 and moves < 0.7):  # white around what it follows
-            return True
-    return False
+        share = rest.std(axis=0) / b.std(axis=0)
+        for k in np.flatnonzero(share < FOLLOWS).tolist():
+            still = np.diff(b[:, k]).std() < 0.7 * b[:, k].std()
+            white = rest[:, k].std() == 0 or np.corrcoef(rest[1:, k], rest[:-1, k])[0, 1] < 0.3
+            found[i, moving[k]] |= share[k] < 0.02 or (still and white)  # white around what it follows
+    return found
 
 
 def drop_noise(
@@ -134,7 +111,7 @@ def drop_noise(
             "nothing here is more than noise from one sample to the next: record the machine at work before you "
             "fit a model"
         )
-    shown = steps_of(pool, every, used).effect(range(len(pool))) > SHOWS
+    shown = steps_of(pool, every, used).effect() > SHOWS
     families = {c.family for c, known in zip(pool, share, strict=True) if known >= NOISE}
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
@@ -161,18 +138,11 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
             candidate.reason, candidate.ready = "shows in the next step of none of the states", "control"
 
 
+_WITHIN = "answers within a step; add it if it has a memory of its own"
 _BESIDE = (
     (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist above"),
-    (
-        r"angular_velocity\.|\(orientation\)",
-        r"linear_acceleration\.",
-        "an acceleration answers within a step; add it if it has a memory of its own",
-    ),
-    (
-        r"^(position|velocity)\[",
-        r"^effort\[",
-        "an effort answers within a step; add it if it has a memory of its own",
-    ),
+    (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", f"an acceleration {_WITHIN}"),
+    (r"^(position|velocity)\[", r"^effort\[", f"an effort {_WITHIN}"),
 )
 """What is left out beside what, and why: of a pose and its twist the pose, of a joint the effort."""
 
@@ -182,9 +152,8 @@ def prefer_rates(source: Source) -> None:
     moves = [c.path for c in source.free]
     for there, left, reason in _BESIDE:
         if any(re.search(there, path) for path in moves):
-            for candidate in source.free:
-                if re.search(left, candidate.path):
-                    candidate.reason = reason
+            for candidate in (c for c in source.free if re.search(left, c.path)):
+                candidate.reason = reason
 
 
 _ROWS = 1 << 14
@@ -239,8 +208,6 @@ def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
 
 def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
     a, b = np.concatenate(one.values), np.concatenate(other.values)
-    if one.topic != other.topic or len(a) != len(b):
-        return False
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
     if len(a) <= 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -261,19 +228,13 @@ PER_UNKNOWN = 20
 MOST = 8  # states, and controls
 
 
-class _Room(NamedTuple):
+class _Room:
     """How many signals of a kind are proposed at most, and the reason for leaving out more."""
 
-    most: int
-    reason: str
-
-    @classmethod
-    def of(cls, carried: int, most: int, what: str) -> _Room:
-        if carried >= most:
-            return cls(
-                most, f"others show more, and at most {most} {what} are tried together; exchange one if this matters"
-            )
-        return cls(max(1, carried), f"the recording is too short for more than {max(1, carried)} {what}")
+    def __init__(self, carried: int, what: str) -> None:
+        self.most = min(max(1, carried), MOST)
+        many = f"others show more, and at most {MOST} {what} are tried together; exchange one if this matters"
+        self.reason = many if carried >= MOST else f"the recording is too short for more than {self.most} {what}"
 
 
 def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
@@ -286,10 +247,10 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     fastest = max(s.rate for s in shown)
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
-    for source in states:
+    for source in (s for s in states if s is not main):
         at_its_rate = ALIKE * fastest <= source.rate <= fastest / ALIKE
-        if source is main or (source in shown and at_its_rate):
-            pool += [] if source is main else source.free
+        if source in shown and at_its_rate:
+            pool += source.free
             continue
         source.reason = "the controls do not show in it"
         if source in shown:
@@ -299,21 +260,18 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
                 candidate.reason, candidate.ready = source.reason, "state"
     pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], every, like)
     used = drop_copies(used)
-    steps = steps_of(pool, every, used)
-    pool = drop_functions(steps, pool)
-    pool, doubt = drop_noise(pool, every, used)
-    steps = steps_of(pool, every, used)
-    N = len(steps.X)
+    pool, doubt = drop_noise(drop_functions(steps_of(pool, every, used), pool), every, used)
+    N = len(steps_of(pool, every, used).X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(_driven(pool, every, used, 0), used, _Room.of(room // 2, MOST, "controls"))
+    used = _strongest(_driven(pool, every, used, 0), used, _Room(room // 2, "controls"))
     steps = steps_of(pool, every, used)
-    states_room = _Room.of(room - len(used), MOST, "states")
+    states_room, driven = _Room(room - len(used), "states"), _driven(pool, every, used)
     if N < FEWEST:
         keep = pool[:MOST]
-    elif _is_pose(pool):
-        keep = _steered(pool, states_room, _driven(pool, every, used))
+    elif all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool):  # place and attitude of a body
+        keep = _steered(pool, states_room, driven)
     else:
-        keep = _coupled(steps, pool, states_room, _driven(pool, every, used).max(axis=0, initial=0.0))
+        keep = _coupled(steps, pool, states_room, driven.max(axis=0, initial=0.0))
     drop_idle_controls(steps_of(keep, every, used), used, _driven(keep, every, used, 0)[1:].max(axis=1, initial=0.0))
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
@@ -328,24 +286,22 @@ def _driven(
     It may be none: a servo carries a command out before the next message, which is the first to hold it.
     Returns (1 + m, n).
     """
-    found = np.zeros((1 + len(used), len(pool)))
-    for lag in range(latest + 1):
-        steps = steps_of(pool, every, used, [lag] * len(used))
-        if used and len(steps.X) >= FEWEST:
-            found = np.maximum(found, np.vstack([steps.effect(range(len(pool))), steps.effect_of_each()]))
     m = len(used)
+    found = np.zeros((1 + m, len(pool)))
+
+    def most(steps: Steps) -> Array:
+        if not m or len(steps.X) < FEWEST:
+            return found
+        return np.maximum(found, np.vstack([steps.effect(), steps.effect_of_each()]))
+
+    for lag in range(latest + 1):
+        found = most(steps_of(pool, every, used, [lag] * m))
     steps = steps_of(pool, every, [*used, *used], [0] * m + [-1] * m)
-    if used and len(steps.X) >= FEWEST:
-        U, V = np.hsplit(steps.U / _spread(steps.U).T, 2)
-        arrival, servo = Steps(steps.X, V, steps.dX), from_both_ends(steps.X, U, V, steps.dX, np.ones(m, dtype=bool))[0]
-        at_arrival = np.vstack([arrival.effect(range(len(pool))), arrival.effect_of_each()])
-        found = np.where(servo, np.maximum(found, at_arrival), found)
-    return found
-
-
-def _is_pose(pool: Sequence[Candidate]) -> bool:
-    """Place and attitude of a body, all of which move together somehow."""
-    return all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool)
+    if not m or len(steps.X) < FEWEST:
+        return found
+    U, V = np.hsplit(steps.U / size_of(steps.U), 2)
+    servo = from_both_ends(steps.X, U, V, steps.dX, np.ones(m, dtype=bool))[0]
+    return np.where(servo, most(Steps(steps.X, V, steps.dX)), found)
 
 
 def _one_element(
@@ -357,9 +313,8 @@ def _one_element(
         return pool, used
 
     def effect(element: str) -> float:
-        mine = [c for c in pool if c.element == element]
-        steps = steps_of(mine, every, [c for c in used if c.element == element])
-        return float(np.max(steps.effect(range(len(mine))), initial=0.0)) if len(steps.X) >= FEWEST else 0.0
+        mine, its = ([c for c in group if c.element == element] for group in (pool, used))
+        return most_shown(mine, every, its)
 
     best = like if like in shared else max(shared, key=effect)
     for candidate in [*pool, *used]:
@@ -370,10 +325,8 @@ def _one_element(
 
 def _strongest(driven: Array, used: list[Candidate], room: _Room) -> list[Candidate]:
     """The controls that show most, up to a number; `driven` (1 + m, n): of all controls, and of each."""
-    order = used
     if len(used) > room.most:
-        order = [used[j] for j in np.argsort(driven[1:].max(axis=1, initial=0.0))[::-1]]
-    _first(order, room)
+        _first([used[j] for j in np.argsort(driven[1:].max(axis=1, initial=0.0))[::-1]], room)
     return [c for c in used if not c.reason]
 
 
@@ -454,16 +407,11 @@ def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence
         if N < PER_UNKNOWN * (len(states) + len(used)):
             return
         u = steps.U.T.reshape(LONGEST_DELAY + 1, len(used), N)
-        found = lags(steps.X.T / _spread(steps.X), u / _spread(u[0].T)[None], steps.dX.T, np.ones(N))
+        found = lags((steps.X / size_of(steps.X)).T, u / size_of(u[0].T)[:, None], steps.dX.T, np.ones(N))
         if not found:
             return
         first = max(found, key=lambda j: found[j][1])
         used[first].delay += found[first][0]
-
-
-def _spread(values: Array) -> Array:
-    """Size of each column, (k, 1), to divide by."""
-    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300)[:, None])
 
 
 MOST_VALUES = 8
@@ -496,8 +444,9 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     """
     every = [c for s in sources for c in s.candidates if c.values]
     for candidate in every:
-        candidate.reason = _unfit(candidate)
-    drop_copies([c for c in every if not c.reason and np.ptp(_finite(c)) > 0], exact=True)
+        if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason):  # what hardly moves is a signal, too
+            candidate.reason = ""
+    drop_copies([c for c in every if not c.reason and np.ptp(c.finite) > 0], exact=True)
     free = [c for c in every if not c.reason]
     called = {c for s in sources if s.role in ("control", "reference") for c in s.candidates}
     controls = [c for c in free if _is_set(c, c in called)]
@@ -507,10 +456,11 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         if on is not None:
             candidate.why = f"0 whenever {on.path} is off"
             controls.append(candidate)
-    stems = [_stem(c) for c in controls if not c.why.startswith("always")]
-    alike = [c for c in free if c not in controls and stems.count(_stem(c)) > 1]
+    stem = {c: re.sub(r"\d+", "*", c.path) for c in free}  # of `F_PU1` and `F_PU2`, and not of one unit's
+    stems = [stem[c] for c in controls if not c.why.startswith("always")]
+    alike = [c for c in free if c not in controls and stems.count(stem[c]) > 1]
     for candidate in alike if len(controls) + len(alike) < len(free) else ():  # they go together, unless none is left
-        candidate.why = f"one of the {_stem(candidate)}, of which the others are controls"
+        candidate.why = f"one of the {stem[candidate]}, of which the others are controls"
         controls.append(candidate)
     controls += _set_or_analysed([c for c in free if c not in controls], {s.topic: s for s in sources})
     known = [c for c in controls if not c.judged]
@@ -519,10 +469,10 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.reason = f"answers within a row: the controls of the same row tell {share:.0%} of it"
             candidate.ready = "state"
     for candidate in (c for c in controls if c.judged):
-        moves = np.concatenate([np.diff(v) != 0 for v in candidate.values])
-        if moves.mean() <= RARE:
+        moves = np.concatenate([np.diff(v) != 0 for v in candidate.values]).mean()
+        if moves <= RARE:
             candidate.judged = False
-            candidate.why = f"{_BY_NAME}not judged, as it changes in {moves.mean():.1%} of the rows only"
+            candidate.why = f"{_BY_NAME}not judged, as it changes in {moves:.1%} of the rows only"
     states = [c for c in free if c not in controls and not c.reason]
     for candidate in states:
         told = _known(candidate)
@@ -536,19 +486,9 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     return states, [c for c in free if c in controls]
 
 
-def _finite(candidate: Candidate) -> Array:
-    values = np.concatenate(candidate.values)
-    return np.asarray(values[np.isfinite(values)])
-
-
-def _unfit(candidate: Candidate) -> str:
-    """Why a column is no signal at all; what hardly moves is one."""
-    return "" if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason) else candidate.reason
-
-
 def _is_set(candidate: Candidate, called: bool) -> bool:
     """Whether a column is a control by its values or its name, or is `called` one; says why."""
-    values = np.unique(_finite(candidate))
+    values = np.unique(candidate.finite)
     by_name = called or _TURNED.search(candidate.path.lower())
     if len(values) == 1:
         candidate.why = (
@@ -572,11 +512,6 @@ def _gated(candidate: Candidate, switch: Candidate) -> bool:
     return True
 
 
-def _stem(candidate: Candidate) -> str:
-    """Name with its numbers replaced: of alike signals, such as `F_PU1` and `F_PU2`, and not of one unit's."""
-    return re.sub(r"\d+", "*", candidate.path)
-
-
 def _held_for(candidate: Candidate) -> int:
     """Rows for which nearly every value is held; 0 where it is not."""
     gaps = np.concatenate([np.diff(np.flatnonzero(np.diff(v) != 0)) for v in candidate.values])
@@ -594,14 +529,14 @@ def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> li
     hold as long are of one analyser, unless most of them are set: a controller acts on some of what an analyser says.
     """
     held = {c: rows for c in measured if (rows := _held_for(c))}
-    rest, found = [c for c in measured if c not in held and np.ptp(_finite(c)) > 0], []
+    rest, found = [c for c in measured if c not in held and np.ptp(c.finite) > 0], []
     for rows in dict.fromkeys(held.values()) if rest else ():
         group = [c for c in held if held[c] == rows]
         leads = steps_of(rest, of, group).effect_of_each().max(axis=1, initial=0.0) > SHOWS
         for j, candidate in enumerate(group):
             before = steps_of([candidate], of, rest)
             set_at = before.dX[:, 0] != 0
-            leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effect([0])[0] <= SHOWS
+            leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effect()[0] <= SHOWS
         found += group if 2 * leads.sum() > len(group) else []
     for candidate, rows in held.items():
         candidate.why = f"set, for {rows} rows each: the others follow it"
@@ -612,9 +547,9 @@ def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> li
 
 def _told(candidate: Candidate, controls: Sequence[Candidate]) -> float:
     """Share of the variance that a linear function of the controls of the same row tells; 0 if the rest lasts."""
-    y, U = np.concatenate(candidate.values), np.column_stack([np.concatenate(c.values) for c in [candidate, *controls]])
-    good = np.isfinite(U).all(axis=1)
-    y, U = y[good], np.column_stack([U[good, 1:], np.ones(good.sum())])
+    columns = np.column_stack([np.concatenate(c.values) for c in [candidate, *controls]])
+    columns = columns[np.isfinite(columns).all(axis=1)]
+    y, U = columns[:, 0], np.column_stack([columns[:, 1:], np.ones(len(columns))])
     if len(y) < FEWEST * U.shape[1] or y.var() == 0:
         return 0.0
     rest = y - U @ np.linalg.lstsq(U, y, rcond=None)[0]
@@ -624,8 +559,7 @@ def _told(candidate: Candidate, controls: Sequence[Candidate]) -> float:
 
 def _known(candidate: Candidate) -> float:
     """Share of the variance of the next row that one row tells."""
-    pairs = [(v[:-1], v[1:]) for v in candidate.values]
-    now, after = (np.concatenate(side) for side in zip(*pairs, strict=True))
+    now, after = (np.concatenate([v[side] for v in candidate.values]) for side in (slice(-1), slice(1, None)))
     good = np.isfinite(now) & np.isfinite(after)
     if good.sum() < 3 or np.ptp(now[good]) == 0 or np.ptp(after[good]) == 0:
         return 0.0

@@ -92,7 +92,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
                 facts[fact.info.topic] = fact
     sources = []
     for topic, fact in facts.items():
-        total = sum(bag.topics[topic].count for bag in bags if topic in bag.topics)
+        total = sum(_messages(bag, topic) for bag in bags)
         if fact.info.type == TYPE:
             sources += _of_table(fact, total, all(topic in b.topics for b in bags))
             continue
@@ -105,7 +105,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
             source.reason = "no signal of a machine by its name or type"
         elif total < (3 if source.role == "control" else FEWEST):
             source.reason = f"{plural(total, 'message')} only"
-        elif any(topic not in b.topics or not b.topics[topic].count for b in bags):
+        elif not all(_messages(bag, topic) for bag in bags):
             source.reason = _APART
         elif any(b.topics[topic].type != fact.info.type for b in bags):
             source.reason = "of different types in these recordings"
@@ -113,16 +113,19 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
             source.candidates = _candidates(topic, fact.fields)
             if not source.candidates:
                 source.reason = "no number in it"
-        if source.reason:
-            source.candidates = []
     _limit(bags, sources)
     for bag in bags:
         _read(bag, [s for s in sources if s.candidates], progress)
     for source in sources:
         if source.candidates and not source.rate > 0:
             source.reason, source.candidates = "no time passes between its messages", []
-        _sift(source)
+        elif source.candidates:
+            _sift(source)
     return sources
+
+
+def _messages(bag: Recording, topic: str) -> int:
+    return bag.topics[topic].count if topic in bag.topics else 0
 
 
 def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tuple[str, str, Array, Array]], list[str]]:
@@ -133,9 +136,7 @@ def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tupl
     sources = read_sources([bag], progress)
     chosen = [(s, c) for s in sources if not s.reason for c in s.candidates if not c.reason]
     start = min((int(s.arrival[0][0]) for s, _ in chosen), default=0)
-    found = [
-        (s.topic, c.path, np.asarray((s.arrival[0] - start) * 1e-9, dtype=np.float64), c.values[0]) for s, c in chosen
-    ]
+    found = [(s.topic, c.path, np.multiply(s.arrival[0] - start, 1e-9), c.values[0]) for s, c in chosen]
     left = [f"{s.topic}: {s.reason}" for s in sources if s.reason]
     left += [f"{s.topic} {c.path}: {c.reason}" for s in sources if not s.reason for c in s.candidates if c.reason]
     return found, left
@@ -144,10 +145,8 @@ def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tupl
 def run_column(bags: Sequence[Recording]) -> str:
     """Column of tables that tells the runs in one file apart."""
     tables = [bag for bag in bags if isinstance(bag, Table)]
-    if not tables or len(tables) < len(bags):
-        return ""
-    told = (name for name in tables[0].columns_by_field if all(_tells_runs(table, name) for table in tables))
-    return next(told, "")
+    names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
+    return next((name for name in names if all(_tells_runs(table, name) for table in tables)), "")
 
 
 def _tells_runs(table: Table, name: str) -> bool:
@@ -169,16 +168,11 @@ def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
     beside = {bare(field) for field in fact.fields}
     for field in fact.fields:
         by_role.setdefault(role_of_column(field, beside), []).append(field)
-    sources = []
+    reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if everywhere else _APART
+    topic, sources = fact.info.topic, []
     for role, fields in by_role.items():
-        source = Source(fact.info.topic, TYPE, role, False, None)
-        if rows < FEWEST:
-            source.reason = f"{plural(rows, 'row')} only"
-        elif not everywhere:
-            source.reason = _APART
-        else:
-            source.candidates = _candidates(fact.info.topic, fields)
-        sources.append(source)
+        candidates = [] if reason else _candidates(topic, fields)
+        sources.append(Source(topic, TYPE, role, False, None, candidates=candidates, reason=reason))
     return sources
 
 
@@ -188,7 +182,7 @@ def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
     left = MOST_VALUES
     for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
         for candidate in source.free:
-            left -= max(1, sum(bag.topics[source.topic].count for bag in bags))
+            left -= max(1, sum(_messages(bag, source.topic) for bag in bags))
             if left < 0:
                 candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
 
@@ -232,8 +226,6 @@ def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) 
 
 def _sift(source: Source) -> None:
     """Say of each number whether it moves; angles in place of the quaternions that are some."""
-    if not source.candidates:
-        return
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
     parts = {c.path: c for c in source.candidates}
     for base in bases:
@@ -242,49 +234,42 @@ def _sift(source: Source) -> None:
         norm = np.sqrt(sum(np.concatenate(r.values) ** 2 for r in read)) if len(read) == 4 else np.zeros(1)
         unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
         is_rotation = len(unit) > 0 and unit.mean() > 0.9
-        for candidate in source.candidates:
-            of_base = candidate.path.startswith(f"{base}.") or candidate.path.endswith(f"({base})")
-            if of_base and candidate.path.endswith(f"({base})") != is_rotation:
-                candidate.reason = "|"  # the other form of the same numbers has its line
-    source.candidates = [c for c in source.candidates if c.reason != "|"]
+        source.candidates = [  # the other form of the same numbers has its line
+            c
+            for c in source.candidates
+            if not (c.path.startswith(f"{base}.") if is_rotation else c.path.endswith(f"({base})"))
+        ]
     for candidate in source.free:
-        _ignore(candidate)
-        _judge(candidate, source)
+        if found := codes(np.concatenate([np.empty(0), *candidate.values])):  # numbers that stand for none
+            candidate.ignore = tuple(sorted(found))
+            candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
+        candidate.reason = _unfit(candidate, source)
     _wrapped(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
         source.reason += f" and {len(source.candidates) - 3} more" * (len(source.candidates) > 3)
 
 
-def _ignore(candidate: Candidate) -> None:
-    """Take numbers that stand for none out of the values."""
-    found = codes(np.concatenate([np.empty(0), *candidate.values]))
-    if found:
-        candidate.ignore = tuple(sorted(found))
-        candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
-
-
-def _judge(candidate: Candidate, source: Source) -> None:
+def _unfit(candidate: Candidate, source: Source) -> str:
+    """Why a number is no signal; "" if nothing is against it."""
     if not candidate.values:
-        candidate.reason = "not read"
-        return
-    values = np.concatenate(candidate.values)
-    finite = values[np.isfinite(values)]
+        return "not read"
+    values, finite = np.concatenate(candidate.values), candidate.finite
     if not len(finite):
-        candidate.reason = "never a number"
-    elif finite.min() == finite.max():
-        candidate.reason = f"always {finite[0] + 0.0:.6g}"
-    elif len(finite) < 0.5 * len(values):
+        return "never a number"
+    if finite.min() == finite.max():
+        return f"always {finite[0] + 0.0:.6g}"
+    if len(finite) < 0.5 * len(values):
         what = "rows only, so fill its empty cells with the number above" if source.type == TYPE else "messages only"
-        candidate.reason = f"a number in {len(finite)} of {len(values)} {what}"
-    elif (moved := len(finite) - int(np.unique(finite, return_counts=True)[1].max())) < max(3, len(finite) // 500):
-        candidate.reason = f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
-    elif source.role == "state" and len(np.unique(finite)) < 3:
-        candidate.reason = TWO_VALUES
-    elif source.role != "control" and _counts(values, np.concatenate(source.arrival)):
-        candidate.reason = "grows as a clock or a counter does"
-    elif max(abs(float(finite.min())), abs(float(finite.max()))) > 1e15:
-        candidate.reason = "holds numbers beyond 1e15"
+        return f"a number in {len(finite)} of {len(values)} {what}"
+    counts = np.unique(finite, return_counts=True)[1]
+    if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
+        return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
+    if source.role == "state" and len(counts) < 3:
+        return TWO_VALUES
+    if source.role != "control" and _counts(values, np.concatenate(source.arrival)):
+        return "grows as a clock or a counter does"
+    return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
 def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
@@ -383,8 +368,12 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
-    if not (states or controls or like) and is_plant(sources):
-        return _of_plant(bags, sources, runs, warnings)
+    if not (states or controls or like) and is_plant(sources):  # names are those of the columns
+        chosen, used = plant_signals(sources)
+        if not chosen:
+            raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
+        text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
+        return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     switches = [] if controls else take_switches(sources)
@@ -394,13 +383,11 @@ def propose(
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
-        remedy = "record the machine at work, and longer, or name the topics of its states in `uncertain-lti init"
-        remedy += " --states`"
+        nothing = f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})"
         if any(s.reason == _APART for s in sources):
-            remedy = "give recordings of one machine, with the same topics"
-        raise BagError(
-            f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'}); {remedy}"
-        )
+            raise BagError(f"{nothing}; give recordings of one machine, with the same topics")
+        named = "name the topics of its states in `uncertain-lti init --states`"
+        raise BagError(f"{nothing}; record the machine at work, and longer, or {named}")
     chosen, doubt = choose(measured, commands, like)
     doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
@@ -416,12 +403,12 @@ def propose(
     set_operating_point(chosen, used, sources)
     for candidate in ready:
         set_own_scale(candidate)
-    warnings += [doubt] if doubt else []
+    warnings += [doubt] * bool(doubt)
     if not commands:
         unread = (s for s in sources if s.role == "control" and s.unreadable)
         warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]
     for topic in (s.topic for s in sources if s.role == "control"):
-        lacking = [str(bag.path) for bag in bags if topic not in bag.topics or not bag.topics[topic].count]
+        lacking = [str(bag.path) for bag in bags if not _messages(bag, topic)]
         if 0 < len(lacking) < len(bags):
             without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
             warnings.append(f"{without}, so it is no control; leave those recordings out")
@@ -435,15 +422,6 @@ def propose(
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
 
 
-def _of_plant(bags: Sequence[Recording], sources: Sequence[Source], runs: str, warnings: Sequence[str]) -> Proposal:
-    """The proposal for process data; names are those of the columns."""
-    chosen, used = plant_signals(sources)
-    if not chosen:
-        raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
-    text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
-    return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
-
-
 def _members(
     states: Sequence[Candidate], controls: Sequence[Candidate], moving: Mapping[tuple[str, str], Candidate]
 ) -> dict[str, list[Candidate]]:
@@ -455,9 +433,9 @@ def _members(
     (like,) = one
     found = {}
     for member in dict.fromkeys(c.element for c in moving.values() if c.element):
-        alike = [moving.get((c.topic, c.path.replace(f"[{like}]", f"[{member}]"))) for c in group]
-        if None not in alike:
-            found[member] = [c for c in alike if c is not None]
+        places = [(c.topic, c.path.replace(f"[{like}]", f"[{member}]")) for c in group]
+        if moving.keys() >= set(places):
+            found[member] = [moving[place] for place in places]
     return found if len(found) > 1 else {}
 
 
@@ -481,8 +459,8 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
     for one in chosen:
         of = group[names.index(one.of)]
         memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
-        lag, rate = memory.kind == "lag", memory.kind == "rate"
-        recalled = replace(of, name=one.name, path=memory.of(of.path), steady=of.steady if lag else 0.0, delay=0)
-        recalled.unit += "/s" if of.unit and rate else ""
+        steady = of.steady if memory.kind == "lag" else 0.0
+        unit = f"{of.unit}/s" if of.unit and memory.kind == "rate" else of.unit
+        recalled = replace(of, name=one.name, path=memory.of(of.path), steady=steady, unit=unit, delay=0)
         lines.append(entry(recalled, comment=gain))
     return lines

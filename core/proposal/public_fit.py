@@ -14,7 +14,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from types import MappingProxyType
 from typing import Any, Literal
 
 from numpy.typing import ArrayLike
@@ -159,32 +158,24 @@ def fit(
     names = [*first.state_names, *first.control_names, *first.scheduling_names]
     if additive is None and signals is not None:
         additive = signals.additive
-    options: dict[str, Any] = {
-        "criterion": criterion or "lp",
-        "weights": weights,
-        "additive": additive or "noise",
-        "operating_point": operating_point,
-        "count": count,
-        "structure": structure,
-        "discard": discard,
-        "method": method,
-    }
+    options: dict[str, Any] = {"criterion": criterion or "lp", "additive": additive or "noise", "count": count}
     messages: list[str] = []
     for_controls_as_they_are = (weights, transient_weights, operating_point, structure)
-    if alarm == "panel" and method == "working-set" and all(given is None for given in for_controls_as_they_are):
-        way = {name: options[name] for name in ("criterion", "additive", "count")}
-        at, why = choose_ends(transients, groups=groups, **way)
+    learns = alarm == "panel" and method == "working-set"
+    if learns and all(given is None for given in for_controls_as_they_are):
+        at, why = choose_ends(transients, groups=groups, **options)
         if why:
             transients = [t.controls_at(at) for t in transients]
             messages.append(why)
             first, signals = transients[0], transients[0].signals
+    options |= {"weights": weights, "operating_point": operating_point, "structure": structure}
+    options |= {"discard": discard, "method": method}
     asked = schedule
     if asked is None:
         asked = {} if signals is None else asked_by(signals)
-    if isinstance(asked, Mapping):
-        check_names(asked, names)
-    rule = _horizons_asked_for(signals, horizons, widths)
     chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
+    check_names(chosen, names)
+    rule = _horizons_asked_for(signals, horizons, widths)
     automatic = [name for name, knots in chosen.items() if isinstance(knots, str) and knots == "auto"]
     leaves_out = alarm == "panel" or automatic or (rule is not None and rule.leaves_out)
     if groups is not None and not leaves_out:
@@ -227,7 +218,7 @@ def fit(
     options |= {"schedule": asked, "horizons": list(lengths), "widths": lengths, "transient_weights": transient_weights}
     options["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
     options |= {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
-    if alarm == "panel" and method == "working-set":
+    if learns:
         ways = _ways(criterion, additive, bool(asked))
         if len(ways) > 2 and operating_point is None:
             ways.append({"criterion": "qp", "additive": "both", "centred": True})
@@ -245,9 +236,7 @@ def fit(
     return _saying(model, messages, added)
 
 
-def _saying(
-    model: UncertainLTI, messages: Sequence[str], added: Mapping[str, Any] = MappingProxyType({})
-) -> UncertainLTI:
+def _saying(model: UncertainLTI, messages: Sequence[str], added: Mapping[str, Any]) -> UncertainLTI:
     """The model with further sentences, and facts, in its summary."""
     if not (added or messages):
         return model
@@ -298,7 +287,7 @@ def fit_many(
         return model if isinstance(alarm, str) else model.replace(alarm=alarm)
     note = f"learnt on {len(some)} of {plural(len(bags), 'recording')}, as many as memory is for"
     note *= len(some) < len(bags)
-    return _saying(monitored_like(taken, model, some, false_alarms, note).finished(), messages)
+    return _saying(monitored_like(taken, model, some, false_alarms, note).finished(), messages, {})
 
 
 def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> None:

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -26,12 +26,12 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.candidates import from_both_ends, left
+from uncertain_lti.proposal.candidates import from_both_ends, left, size_of
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule
 from uncertain_lti.validation.left_out import leave_out
-from uncertain_lti.validation.monitor_fit import ALONE, CLEARLY, FOLDS, fit_monitored
+from uncertain_lti.validation.monitor_fit import CLEARLY, FOLDS, fit_monitored
 from uncertain_lti.validation.panel import learn
 from uncertain_lti.validation.part import by_unit, fitted_parts
 from uncertain_lti.validation.result import Validation
@@ -92,25 +92,18 @@ def _geometric(values: ArrayLike) -> float:
 
 
 def score_of(
-    transients: Sequence[Transient],
-    model: UncertainLTI,
-    groups: Sequence[Any] | str | None,
-    folds: int,
-    options: Mapping[str, Any],
+    transients: Sequence[Transient], model: UncertainLTI, groups: Sequence[Any] | str | None, options: Mapping[str, Any]
 ) -> tuple[Score, Validation]:
     """What was left out of the fit with these options, on the schedule of the model. Raises FitError if nothing was."""
     own = {name: value for name, value in options.items() if name != "schedule"}
-    left = leave_out(transients, full=model, groups=groups, folds=folds, **own)
+    left = leave_out(transients, full=model, groups=groups, folds=FOLDS, **own)
     return Score.of(left, learn(left, fitted_parts(model, transients)).figure), left
 
 
 def _what(left: Validation) -> dict[str, Any]:
     """What was left out at a time, and how often."""
-    many = left.units > FOLDS
-    return {
-        "left_out": f"{FOLDS}th part of the {left.what}s" if many else left.what,
-        "units": FOLDS if many else left.units,
-    }
+    what = f"{FOLDS}th part of the {left.what}s" if left.units > FOLDS else left.what
+    return {"left_out": what, "units": min(left.units, FOLDS)}
 
 
 ENOUGH, COMPARED = 20, 20_000
@@ -136,7 +129,7 @@ def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, st
         figures: dict[At, float] = {}
         for at in _promising_ends(few, tried["arrival"]):
             panel = fit_monitored(tried.get(at, few), **options).panel
-            if panel is None or panel.units < UNITS or len(panel.unlike) > ALONE * panel.units:
+            if panel is None or panel.units < UNITS or not panel.vouched:
                 return "departure", ""
             figures[at] = panel.figure
     except UncertainLTIError:  # a control is a state, or too little is left
@@ -168,7 +161,7 @@ def _promising_ends(transients: Sequence[Transient], arrival: Sequence[Transient
     free = np.array([a != b for a, b in zip(transients[0].ends, arrival[0].ends, strict=True)], dtype=bool)
     if not free.any() or len(X) < ENOUGH * (X.shape[1] + 2 * U.shape[1]):
         return []
-    size = np.maximum(np.abs(U).max(axis=0, initial=0.0), 1e-300)
+    size = size_of(U)
     U, V, dX = U / size, (V / size)[:, free], after - X
     aligned, move, late = from_both_ends(X, U, V, dX, free)
     rest = {"arrival": left(np.hstack([X, U[:, ~free], V]), dX)[0], "both": move - late}
@@ -225,17 +218,11 @@ class KnotCandidate:
     def row(self, base: Score | None, signal: str) -> dict[str, Any]:
         """Its line in the table."""
         row: dict[str, Any] = {"knots": self.count}
-        if self.model is not None:
-            row["at"] = knots_of(self.model, signal)
+        row |= {} if self.model is None else {"at": knots_of(self.model, signal)}
         if self.score is None or base is None:
-            return {**row, "refused": self.refused}
-        return {
-            **row,
-            "outside": self.score.share,
-            "excess": self.score.excess(base),
-            "width": self.score.width / base.width,
-            "jumps": self.score.figure / base.figure,
-        }
+            return row | {"refused": self.refused}
+        row |= {"outside": self.score.share, "excess": self.score.excess(base)}
+        return row | {"width": self.score.width / base.width, "jumps": self.score.figure / base.figure}
 
 
 def choose_knots(
@@ -261,13 +248,12 @@ def choose_knots(
             break
         if progress is not None and candidates:
             progress(f"{plural(count, 'knot')} on {signal}")
-        model = None
+        model, asked = None, {signal: count, **beside} if candidates else beside
         try:
-            asked = {signal: count, **beside} if candidates else beside
             model = fit(transients, schedule=asked, describe_data=False, **options)
             if candidates and (tied := sum(data.tied_to is not None for data in model.block_data)):
                 raise FitError(f"{tied} of {plural(len(model.block_data), 'block')} would have too little data")
-            score, left = score_of(transients, model, groups, FOLDS, options)
+            score, left = score_of(transients, model, groups, options)
             candidates.append(KnotCandidate(count, model, score))
         except FitError as error:
             if not candidates and model is None:
@@ -275,14 +261,9 @@ def choose_knots(
             candidates.append(KnotCandidate(count, model, refused=str(error)))
             break  # more knots would be refused likewise
         facts = _what(left)
-    chosen, base = chosen_of(candidates), candidates[0]
-    return chosen, {
-        "signal": signal,
-        **facts,
-        "candidates": [c.row(base.score, signal) for c in candidates],
-        "chosen": chosen.count,
-        "reason": _reason_for_knots(candidates, chosen),
-    }
+    chosen, rows = chosen_of(candidates), [c.row(candidates[0].score, signal) for c in candidates]
+    table = {"signal": signal, **facts, "candidates": rows, "chosen": chosen.count}
+    return chosen, table | {"reason": _reason_for_knots(candidates, chosen)}
 
 
 def knots_of(model: UncertainLTI, signal: str) -> list[float]:
@@ -390,31 +371,34 @@ def choose_horizons(
         transients = thinned(transients, _OF_HORIZONS, 20 * max(lengths, default=1))
     dropped: dict[int, str] = {}
     kinds: tuple[Widths, ...] = get_args(Widths) if rule.widths == "auto" else (rule.widths,)
-    asked = bool(rule.steps or rule.seconds)
+    asked, nothing = bool(rule.steps or rule.seconds), ""
     found: dict[int, list[HorizonCandidate]] = {}
     facts: dict[str, Any] = {"left_out": "recording", "units": 0, "candidates": [], "chosen": {}}
     for kind in kinds:
         if progress is not None:
             progress(f"{kind} half-widths over {', '.join(map(str, lengths))} steps")
         model = fit(transients, describe_data=False, horizons=lengths, widths=kind, drop_horizons=True, **options)
-        dropped |= {steps: _why_dropped(model, steps) for steps in lengths if steps not in model.steps}
+        said = model.fit_summary.get("messages", [])
+        for steps in (steps for steps in lengths if steps not in model.steps):
+            begin = f"no horizon of {steps} steps: "
+            dropped[steps] = next((text.removeprefix(begin) for text in said if text.startswith(begin)), "")
         try:
-            one, left = score_of(transients, model, groups, FOLDS, options)
+            one, left = score_of(transients, model, groups, options)
         except FitError as error:
-            _refuse_missing(model.steps, lengths if asked else (), dropped)
-            chosen: dict[int, Widths] = {h.steps: "constant" for h in model.horizons} if asked else {}
-            facts |= {"chosen": {str(h): w for h, w in chosen.items()}, "reason": f"nothing can be left out: {error}"}
-            return chosen, facts
+            nothing = f"nothing can be left out: {error}"
+            break
         facts |= _what(left)
         for j, horizon in enumerate(model.horizons):
             found.setdefault(horizon.steps, []).append(_judged_horizon(left, j, horizon.steps, kind))
-    _refuse_missing(found, lengths if asked else (), dropped)
-    chosen, facts["candidates"] = _decided(found, one, asked)
-    facts |= {
-        "chosen": {str(steps): widths for steps, widths in chosen.items()},
-        "reason": _reason_for_horizons(chosen, found, dropped),
-    }
-    return chosen, facts
+    there = model.steps if nothing else found
+    if missing := [steps for steps in lengths if asked and steps not in there]:
+        raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
+    if nothing:
+        chosen: dict[int, Widths] = {steps: "constant" for steps in model.steps if asked}
+    else:
+        chosen, facts["candidates"] = _decided(found, one, asked)
+    facts["chosen"] = {str(steps): widths for steps, widths in chosen.items()}
+    return chosen, facts | {"reason": nothing or _reason_for_horizons(chosen, found, dropped)}
 
 
 def _judged_horizon(left: Validation, j: int, steps: int, kind: Widths) -> HorizonCandidate:
@@ -429,18 +413,6 @@ def _judged_horizon(left: Validation, j: int, steps: int, kind: Widths) -> Horiz
     )
 
 
-def _refuse_missing(there: Collection[int], asked: Sequence[int], dropped: Mapping[int, str]) -> None:
-    if missing := [h for h in asked if h not in there]:
-        raise FitError(f"no horizon of {missing[0]} steps: {dropped[missing[0]]}")
-
-
-def _why_dropped(model: UncertainLTI, steps: int) -> str:
-    """What the fit says of a horizon that was asked for and is not in the model."""
-    begin = f"no horizon of {steps} steps: "
-    said = [text for text in model.fit_summary.get("messages", []) if text.startswith(begin)]
-    return said[0].removeprefix(begin) if said else ""
-
-
 def _decided(
     found: Mapping[int, Sequence[HorizonCandidate]], base: Score, asked: bool
 ) -> tuple[dict[int, Widths], list[dict[str, Any]]]:
@@ -453,30 +425,24 @@ def _decided(
         best, other = ordered[0], ordered[-1]
         if other is not best and other.holds(best) and other.width <= PAYS * best.width:
             best = other
-        why = "asked for" if asked else ""
-        if not asked:
-            if not best.judged.sum():
-                why = "no left-out part is so long"
-            elif not best.holds(base):
-                why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
-            elif not best.per_step <= PAYS * reached:
-                why = "sees no slower changes than the horizon before it"
-        taken = asked or not why
+        taken = asked
+        if asked:
+            why = "asked for"
+        elif not best.judged.sum():
+            why = "no left-out part is so long"
+        elif not best.holds(base):
+            why = f"{best.share:.1%} of the left-out windows are outside, {base.share:.1%} of the single steps"
+        elif not best.per_step <= PAYS * reached:
+            why = "sees no slower changes than the horizon before it"
+        else:
+            why, taken = "holds, and sees slower changes", True
         if taken:
             chosen[steps], reached = best.widths, best.per_step
         instead = "growing ones are narrower" if best.widths == "growing" else "constant ones hold as well"
-        rows += [
-            {
-                "steps": steps,
-                "widths": one.widths,
-                "outside": one.share,
-                "width": one.width,
-                "per_step": one.per_step,
-                "taken": taken and one is best,
-                "why": (why or "holds, and sees slower changes") if one is best else instead,
-            }
-            for one in ordered
-        ]
+        for one in ordered:
+            row: dict[str, Any] = {"steps": steps, "widths": one.widths, "outside": one.share, "width": one.width}
+            row |= {"per_step": one.per_step, "taken": taken and one is best, "why": why if one is best else instead}
+            rows.append(row)
     return chosen, rows
 
 

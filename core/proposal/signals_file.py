@@ -15,7 +15,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from itertools import count
+from itertools import chain, count
 from types import MappingProxyType
 
 import numpy as np
@@ -54,12 +54,11 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
     for group, suffix in ((states, "state"), (controls, "command")):
         kinds = {c.kind for c in group}
         for candidate in group:
-            words = _words(candidate, len(kinds) > 1)
-            name = "_".join(words)
+            name = "_".join(_words(candidate, len(kinds) > 1))
             if name in taken or (suffix == "command" and candidate.element in elements):
                 name = f"{name}_{suffix}"
             numbered = (f"{name}_{number}" for number in count(2))
-            candidate.name = name if name not in taken else next(n for n in numbered if n not in taken)
+            candidate.name = next(n for n in chain([name], numbered) if n not in taken)
             taken.add(candidate.name)
             candidate.unit = next((unit for pattern, unit in _UNITS if pattern.search(candidate.path)), "")
 
@@ -114,8 +113,7 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
 
 def set_own_scale(candidate: Candidate) -> None:
     """Median and range, for one in a comment."""
-    finite = np.concatenate(candidate.values)
-    finite = finite[np.isfinite(finite)]
+    finite = candidate.finite
     candidate.steady, candidate.scale = float(np.median(finite)), _listed(float(np.ptp(finite)))
 
 
@@ -128,7 +126,7 @@ def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
     """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do."""
     if source.topic == clock.topic:  # it comes with the states
         return None, ""
-    steps = np.concatenate([np.diff(a) for a in source.arrival if len(a) > 1] or [np.empty(0)]) * 1e-9
+    steps = np.concatenate([np.empty(0), *(np.diff(a) for a in source.arrival)]) * 1e-9
     steps = steps[steps > 0]
     if not len(steps):
         return None, ""
@@ -172,12 +170,8 @@ def signals_file(
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
-        lines += [
-            "",
-            "# Their header stamps do not move, or not all use one clock: times of arrival serve for all.",
-            "topics:",
-        ]
-        lines += [f"  {_quoted(t)}: {{time: log}}" for t in topics]
+        lines += ["", "# Their header stamps do not move, or not all use one clock: times of arrival serve for all."]
+        lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
     if runs:
         lines += ["", "# Each value of this column is a recording of its own.", "table:", f"  runs: {_quoted(runs)}"]
     if plant:
@@ -188,9 +182,8 @@ def signals_file(
         lines.append("# magnitude, or the range where that is small. Both in recorded units.")
     lines += [f"# Beware: {doubt}."] if doubt else []
     if any(c.ignore for c in [*states, *controls]):
-        lines.append(
-            "# ignore: numbers that stand for no value, as they lie far from all others; they count as missing."
-        )
+        said = "numbers that stand for no value, as they lie far from all others; they count as missing."
+        lines.append(f"# ignore: {said}")
     ready = [c for s in sources for c in s.candidates if c.ready]
     lines += ["states:", *(entry(c, comment=c.why) for c in states), *memories]
     lines += [entry(c, comment=c.reason, out=True) for c in ready if c.ready == "state"]
@@ -200,21 +193,17 @@ def signals_file(
             lines.append("  # by correlation alone: nothing is called a command here")
         if any(c.delay for c in controls):
             lines.append("  # delay: number of samples by which the states follow later")
-        for candidate in controls:
+        for candidate in [*controls, *(c for c in ready if c.ready == "control")]:
             limit, why = (None, candidate.why) if plant else longest_hold(every[candidate.topic], clock)
-            lines.append(entry(candidate, limit, why))
-        lines += [
-            entry(c, longest_hold(every[c.topic], clock)[0], c.reason, out=True) for c in ready if c.ready == "control"
-        ]
+            lines.append(entry(candidate, limit, candidate.reason or why, out=bool(candidate.ready)))
     else:
         lines += [
             "",
             "# No command can be used. Without controls the envelope must cover what they do.",
             "controls: []",
         ]
-    proposed = [*states, *controls, *(c for alike in members.values() for c in alike)]
-    left_out = _left_out(sources, set(proposed))
-    if left_out:
+    proposed = {*states, *controls, *(c for alike in members.values() for c in alike)}
+    if left_out := _left_out(sources, proposed):
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
         lines = for_members(lines, states[0].element, list(members))
@@ -236,17 +225,11 @@ def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[
     found = []
     for line in lines:
         if line.startswith("states:"):
-            found += [
-                f"# {len(members)} that are alike: each depends on its own states and controls. Shorten the lists to "
-                "watch fewer.",
-                "structure: own",
-                "",
-            ]
-        if re.match(r"  - \{name: ", line) and f"[{one}]" in line:
+            alike = f"# {len(members)} that are alike: each depends on its own states and controls."
+            found += [f"{alike} Shorten the lists to watch fewer.", "structure: own", ""]
+        if (name := re.match(r"  - \{name: ([^,]+),", line)) and f"[{one}]" in line:
+            line = f"  - {{for: [{listed}], name: {_place(name[1], one)}," + line[name.end() :]
             line = line.replace(f"[{one}]", "[{}]")
-            line = re.sub(
-                r"^  - \{name: ([^,]+),", lambda m: f"  - {{for: [{listed}], name: {_place(m[1], one)},", line
-            )
             if not re.search(r'field: "(rate|diff)\(', line):
                 line = re.sub(r"steady: [^,}]+, scale: [^,}]+", "steady: auto, scale: auto", line)
         found.append(line)

@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, TransientError, UncertainLTIError
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.base.text import meant, plural
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.evidence import autocorrelation, late_controls
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
+from uncertain_lti.proposal.candidates import size_of
 from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of, thinned
 from uncertain_lti.sampling.clock import longest_step
@@ -38,7 +39,7 @@ from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 from uncertain_lti.signals.values import Additive
-from uncertain_lti.validation.monitor_fit import CLEARLY, FOLDS, fit_monitored, point_of
+from uncertain_lti.validation.monitor_fit import CLEARLY, fit_monitored, point_of
 from uncertain_lti.validation.panel import worth
 
 PROMISING, SIGNALS = 0.9, 2
@@ -145,7 +146,7 @@ def remember(transients: Sequence[Transient], memories: Sequence[Remembered]) ->
             signals = replace(signals, max_gap=longest)
         return t.replace(max_gap=longest, signals=signals)
 
-    return [with_memories(parted(t), {one.name: (one.of, one.memory) for one in memories}) for t in transients]
+    return [with_memories(parted(t), memories) for t in transients]
 
 
 def memory_candidates(transients: Sequence[Transient], additive: Additive = "noise") -> list[tuple[Remembered, ...]]:
@@ -191,7 +192,7 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
     def scored(memories: tuple[Remembered, ...]) -> Score:
         runs = thinned(remember(transients, memories), 5 * TRANSITIONS)
         model = fitting.fit(runs, schedule={}, describe_data=False, additive=additive)
-        return score_of(runs, model, None, FOLDS, {"additive": additive})[0]
+        return score_of(runs, model, None, {"additive": additive})[0]
 
     chosen: tuple[Remembered, ...] = ()
     try:
@@ -199,12 +200,11 @@ def choose_memories(transients: Sequence[Transient], additive: Additive) -> tupl
     except FitError:
         return (), 1.0
     for names in (transients[0].state_names, transients[0].control_names):
-        found = list[tuple[Score, tuple[Remembered, ...]]]()
+        found = [(best, chosen)]
         for some in (s for s in sets if s[0].of in names):
             with suppress(FitError):
                 found.append((scored((*chosen, *some)), (*chosen, *some)))
-        found = [(after, beside) for after, beside in found if after.holds(before)]
-        after, beside = min(found, key=lambda pair: pair[0].figure, default=(best, chosen))
+        after, beside = min((one for one in found if one[0].holds(before)), key=lambda one: one[0].figure)
         if after.figure < PAYS * best.figure:
             best, chosen = after, beside
     return chosen, best.width / before.width
@@ -215,20 +215,20 @@ def promise(transients: Sequence[Transient]) -> dict[str, float]:
 
     The knots are the ends of the signal and one of a few places between, the best.
     """
-    steps = [t.transitions() for t in transients]
-    first = transients[0]
+    first, steps = transients[0], [t.transitions() for t in transients]
     names = [*first.state_names, *first.control_names, *first.scheduling_names]
-    x, u = np.concatenate([s.x for s in steps]), np.concatenate([s.u for s in steps])
-    dt = np.concatenate([s.dt for s in steps])
+    x, u, s, x_next, dt = (
+        np.concatenate([getattr(step, name) for step in steps]) for name in ("x", "u", "s", "x_next", "dt")
+    )
     z = np.column_stack([x, u])
-    phi = dt * np.vstack([(z / np.maximum(np.abs(z).max(axis=0, initial=0.0), 1e-300)).T, np.ones(len(z))])
+    phi = dt * np.vstack([(z / size_of(z)).T, np.ones(len(z))])
     if len(z) < 9 * len(phi):
         return dict.fromkeys(names, 1.0)
-    move = np.concatenate([s.x_next for s in steps]) - x
+    move = x_next - x
     floor = np.maximum(1e-9 * np.ptp(x, axis=0), 1e-300)
     whole = np.maximum(_largest(phi, move), floor)
     found = {}
-    for name, values in zip(names, np.column_stack([z, np.concatenate([s.s for s in steps])]).T, strict=True):
+    for name, values in zip(names, np.column_stack([z, s]).T, strict=True):
         low, high = float(values.min()), float(values.max())
         places = {0.5 * (low + high), *np.quantile(values, [0.25, 0.5, 0.75]).tolist()}
         found[name] = 1.0
@@ -329,9 +329,8 @@ def tune(
     alarm = model.fit_summary["alarm"]
     if "biases" not in alarm:
         raise FitError(f"fit alone cannot learn an alarm, so nothing can be compared: {alarm['not_learnt']}")
-    options = {"criterion": model.fit_summary["criterion"], "additive": model.fit_summary["additive"]}
-    if alarm.get("centred"):
-        options["centred"] = True
+    options = {name: model.fit_summary[name] for name in ("criterion", "additive")}
+    options |= {"centred": True} if alarm.get("centred") else {}
     best, least = Setting("as fit does", options), alarm["figure"]
     base, trials = least, [_row(best.words, least, least, model)]
     missed = _missed(model, best, faulty or {})
@@ -376,8 +375,8 @@ def tune(
                         break
     except (_SpentError, KeyboardInterrupt):
         reason += "; the time ran out before every way was tried"
-    tuned = Tuned(model, reason, tuple(trials))
-    return Tuned(model.replace(fit_summary={**model.fit_summary, "tune": tuned.to_dict()}), reason, tuned.trials)
+    said = Tuned(model, reason, tuple(trials)).to_dict()
+    return Tuned(model.replace(fit_summary={**model.fit_summary, "tune": said}), reason, tuple(trials))
 
 
 def _missed(model: UncertainLTI, setting: Setting, faulty: Mapping[str, Sequence[Transient]]) -> set[tuple[str, int]]:
@@ -421,47 +420,28 @@ def recall(values: Array, memory: Memory, dt: Array, opens: NDArray[np.bool_]) -
         return values - past if memory.kind == "diff" else (values - past) / dt
 
 
-def with_memories(transient: Transient, memories: Mapping[str, tuple[str, Memory]]) -> Transient:
+def with_memories(transient: Transient, memories: Sequence[Remembered]) -> Transient:
     """The same run with further controls that follow from earlier samples of its states and controls."""
-    names = [*transient.state_names, *transient.control_names, *transient.scheduling_names]
+    places = {name: j for j, name in enumerate([*transient.state_names, *transient.control_names])}
     z, signals = np.hstack([transient.x, transient.u]), transient.signals
-    there = names[: z.shape[1]]
-    columns, added = [], []
-    for name, (of, memory) in memories.items():
-        if of not in there:
-            raise TransientError(
-                f"{transient.name}: there is no '{of}'{meant(of, there)}; there are {', '.join(there)}"
-            )
-        if name in names:
-            raise TransientError(f"{transient.name}: '{name}' is there already; choose another name")
-        names.append(name)
-        place = there.index(of)
-        columns.append(_column(transient, z[:, place], memory))
-        if signals is not None:
-            added.append(memory_of(signals[place], memory, name))
-    u = np.column_stack([transient.u, *columns])
+    u = np.column_stack([transient.u, *(_column(transient, z[:, places[one.of]], one.memory) for one in memories)])
     if signals is None:
-        return transient.replace(u=u, control_names=(*transient.control_names, *memories))
-    rules = with_rules(signals.structure, {name: of for name, (of, _) in memories.items()})
+        return transient.replace(u=u, control_names=(*transient.control_names, *(one.name for one in memories)))
+    added = [memory_of(signals[places[one.of]], one.memory, one.name) for one in memories]
+    rules = with_rules(signals.structure, {one.name: one.of for one in memories})
     return transient.replace(u=u, signals=replace(signals, controls=(*signals.controls, *added), structure=rules))
 
 
 def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
     """The same run with some controls taken so many samples earlier, as `delay` in a signals file does."""
-    u, controls = transient.u.copy(), list(transient.signals.controls) if transient.signals is not None else []
-    for name, samples in delays.items():
-        if name not in transient.control_names:
-            there = ", ".join(transient.control_names)
-            raise TransientError(f"{transient.name}: there is no control '{name}'; there are {there}")
-        j = list(transient.control_names).index(name)
-        if controls and controls[j].memory is not None:
-            raise TransientError(f"{transient.name}: control '{name}' is {controls[j].field}; it takes no delay")
-        u[:, j] = _column(transient, u[:, j], Memory("lag", samples))
-        if controls:
-            controls[j] = replace(controls[j], delay=controls[j].delay + samples)
-    if transient.signals is not None:
-        return transient.replace(u=u, signals=replace(transient.signals, controls=tuple(controls)))
-    return transient.replace(u=u)
+    u, signals = transient.u.copy(), transient.signals
+    for j, name in enumerate(transient.control_names):
+        if name in delays:
+            u[:, j] = _column(transient, u[:, j], Memory("lag", delays[name]))
+    if signals is not None:
+        controls = [replace(s, delay=s.delay + delays[s.name]) if s.name in delays else s for s in signals.controls]
+        signals = replace(signals, controls=tuple(controls))
+    return transient.replace(u=u, signals=signals)
 
 
 def memory_of(signal: Signal, memory: Memory, name: str) -> Signal:

@@ -104,9 +104,8 @@ def _folder(transient: Transient) -> str:
         path = Path(transient.sources[0]).resolve()  # a run of a table
     if not path.exists():
         raise FitError(f"{transient.name}: is no file, so it has no folder; name the groups one by one")
-    parent = path.parent
-    # the file of a recording that is a folder
-    return str(parent.parent if (parent / "metadata.yaml").exists() else parent)
+    inside = (path.parent / "metadata.yaml").exists()  # the file of a recording that is a folder
+    return str(path.parent.parent if inside else path.parent)
 
 
 def _from_metadata(transient: Transient, name: str) -> str:
@@ -139,25 +138,16 @@ def _sessions(transients: Sequence[Transient], hours: float) -> list[str]:
                 f"cannot group it; group by folder, metadata or name"
             )
     numbers = _chained(spans, hours)
-    return [_instant(int(spans[numbers == number, 0].min())) for number in numbers]
+    starts = [int(spans[numbers == number, 0].min()) // 10**9 for number in numbers]
+    return [f"{np.datetime64(start, 's')}Z" for start in starts]  # to the second, so that no fit changes the name
 
 
 def _chained(spans: NDArray[np.int64], hours: float) -> NDArray[np.intp]:
     """Number of the session of each recording; a session goes on as long as the next start is near enough."""
-    numbers = np.zeros(len(spans), dtype=np.intp)
-    number, until = -1, 0
-    for i in np.argsort(spans[:, 0], kind="stable").tolist():
-        if number < 0 or spans[i, 0] - until > hours * 3600e9:
-            number += 1
-            until = int(spans[i, 1])
-        until = max(until, int(spans[i, 1]))
-        numbers[i] = number
+    numbers, order = np.zeros(len(spans), dtype=np.intp), np.argsort(spans[:, 0], kind="stable")
+    ends = np.maximum.accumulate(spans[order, 1])
+    numbers[order[1:]] = np.cumsum(spans[order[1:], 0] - ends[:-1] > hours * 3600e9)
     return numbers
-
-
-def _instant(t_ns: int) -> str:
-    """As UTC; the nanoseconds do not matter, so that the name does not change with the fit."""
-    return f"{np.datetime64(t_ns // 10**9, 's')}Z"
 
 
 def likely_groups(transients: Sequence[Transient]) -> str:

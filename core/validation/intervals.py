@@ -127,11 +127,9 @@ def scenario_interval(support: int, transients: int, confidence: float) -> tuple
     if k == N:
         root = brentq(excess, -60.0, 10.0) if excess(-60.0) < 0 < excess(10.0) else 0.0
         return max(0.0, 1.0 - math.exp(root)), 1.0
-    grid = np.linspace(-30.0 / (N - k), 3.0, 4001)  # log t; the stretch where the excess is negative holds 1 - k/N
-    centre = math.log(max(1.0 - k / N, 1e-12))
+    centre = math.log(max(1.0 - k / N, 1e-12))  # the stretch of log t where the excess is negative holds 1 - k/N
     if excess(centre) >= 0:
-        values = np.array([excess(s) for s in grid])
-        centre = float(grid[int(np.argmin(values))])
+        centre = min(np.linspace(-30.0 / (N - k), 3.0, 4001).tolist(), key=excess)
     below, above = centre - 1.0, centre + 1.0
     while excess(below) < 0:
         below -= 5.0
@@ -163,6 +161,4 @@ def discarding_bound(variables: int, discarded: int, transients: int, confidence
     def excess(share: float) -> float:
         return float(ways + binom.logcdf(worst, transients, share) - aim)
 
-    if excess(high) > 0:
-        return 1.0
-    return float(brentq(excess, low, high))
+    return 1.0 if excess(high) > 0 else float(brentq(excess, low, high))

@@ -122,10 +122,8 @@ def leave_out(
     if gap is None:
         gap = guard_interval(full, cuts) if blocks else 0.0
     shown = [f"{t.name} from {t.t[a]:.6g} to {t.t[b - 1]:.6g} s" if blocks else t.name for t, a, b in cuts]
-    units: dict[Any, list[int]] = {}
-    for i in range(len(cuts)):
-        units.setdefault(names[i] if grouping else i, []).append(i)
-    together = list(units.values())
+    unit_of = names or list(map(str, range(len(cuts))))
+    together = [[i for i, unit in enumerate(unit_of) if unit == one] for one in dict.fromkeys(unit_of)]
     if folds is not None and (blocks or folds < len(together)):
         count = blocks or folds
         together = [[i for unit in together[k::count] for i in unit] for k in range(count)]

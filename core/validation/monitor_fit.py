@@ -31,8 +31,6 @@ from uncertain_lti.validation.result import Validation
 
 CLEARLY = 0.9
 """Largest size of the jumps that a better way to fit sees, over those that a simpler one sees."""
-ALONE = 1 / 3
-"""Share of recordings, groups or blocks not covered by the others beyond which only the simplest way is tried."""
 FOLDS = 5
 """Fits without a part of the recordings, groups or, of a single recording, blocks, for an alarm or any other choice."""
 LIMIT = 1e9
@@ -62,8 +60,7 @@ class Monitored:
                 model = model.replace(memory={**model.memory, "evidence": panel.evidence.to_dict()})
             if self.why:
                 alarm["note"] = self.why
-        if self.centred:
-            alarm["centred"] = True
+        alarm |= {"centred": True} if self.centred else {}
         left = {"not_done": self.why} if self.validation is None else self.validation.judged_as(model).to_dict()
         return model.replace(fit_summary={**model.fit_summary, "alarm": alarm}, validation=left)
 
@@ -90,9 +87,8 @@ def fit_monitored(
     left = {name: value for name, value in options.items() if name not in of_the_fit_alone}
     size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
     if options.get("transient_weights") is not None:
-        return Monitored(
-            model, None, why="transient_weights are for all recordings, so none can be left out", centred=centred
-        )
+        why = "transient_weights are for all recordings, so none can be left out"
+        return Monitored(model, None, None, why, centred)
     if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
         seen = _seen(model, transients, _SHOWN)
@@ -137,17 +133,19 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
     are fitted to the way that is taken.
     """
     alone = {name: value for name, value in options.items() if name not in ("horizons", "widths", "drop_horizons")}
-    taken, way = _chosen(transients, ways, alone)
+    way, taken = ways[0], fit_monitored(transients, **{**alone, **ways[0]})
+    if len(ways) > 1 and taken.panel is not None and taken.panel.vouched:
+        best = _promising(transients, ways, taken.model, alone)
+        other = fit_monitored(transients, **{**alone, **best}) if best is not way else taken
+        if other.panel is not None and other.panel.figure < CLEARLY * taken.panel.figure:
+            way, taken = best, other
     return fit_monitored(transients, **{**options, **way}) if options.get("horizons") else taken
 
 
-def _chosen(
-    transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], options: Mapping[str, Any]
-) -> tuple[Monitored, Mapping[str, Any]]:
-    """What `choose_monitored` takes, and how it is fitted, without horizons."""
-    first = fit_monitored(transients, **{**options, **ways[0]})
-    if len(ways) == 1 or first.panel is None or len(first.panel.unlike) > ALONE * first.panel.units:
-        return first, ways[0]
+def _promising(
+    transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], first: UncertainLTI, options: Mapping[str, Any]
+) -> Mapping[str, Any]:
+    """The way whose panel sees clearly smaller jumps on what was fitted; `first`: fitted in the first way."""
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
 
@@ -155,7 +153,7 @@ def _chosen(
         seen = _seen(model, transients, _COMPARED)
         return learn(seen, seen.parts).figure
 
-    best, least = ways[0], figure(first.model)
+    best, least = ways[0], figure(first)
     for way in ways[1:]:
         asked = {**shared, **way}
         if asked.pop("centred", False):
@@ -166,11 +164,7 @@ def _chosen(
             continue
         if size < CLEARLY * least:
             best, least = way, size
-    if best is not ways[0]:
-        taken = fit_monitored(transients, **{**options, **best})
-        if taken.panel is not None and taken.panel.figure < CLEARLY * first.panel.figure:
-            return taken, best
-    return first, ways[0]
+    return best
 
 
 def point_of(transient: Transient) -> OperatingPoint:

@@ -36,7 +36,6 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import FitError
@@ -70,6 +69,8 @@ MOST = 1.5
 """That limit over the threshold without it at most, as parts at rest and parts that move are not alike."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
+ALONE = 1 / 3
+"""Share of recordings, groups or blocks not covered by the others beyond which only the simplest way is tried."""
 NEARBY = 0.75
 """Down to this share of the thresholds, alarms are assumed to cluster as they do at the thresholds."""
 BLIND = 1.0
@@ -135,10 +136,11 @@ class Evidence:
         """Of each rule (n,) or (1,), but for the factor."""
         ends = np.cumsum([len(rule.thresholds(n)) for rule in rules])[:-1]
         each = (np.split(values, ends, axis=-1) for values in (self.peaks, self.top, self.median))
-        return [
-            _threshold(rule, n, what == "block", self.dt, peaks, top, median, self.verdicts)
-            for rule, peaks, top, median in zip(rules, *each, strict=True)
-        ]
+        found = []
+        for rule, *of in zip(rules, *each, strict=True):
+            windows = max(3.0, self.verdicts / 2.0 / max(1, round(rule.window_s / self.dt)))
+            found.append(_threshold(windows, n, what == "block", *of))
+        return found
 
     def learnt(self, rules: Sequence[StatisticRule], what: str) -> tuple[StatisticRule, ...]:
         """These rules with their thresholds."""
@@ -168,24 +170,18 @@ class Evidence:
 class Panel:
     """Alarm rules with what they promise.
 
-    `rules`: the panel; `limit`: false alarms per hour at most, with CONFIDENCE; `alarms`: those on what was left out;
-    `hours`: under verdict there; `units`: independent recordings, groups or blocks; `what`: which of them;
-    `biases` (n,): jump of the reading of each state that the energy of one verdict shows some nine of ten times, the
-    threshold above twice the median size, or that alone brings chi2 to its threshold, recorded units; `within`: in this
-    time, s; `figure`: what ways to fit are compared by, the geometric mean over the states of the lasting offset that
-    the energy over a window shows;
-    `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the others do not cover;
-    `asked`: rate that was asked for; `residuals`: of the model, in the form that the joint rules take.
+    `rules`: the panel; `limit`: false alarms per hour at most, with CONFIDENCE; `what`: what was left out, recordings,
+    groups or blocks; `biases` (n,): jump of the reading of each state that the energy of one verdict shows some nine of
+    ten times, the threshold above twice the median size, or that alone brings chi2 to its threshold, recorded units;
+    `figure`: what ways to fit are compared by, the geometric mean over the states of the lasting offset that the energy
+    over a window shows; `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the others
+    do not cover; `asked`: rate that was asked for; `residuals`: of the model, in the form that the joint rules take.
     """
 
     rules: tuple[Rule, ...]
     limit: float
-    alarms: int
-    hours: float
-    units: int
     what: str
     biases: Array
-    within: float
     figure: float
     evidence: Evidence
     unlike: tuple[str, ...] = ()
@@ -216,12 +212,19 @@ class Panel:
                 certain = np.linalg.norm(residuals.whitening(np.ones(n, dtype=bool)), axis=0)
                 known = certain > 0.0
                 biases[known] = np.minimum(biases, unit * room / np.maximum(certain, 1e-300))[known]
-        return cls(
-            evidence.learnt(rules, what), _limit(evidence, len(rules)), int(evidence.counts.sum()), evidence.hours,
-            len(evidence.peaks), what, biases, evidence.dt,
-            float(np.exp(np.log(np.maximum(median * window, 1e-300)).mean())), evidence,
-            tuple(unlike), asked, residuals,
-        )  # fmt: skip
+        figure = float(np.exp(np.log(np.maximum(median * window, 1e-300)).mean()))
+        learnt, limit = evidence.learnt(rules, what), _limit(evidence, len(rules))
+        return cls(learnt, limit, what, biases, figure, evidence, tuple(unlike), asked, residuals)
+
+    @property
+    def units(self) -> int:
+        """Independent recordings, groups or blocks."""
+        return len(self.evidence.peaks)
+
+    @property
+    def vouched(self) -> bool:
+        """Whether what was left out shows that one way to fit holds better than another."""
+        return len(self.unlike) <= ALONE * self.units
 
     def summary(self, model: UncertainLTI) -> dict[str, Any]:
         """What `fit_summary["alarm"]` of its model says."""
@@ -233,19 +236,19 @@ class Panel:
         """Hours without an alarm that show the rate that was asked for; 0 if none was, or nothing says."""
         if self.asked is None or not math.isfinite(self.limit):
             return 0.0
-        return self.limit * self.hours / self.asked  # the limit falls with the hours
+        return self.limit * self.evidence.hours / self.asked  # the limit falls with the hours
 
     def to_dict(self) -> dict[str, Any]:
         """Plain data for the model file."""
         return {
             "limit_per_hour": self.limit if math.isfinite(self.limit) else None,
             "confidence": CONFIDENCE,
-            "alarms": self.alarms,
-            "hours": self.hours,
+            "alarms": int(self.evidence.counts.sum()),
+            "hours": self.evidence.hours,
             "units": self.units,
             "what": self.what,
             "biases": self.biases.tolist(),
-            "within": self.within,
+            "within": self.evidence.dt,
             "figure": self.figure,
             "unlike": list(self.unlike),
             **({} if self.asked is None else {"asked": self.asked, "needed_hours": self.needed_hours}),
@@ -272,18 +275,15 @@ def rules_for(model: UncertainLTI, steps: int, dt: float, apart: bool = False) -
     return found
 
 
-def sizes_of(rules: Sequence[StatisticRule], part: Part) -> list[Array]:
-    """Size of each rule over its threshold, (K, n) or (K, 1), on one part by the alarm's own arithmetic."""
+def sizes_of(rules: Sequence[StatisticRule], part: Part) -> Array:
+    """Sizes (K, S) of the rules over their thresholds on one part, by the alarm's own arithmetic."""
     model = part.judged_by
     alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
     values = np.zeros((part.judged, len(alarm.names)))
     alarm.over(part.spans, part.dt, np.zeros(part.judged, dtype=bool), part.rows, values=values)
-    sizes = np.abs(values, out=values)
-    sizes[np.isnan(sizes)] = 0.0
-    np.minimum(sizes, LARGEST, out=sizes)
-    ends = np.cumsum([len(rule.thresholds(model.n)) for rule in rules])[:-1]
-    each = zip(rules, np.split(sizes, ends, axis=1), strict=True)
-    return [size if rule.kind == "mean" else np.sqrt(size) for rule, size in each]
+    sizes = np.minimum(np.nan_to_num(np.abs(values, out=values), copy=False), LARGEST, out=values)
+    squared = np.repeat([rule.kind != "mean" for rule in rules], [len(rule.thresholds(model.n)) for rule in rules])
+    return np.asarray(np.sqrt(sizes, out=sizes, where=squared))
 
 
 def check_rate(rate: float | None) -> None:
@@ -307,7 +307,7 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     apart = validation.what != "block" and int(unit_numbers(parts).max()) + 1 >= TELLING
     stretch = lengths[len(lengths) // 10]
     rules = rules_for(validation.model, stretch, dt, apart)
-    model, left, fitted = _narrowest(validation.model, rules, parts, fitted, dt, validation.what)
+    model, left, fitted = _narrowest(validation, rules, parts, fitted, dt)
     rules = rules_for(model, stretch, dt, apart)
     evidence, shown, unlike = _gathered(rules, left, fitted, dt)
     found = evidence.with_alarms(rules, validation.what, shown)
@@ -320,19 +320,14 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
 
 
 def _narrowest(
-    model: UncertainLTI,
-    rules: Sequence[StatisticRule],
-    parts: Sequence[Part],
-    fitted: Sequence[Part],
-    dt: float,
-    what: str,
+    validation: Validation, rules: Sequence[StatisticRule], parts: Sequence[Part], fitted: Sequence[Part], dt: float
 ) -> tuple[UncertainLTI, Sequence[Part], Sequence[Part]]:
     """The model with the form of its residuals in which the joint statistics of one step leave the least room.
 
     Room is the volume that a joint statistic allows to a residual: the root of the determinant of its covariance, in
     utilisation times half-widths, and of its threshold. Returns what is left out and fitted in that form, too.
     """
-    joint = [rule for rule in rules if rule.kind == "chi2" and rule.horizon == 1]
+    model, joint = validation.model, [rule for rule in rules if rule.kind == "chi2" and rule.horizon == 1]
     forms = () if model.residuals is None else model.residuals.forms
     best, least = (model, parts, fitted), math.inf
     for form in forms if joint else forms[:1]:
@@ -343,7 +338,9 @@ def _narrowest(
             roots = np.diagonal(form.whitening(np.ones(model.n, dtype=bool)))
             half = evidence.widths[1] / 2.0 / model.operating_point.X if form.relative else np.ones(model.n)
             sizes = np.log(half[roots > 0.0] / roots[roots > 0.0])
-            room = float(sizes.sum() / max(len(sizes), 1) + np.log(evidence.thresholds(joint, model.n, what)).mean())
+            room = float(
+                sizes.sum() / max(len(sizes), 1) + np.log(evidence.thresholds(joint, model.n, validation.what)).mean()
+            )
         if room < least:
             best, least = (own, left, seen), room
     return best
@@ -378,27 +375,20 @@ def _gathered(
             far = part.extrapolated > 0
             unlike.append(part.name)
         left.append(part.without(far))
-    sizes = [np.hstack(sizes_of(rules, part)) for part in left]
-    every = np.concatenate([*sizes, *(np.hstack(sizes_of(rules, part)) for part in fitted)])
+    sizes, units = [sizes_of(rules, part) for part in left], unit_numbers(parts)
+    every = np.concatenate([*sizes, *(sizes_of(rules, part) for part in fitted)])
     shown = [(part, of) for part, of in zip(left, sizes, strict=True) if part.judged]
-    found = Evidence(
-        _peaks(unit_numbers(parts), sizes),
-        every.max(axis=0),
-        np.median(every, axis=0),
-        len(every),
-        np.average([(p.usual_width, p.median_width) for p in parts], axis=0, weights=judged),
-        sum(judged),
-        sum(part.hours for part, _ in shown),
-        dt,
-    )
-    return found, shown, unlike
+    peaks = np.full((int(units.max()) + 1, every.shape[1]), _NOTHING)
+    for unit, each in zip(units.tolist(), sizes, strict=True):
+        peaks[unit] = np.maximum(peaks[unit], each.max(axis=0, initial=0.0))
+    widths = np.average([(p.usual_width, p.median_width) for p in parts], axis=0, weights=judged)
+    hours = sum(part.hours for part, _ in shown)
+    top, median = every.max(axis=0), np.median(every, axis=0)
+    return Evidence(peaks, top, median, len(every), widths, sum(judged), hours, dt), shown, unlike
 
 
-def _threshold(
-    rule: StatisticRule, n: int, blocks: bool, dt: float, peaks: Array, top: Array, median: Array, verdicts: float
-) -> Array:
-    """Threshold (n,) or (1,) of one rule; as `Evidence` has them, of its sizes alone."""
-    windows = max(3.0, verdicts / 2.0 / max(1, round(rule.window_s / dt)))
+def _threshold(windows: float, n: int, blocks: bool, peaks: Array, top: Array, median: Array) -> Array:
+    """Threshold (n,) or (1,) of one rule, of so many windows; as `Evidence` has them, of its sizes alone."""
     found = median + math.sqrt(math.log(windows * n) / math.log(windows)) * (top - median)
     peaks = peaks[(peaks > _NOTHING).any(axis=1)]  # one that lies far outside what the others show says nothing
     logs, count = np.ma.log(np.ma.masked_less_equal(peaks, _NOTHING)), len(peaks)  # nor does a state at rest
@@ -415,14 +405,6 @@ def _threshold(
     elif count <= 2 and not blocks:
         found *= MOST
     return np.asarray(np.clip(found * _ABOVE, 1e-6, LARGEST**0.5))
-
-
-def _peaks(units: NDArray[np.intp], values: Sequence[Array]) -> Array:
-    """The largest of the values (K,) or (K, n) of the parts of each unit, at least _NOTHING."""
-    found = np.full((int(units.max()) + 1, *values[0].shape[1:]), _NOTHING)
-    for unit, each in zip(units.tolist(), values, strict=True):
-        found[unit] = np.maximum(found[unit], each.max(axis=0, initial=0.0))
-    return found
 
 
 def _limit(evidence: Evidence, rules: int) -> float:
@@ -459,8 +441,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         why = [f"{', '.join(still)} never moved"] if still else []
         why += [f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []
         return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
-    if panel.unlike:
-        count = len(panel.unlike)
+    if count := len(panel.unlike):
         verb = "does" if count == 1 else "do"
         return "some", (
             f"worth having within what was recorded: {plural(count, panel.what)} of {panel.units} {verb} not repeat "
@@ -480,6 +461,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
 def promises(model: UncertainLTI, panel: Panel) -> list[str]:
     """What the panel promises, a sentence each: false alarms, jumps seen, and what rate was asked for."""
     span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    evidence = panel.evidence
     of = list(zip(model.signals.states, panel.biases.tolist(), (panel.biases < _FAR * span).tolist(), strict=True))
     each = [f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "") for s, b, near in of if near]
     blind = [s.name for s, _, near in of if not near]
@@ -488,14 +470,14 @@ def promises(model: UncertainLTI, panel: Panel) -> list[str]:
     if math.isfinite(panel.limit):
         first = (
             f"false alarms: at most {float(f'{panel.limit:.2g}'):.7g} per hour with {CONFIDENCE:.0%} confidence, while "
-            f"the machine is run as in the recordings ({panel.alarms} in {lasting(panel.hours)} left out, "
-            f"{plural(panel.units, panel.what)})"
+            f"the machine is run as in the recordings ({int(evidence.counts.sum())} in {lasting(evidence.hours)} left "
+            f"out, {plural(panel.units, panel.what)})"
         )
     else:
         first = "false alarms: one stretch says nothing of their rate; record more"
-    found = [first, f"sees within {panel.within:.3g} s {'; '.join(sees)}"]
+    found = [first, f"sees within {evidence.dt:.3g} s {'; '.join(sees)}"]
     if panel.asked is not None and not panel.limit <= panel.asked:
-        more = panel.needed_hours - panel.hours
+        more = panel.needed_hours - evidence.hours
         remedy = f"{lasting(more)} more without an alarm would" if more > 0 else "record more"
         found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {remedy}")
     return found

@@ -241,10 +241,7 @@ def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
 
 def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
     """Sums over what was left out together."""
-    values = np.asarray(values, dtype=np.float64)
-    numbers = unit_numbers(parts)
-    member = numbers[:, None] == np.arange(int(numbers.max(initial=-1)) + 1)
-    return np.asarray(values @ member)
+    return np.asarray(np.bincount(unit_numbers(parts), weights=np.asarray(values)), dtype=np.float64)
 
 
 def rising(raised: NDArray[np.bool_], starts: Sequence[int]) -> int:

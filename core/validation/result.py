@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.text import html_table, named, number_text, plural
+from uncertain_lti.base.text import finite_data, html_table, named, number_text, plural
 from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.terms import ADDITIVE
@@ -213,12 +213,9 @@ class Validation:
         if v.grouping:  # by clusters
             least, most = rate_interval(by_unit(parts, [n > 0 for n in violated]), len(parts), v.confidence)
             whole = [max(0.0, 1.0 - most), 1.0 - least]
-        groups = {
-            "key": v.grouping,
-            "count": v.units,
-            "inside": int(np.count_nonzero(units == 0)),
-            "recordings": {p.group: [q.name for q in parts if q.group == p.group] for p in parts},
-        }
+        whole_groups = int(np.count_nonzero(units == 0))
+        recordings = {p.group: [q.name for q in parts if q.group == p.group] for p in parts}
+        groups = {"key": v.grouping, "count": v.units, "inside": whole_groups, "recordings": recordings}
         outside = (AlarmRule(margin=model.alarm_rule.margin),)
         alarms = [false_alarms(parts, rules, v.confidence) for rules in dict.fromkeys((model.alarm, outside))]
         return {
@@ -250,12 +247,11 @@ class Validation:
 def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
     """What was found on one part: counts, alarms of the model's rule, and the state that went farthest."""
     raised = raised_on(model.alarm, part)
-    farthest: dict[str, Any] = {"farthest": None, "farthest_state": None}
+    farthest, of = None, None
     if part.judged:
         sizes = np.nan_to_num(np.abs(part.utilisation), posinf=np.inf)
         k, i = np.unravel_index(int(np.argmax(sizes)), sizes.shape)
-        value = float(sizes[k, i])
-        farthest = {"farthest": value if math.isfinite(value) else None, "farthest_state": model.state_names[int(i)]}
+        farthest, of = finite_data(sizes[k, i]), model.state_names[int(i)]
     return {
         "name": part.name,
         "verdicts": part.judged,
@@ -263,7 +259,8 @@ def _part(part: Part, model: UncertainLTI) -> dict[str, Any]:
         "outside_domain": part.outside_domain,
         "alarms": rising(raised, part.starts),
         "alarm_share": float(part.dt[raised].sum() / part.dt.sum()) if part.judged else None,
-        **farthest,
+        "farthest": farthest,
+        "farthest_state": of,
     }
 
 
@@ -287,12 +284,9 @@ def condition(validation: Validation) -> str:
 
 def _average(parts: Sequence[Part], values: Sequence[Array]) -> Array:
     """Mean over parts by their verdicts, (n,)."""
-    weight = np.array([p.judged for p in parts], dtype=np.float64)
-    stacked = np.array(values)
+    weight, stacked = np.array([p.judged for p in parts], dtype=np.float64), np.array(values)
     used = weight > 0
-    if not used.any():
-        return np.full(stacked.shape[1], np.nan)
-    return np.asarray(weight[used] @ stacked[used] / weight[used].sum())
+    return np.asarray(weight[used] @ stacked[used] / (weight.sum() if used.any() else math.nan))
 
 
 def _notes(validation: Validation) -> list[str]:
