@@ -24,6 +24,7 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import main
+from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.plants.leibov import STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.reports.check import check_data, check_text
@@ -287,6 +288,24 @@ def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, wor
     model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[0.5])
     verdicts = EnvelopeMonitor(model).check(Transient(t_ns, x, np.zeros((200, 1))))
     assert f"ALARM: raised once, {words}" in check_text(check_data(model, verdicts))
+
+
+def test_the_longest_alarm_is_told_beside_the_first():
+    """What raised the first, of a moment, is not what matters."""
+    x = np.zeros((300, 2))
+    x[20:, 0] = 1.0  # a step of one verdict, and later a ramp
+    x[100:140, 1] = np.arange(1.0, 41.0)
+    x[140:, 1] = 40.0
+    rule = StatisticRule("energy", 0.0, 1.5)
+    model = UncertainLTI(
+        np.zeros((2, 2)), np.zeros((2, 0)), np.zeros((2, 2)), np.zeros((2, 0)), v=[0.5, 0.5], alarm=[rule]
+    )
+    verdicts = EnvelopeMonitor(model).check(Transient(np.arange(300.0), x, np.zeros((300, 0))))
+    first, by, longest, by_then = check_text(check_data(model, verdicts)).splitlines()[-4:]
+    assert first == "ALARM: raised 2 times, first at 20.0000 s for one verdict" and by.startswith(
+        "  raised by energy of x1"
+    )
+    assert longest == "  the longest at 100.0000 s for 39 s" and by_then.startswith("  raised by energy of x2")
 
 
 def test_a_model_is_written_over_with_force_alone(folder, cli):

@@ -29,6 +29,7 @@ from uncertain_lti.model.repeats import Repeats, needs, repeat_words, repeats_in
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.reports.findings import findings
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted
 
@@ -503,7 +504,6 @@ def test_reset_clears_the_alarm_and_a_state_that_stays_frozen_raises_it_again(mo
 
 
 def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> None:
-    from uncertain_lti.reports.findings import findings
     from uncertain_lti.reports.pages import html_report
 
     checked = [EnvelopeMonitor(model, 50, 50).check(held(run(12), 0, 200, 350))]
@@ -519,6 +519,22 @@ def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> Non
     facts = findings(model, "m", checked)
     assert facts["alarm"] and facts["happened"][0]["text"].startswith("frozen: position repeats exactly for 1.49 s")
     assert line in html_report(model, checked, facts)
+
+
+def test_a_report_without_an_alarm_names_the_longest_repeat_beside_what_moves() -> None:
+    """A level sensor hung for half an hour, and only `check` said so."""
+    repeats = Repeats([1.0, 0.0], [LARGEST, LARGEST], [LARGEST, LARGEST], [LARGEST, LARGEST])
+    model = UncertainLTI(
+        np.zeros((2, 2)), np.zeros((2, 0)), np.zeros((2, 2)), np.zeros((2, 0)), v=[5, 5], repeats=repeats
+    )
+    x = np.sin(np.column_stack([np.arange(60), np.arange(60)]))
+    x[20:30, 0], x[40:58, 0] = x[20, 0], x[40, 0]
+    (happened,) = findings(
+        model, "m", [EnvelopeMonitor(model).check(Transient(np.arange(60.0), x, np.zeros((60, 0))))]
+    )["happened"]
+    assert happened["text"].endswith(
+        "x1 repeats exactly for 17 s (at most 1 s in the fit) from 40.0000 s, while x2 moved"
+    )
 
 
 def test_a_quadruped_with_a_held_joint(recordings: Path, signals_folder: Path, tmp_path: Path) -> None:

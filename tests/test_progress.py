@@ -49,6 +49,17 @@ def fit_arguments(folder, output="m.model.json"):
     return ["fit", *files, "--output", str(folder / output), "--additive", "noise", "--force"]
 
 
+def test_work_goes_on_where_nobody_reads_what_it_says(long_run):
+    """As after `2>&1 | head -1`: the model is written, and its summary said where somebody listens."""
+    read, write = os.pipe()
+    os.close(read)
+    (long_run / "cut.model.json").unlink(missing_ok=True)
+    command = [*CLI, *fit_arguments(long_run, "cut.model.json"), "--verbose"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=write, text=True, timeout=120, check=False)
+    os.close(write)
+    assert done.returncode == 0 and "model written to" in done.stdout and (long_run / "cut.model.json").exists()
+
+
 def test_a_terminal_sees_bars_that_are_gone_at_the_end(long_run):
     command = [*CLI, *fit_arguments(long_run)]
     status, written = on_a_terminal(command, stdout=subprocess.DEVNULL)

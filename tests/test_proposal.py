@@ -915,3 +915,20 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     assert propose([path], states=["/table:Label"]).states[0].path == "Label"
     bag = save(tmp_path / "a.mcap", driven(), {})
     refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])
+
+
+def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
+    """A row number begins again in the next file, and a gain has another value there."""
+    files = []
+    for run, gain in enumerate((0.1, 0.4, 0.2)):
+        level = np.cumsum(np.random.default_rng(run).normal(size=300))
+        columns = {
+            "sno": np.arange(1, 301),
+            "ki": np.full(300, gain),
+            "level": level,
+            "flow": np.diff(level, prepend=0),
+        }
+        files.append(table_of(tmp_path / f"{run}.csv", columns))
+    found = propose(files)
+    assert {"sno", "ki"}.isdisjoint(candidate.path for candidate in (*found.states, *found.controls))
+    assert "grows as a clock or a counter does" in found.text and "a setting, and no measurement" in found.text

@@ -177,9 +177,12 @@ class Progress:
         return columns or 80, lines or 24
 
     def write(self, text: str) -> None:
-        """A line on the stream, above the bars."""
-        self._print(text, self._stream)
-        self._stream.flush()
+        """A line on the stream, above the bars; the work goes on where nobody reads it any more."""
+        try:
+            self._print(text, self._stream)
+            self._stream.flush()
+        except BrokenPipeError:
+            self._stream = io.StringIO()
 
     def _print(self, text: str, stream: TextIO) -> None:
         if self._bars:

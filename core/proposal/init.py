@@ -265,9 +265,12 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     counts = np.unique(finite, return_counts=True)[1]
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
         return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
+    known = [np.isfinite(values) for values in candidate.values]
+    if source.role != "control" and all(np.ptp(v[k]) == 0 for v, k in zip(candidate.values, known) if k.any()):
+        return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    if source.role != "control" and _counts(values, np.concatenate(source.arrival)):
+    if source.role != "control" and all(map(_counts, candidate.values, source.arrival)):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 

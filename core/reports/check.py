@@ -505,19 +505,29 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     blocks += [f"warning: {r['text']}, {moves[name]}" for name, r in longest.items()]
     told = [f"the alarm from {like['t']:.4f} s {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
-    if data["alarm"]:
-        first = data["alarms"][0]
-        often = times(len(data["alarms"]))
-        at, seconds = f"{first['t']:.4f} s", first["seconds"]
-        if first["t"] >= 86400 and first["t_ns"] > _DATED_NS:
-            at = f"{np.datetime64(first['t_ns'], 'ns').astype('datetime64[s]')} UTC, {lasting(first['t'] / 3600)} on,"
-        last = f"for {number(seconds)} s" if seconds < 120 else f"for {lasting(seconds / 3600)}"
-        blocks.append(f"ALARM: raised {often}, first at {at} {last if seconds else 'for one verdict'}")
-        by = [r["words"] for r in first["raised"] if r["rule"] != "containment"]
-        blocks += [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
+    if alarms := data["alarms"]:
+        first, longest_alarm = alarms[0], max(alarms, key=lambda alarm: alarm["seconds"])
+        blocks += [f"ALARM: raised {times(len(alarms))}, first at {_when(first)}", *_raised_by(first)]
+        if longest_alarm is not first:
+            blocks += [f"  the longest at {_when(longest_alarm)}", *_raised_by(longest_alarm)]
     elif data["verdicts"]:
         blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return blocks
+
+
+def _when(alarm: Mapping[str, Any]) -> str:
+    """When an alarm was raised, and for how long."""
+    at, seconds = f"{alarm['t']:.4f} s", alarm["seconds"]
+    if alarm["t"] >= 86400 and alarm["t_ns"] > _DATED_NS:
+        at = f"{np.datetime64(alarm['t_ns'], 'ns').astype('datetime64[s]')} UTC, {lasting(alarm['t'] / 3600)} on,"
+    last = f"for {number(seconds)} s" if seconds < 120 else f"for {lasting(seconds / 3600)}"
+    return f"{at} {last if seconds else 'for one verdict'}"
+
+
+def _raised_by(alarm: Mapping[str, Any]) -> list[str]:
+    """The line on what raised it; none where containment alone did."""
+    by = [r["words"] for r in alarm["raised"] if r["rule"] != "containment"]
+    return [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
 
 
 _DATED_NS = 10**17  # since 1970, from which on a time is one of a calendar

@@ -160,6 +160,9 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         text += f", but {recording['reason']}"
     if frozen := [f"{repeat['text']}, {repeat['why']}" for repeat in recording["frozen"]]:
         text = f"frozen: {shortlist(frozen, 1)}. {text}"
+    elif held := [repeat for repeat in recording["repeats"] if repeat["moving"]]:
+        longest = max(held, key=lambda repeat: repeat["seconds"])
+        text += f". {longest['text']}, while {shortlist(longest['moving'], 3)} moved"
     return {"recording": recording["recording"], "state": state, "text": text}
 
 
