@@ -272,9 +272,12 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
     """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted."""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
     spelt, order = _as_iso(where, [_spelt(str(cell)) for cell in cells], cells)
+    plain: dict[int, str] = {}  # by row
+    shifts: list[int] = []
     for row, text in enumerate(spelt):
         if match := _ISO.match(text):
-            times[row] = _of_iso(where, *match.groups())
+            plain[row], shift = _of_iso(where, *match.groups())
+            shifts.append(shift)
         elif match := _CLOCK.match(text):
             hours, minutes, seconds = match.groups()
             fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
@@ -284,27 +287,33 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
             neither = "is neither a number nor an ISO time such as 2026-11-22T06:28:01.25Z"
             remedy = "write all of them as one or the other" + ", with a point before decimals" * point
             raise BagError(f"{where}: '{given}' in row {row + 1} {neither}; {remedy}")
+    if plain:
+        times[list(plain)] = _parsed(where, list(plain.values())) - np.array(shifts)
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     return times, order
 
 
-def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> int:
-    """One instant, ns."""
+def _parsed(where: str, texts: Sequence[str]) -> NDArray[np.int64]:
+    try:
+        return np.array(texts, dtype="datetime64[ns]").astype(np.int64)
+    except ValueError:
+        if len(texts) == 1:
+            raise BagError(f"{where}: '{texts[0][:40]}' is no day or time that there is; mend it") from None
+        return np.concatenate([_parsed(where, [text]) for text in texts])  # one by one, to find the one that is wrong
+
+
+def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[str, int]:
+    """An instant without its zone, and how far that is before UTC, ns."""
     text = f"{day}T{(clock or '00:00').replace(',', '.')}"
     if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
         raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
-    try:
-        instant = int(np.datetime64(text, "ns").astype(np.int64))
-    except ValueError:
-        raise BagError(f"{where}: '{text[:40]}' is no day or time that there is; mend it") from None
     if not zone or zone in ("Z", "UTC"):
-        return instant
+        return text, 0
     hours, minutes = int(zone[1:3]), int(zone[-2:])
     if hours > _LARGEST_ZONE or minutes > 59:
         raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
-    before_utc = (hours * 60 + minutes) * 60 * 10**9
-    return instant + before_utc if zone[0] == "-" else instant - before_utc
+    return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1)
 
 
 def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
