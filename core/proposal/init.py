@@ -266,7 +266,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
         return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
     known = [np.isfinite(values) for values in candidate.values]
-    if source.role != "control" and all(np.ptp(v[k]) == 0 for v, k in zip(candidate.values, known) if k.any()):
+    if source.role != "control" and all(
+        np.ptp(v[k]) == 0 for v, k in zip(candidate.values, known, strict=True) if k.any()
+    ):
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
