@@ -41,12 +41,14 @@ _NAMES = (
     r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
 _UNIT = {
-    "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|millis(econds?)?", "us": r"us|µs|usecs?|micros(econds?)?",
-    "ns": r"ns|nsecs?|nanos(econds?)?",
+    "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
+    "ns": r"ns|nsecs?|nano(s|secs?|seconds?)",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
 _DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
+_DOTTED = re.compile(r"([01]?\d|2[0-3])\.([0-5]\d)\.([0-5]\d)")  # 18.00.00
+_MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)$")  # as Excel writes times with decimals
 _HALF = re.compile(r"(|.*[T\s])(\d{1,2})(?:[:.](\d\d))?(?:[:.](\d\d(?:[.,:]\d+)?))?\s*([AaPp])\.?\s?[Mm]\.?")  # 1:05 PM
 _NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
     re.compile(
@@ -97,7 +99,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
     if values.dtype.kind == "M":
         times = values.astype("datetime64[ns]").astype(np.int64)
     elif values.dtype.kind == "O":
-        cells = values.tolist()
+        cells = _with_colons(values.tolist())
         if layout.time is None and (days := _days_beside(table, column)):
             cells = [f"{day} {cell}".strip() for day, cell in zip(table.columns[days].tolist(), cells, strict=True)]
             said.append(f"its days are those of column '{days}'")
@@ -107,9 +109,11 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
     else:
         unit = layout.unit or _unit(column, values, table.units.get(column, ""))
-        days = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
-        if layout.unit is None and (unit != "s" or days):
-            said.append(f"its numbers are taken for {unit}{days}")
+        doubt = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
+        if unit == "s" and _coarse(values):
+            doubt = ", a long way from row to row: for others name it time_us or time_ms, or give `table: {unit: us}`"
+        if layout.unit is None and (unit != "s" or doubt):
+            said.append(f"its numbers are taken for {unit}{doubt}")
         times = _of_numbers(where, table, column, UNITS[unit])
     words = " and ".join(filter(None, said))
     return column, times, f"column '{column}': {words}" if words else ""
@@ -177,9 +181,32 @@ def _goes_forward(column: Column) -> bool:
     return column.dtype.kind not in "iuf" or bool(abs(np.mean(np.sign(np.diff(column)))) > 0.8)
 
 
+def _with_colons(cells: Sequence[object]) -> Sequence[object]:
+    """Times of day such as 18.00.00, and minutes and seconds such as 14:11.6, as others are written."""
+    texts = [str(cell).strip() for cell in cells]
+    if any(map(_dotted, texts)):
+        return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
+    minutes = [match and int(match[1]) for match in map(_MINUTES.fullmatch, texts)]
+    if None in minutes:
+        return cells
+    hours = np.cumsum(np.diff(minutes, prepend=minutes[:1]) < -30).tolist()
+    return [f"{hour}:{text}" for hour, text in zip(hours, texts, strict=True)]
+
+
+def _dotted(text: str) -> bool:
+    """Whether it is a time of day with points, and no date."""
+    match = _DOTTED.fullmatch(text)
+    low, high = sorted((int(match[1]), int(match[2]))) if match else (1, 1)
+    return not (1 <= low <= 12 and high <= 31)
+
+
 def _spelt(text: str) -> str:
     """An instant as people and controllers write it, such as 13-Mar-24 1:05:03 PM, as ISO does; else as it is."""
     text = text.strip()
+    if _MINUTES.fullmatch(text):
+        return f"0:{text}"
+    if _dotted(text):
+        return text.replace(".", ":")
     if _ISO.match(text) or _CLOCK.match(text):
         return text
     if half := _HALF.fullmatch(text):
@@ -211,7 +238,7 @@ def _unit(name: str, values: Column, stated: str = "") -> str:
     for unit, pattern in _UNIT.items():
         if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"[_\s]({pattern})$", low):
             return unit
-        if re.fullmatch(pattern, low) and unit != "s":
+        if unit != "s" and re.fullmatch(rf"({pattern})(_.*)?", low):
             return unit
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     size = float(np.median(np.abs(finite.astype(np.float64)))) if len(finite) else 0.0
@@ -232,6 +259,14 @@ def _like_days(values: Column) -> bool:
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     fine = bool((np.abs(1e3 * known - np.rint(1e3 * known)) > 1e-3).any())
     return fine and any(least < low and high < most for least, most in ((20_000, 80_000), (690_000, 800_000)))
+
+
+def _coarse(values: Column) -> bool:
+    """Whether whole numbers rise by hundreds from row to row, and not by whole minutes, as of a clock of ms or us."""
+    steps = np.diff(values[np.isfinite(values)].astype(np.float64))
+    return len(steps) > 2 and bool(
+        np.median(steps) >= 100 and (steps % 1 == 0).all() and (steps % 60 != 0).mean() > 0.5
+    )
 
 
 def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:
