@@ -57,7 +57,7 @@ from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
-from uncertain_lti.sampling.steady_state import codes
+from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
 from uncertain_lti.signals.values import TableLayout
@@ -239,8 +239,11 @@ def _sift(source: Source) -> None:
             for c in source.candidates
             if not (c.path.startswith(f"{base}.") if is_rotation else c.path.endswith(f"({base})"))
         ]
+    each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
+    shared = shared_codes(list(each.values())) if source.type == TYPE else set()
     for candidate in source.free:
-        if found := codes(np.concatenate([np.empty(0), *candidate.values])):  # numbers that stand for none
+        values = each[id(candidate)]
+        if found := {*codes(values), *(shared & {*values.tolist()})}:  # numbers that stand for none
             candidate.ignore = tuple(sorted(found))
             candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
         candidate.reason = _unfit(candidate, source)

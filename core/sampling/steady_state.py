@@ -59,6 +59,25 @@ def codes(values: Array) -> dict[float, int]:
     return found
 
 
+SHARED_LEAST, SHARED_APART, SHARED_BY = 99.0, 0.1, 3
+"""What makes a whole number of several columns one that stands for no value: its least size, how far from the others of
+each of so many columns it lies, over their range; and farther than the range of one of them."""
+
+
+def shared_codes(columns: Sequence[Array]) -> set[float]:
+    """Numbers that stand for no value in a table, such as -200 of each sensor: the least, or greatest, of several."""
+    apart: dict[float, list[float]] = {}
+    for values in columns:
+        rest = values[np.isfinite(values)]
+        for extreme in {float(rest.min()), float(rest.max())} if len(rest) else ():
+            others = rest[rest != extreme]
+            if extreme % 1 == 0 and abs(extreme) >= SHARED_LEAST and 0 < len(others) < len(rest) - 1:
+                low, high = float(others.min()), float(others.max())
+                far = max(extreme - high, low - extreme) / ((high - low) or 1.0)
+                apart.setdefault(extreme, []).extend([far] * (far > SHARED_APART))
+    return {code for code, each in apart.items() if len(each) >= SHARED_BY and max(each) > 1.0}
+
+
 STILL_SAMPLES = 10
 """A still stretch has at least this many samples."""
 STILL_BAND = 0.05
