@@ -249,27 +249,22 @@ def steps_of(
     """Samples on the messages of the slowest of the states' topics; of the others, the latest message before."""
     lags = lags or [0] * len(controls)
     longest = max(lags, default=0)
-    topics = list(dict.fromkeys(c.topic for c in state))
-    clock = min(topics, key=lambda t: of[t].rate)
-    X, U, dX = [], [], []
+    clock = min((c.topic for c in state), key=lambda topic: of[topic].rate)
+    found = [tuple(np.empty((0, len(columns))) for columns in (state, controls, state))]
     for number, arrival in enumerate(of[clock].arrival):
         columns = [held(c, of[c.topic], number, of[clock]) for c in [*state, *controls]]
         x, u = np.hsplit(np.column_stack(columns), [len(state)])
         step = np.diff(arrival)
         if len(step) < 2 + longest:
             continue
-        positive = step[step > 0]
-        limit = 2.5 * float(np.median(positive)) if len(positive) else 0.0
+        limit = 2.5 * float(np.median(step[step > 0])) if (step > 0).any() else 0.0
         for j, lag in enumerate(lags):
             u[:, j] = earlier(u[:, j], lag)
         good = (step > 0) & (step <= limit)
         good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
         good[200_000:] = False  # enough to tell
-        X.append(x[:-1][good])
-        U.append(u[:-1][good])
-        dX.append(np.diff(x, axis=0)[good])
-    n, m = np.empty((0, len(state))), np.empty((0, len(controls)))
-    return Steps(np.concatenate([n, *X]), np.concatenate([m, *U]), np.concatenate([n, *dX]))
+        found.append((x[:-1][good], u[:-1][good], np.diff(x, axis=0)[good]))
+    return Steps(*map(np.concatenate, zip(*found, strict=True)))
 
 
 ALIGNED = 0.5

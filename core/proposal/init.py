@@ -229,9 +229,8 @@ def _sift(source: Source) -> None:
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
     parts = {c.path: c for c in source.candidates}
     for base in bases:
-        raw = [parts.get(f"{base}.{axis}") for axis in "xyzw"]
-        read = [r for r in raw if r is not None and r.values]
-        norm = np.sqrt(sum(np.concatenate(r.values) ** 2 for r in read)) if len(read) == 4 else np.zeros(1)
+        read = [parts[path].values for axis in "xyzw" if (path := f"{base}.{axis}") in parts and parts[path].values]
+        norm = np.sqrt(sum(np.concatenate(values) ** 2 for values in read)) if len(read) == 4 else np.zeros(1)
         unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
         is_rotation = len(unit) > 0 and unit.mean() > 0.9
         source.candidates = [  # the other form of the same numbers has its line
