@@ -186,8 +186,8 @@ def _with_colons(cells: Sequence[object]) -> Sequence[object]:
     texts = [str(cell).strip() for cell in cells]
     if any(map(_dotted, texts)):
         return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
-    minutes = [match and int(match[1]) for match in map(_MINUTES.fullmatch, texts)]
-    if None in minutes:
+    minutes = [int(match[1]) for match in map(_MINUTES.fullmatch, texts) if match]
+    if len(minutes) < len(cells):
         return cells
     hours = np.cumsum(np.diff(minutes, prepend=minutes[:1]) < -30).tolist()
     return [f"{hour}:{text}" for hour, text in zip(hours, texts, strict=True)]
