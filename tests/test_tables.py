@@ -680,6 +680,17 @@ def test_the_unit_of_a_clock_is_in_its_name_or_asked_for(head, step, seconds, wo
     assert words in " ".join(bag.warnings) and bool(bag.warnings) == bool(words)
 
 
+@pytest.mark.parametrize("suffix", [".txt", ".dat", ".TXT"])
+def test_the_name_of_a_text_file_with_numbers_does_not_matter(suffix, tmp_path):
+    """As laboratories write them; what is no text is named."""
+    path = tmp_path / f"a{suffix}"
+    path.write_text("time;x\n" + "".join(f"{k};{k % 7},5\n" for k in range(40)))
+    (bag,) = group_recordings([path])
+    assert len(bag.times) == 40 and bag.columns_by_field["x"][1] == 1.5
+    path.write_bytes(bytes(range(256)) * 20)
+    refuses(BagError, "bytes that are no text", group_recordings, [path])
+
+
 def test_years_of_two_digits_may_come_first(tmp_path):
     bag = read_csv(tmp_path, "time,x", (f"24-03-{10 + k // 24:02} {k % 24:02}:00,{k}" for k in range(72)))
     assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}

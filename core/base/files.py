@@ -134,7 +134,7 @@ def try_to_write(path: Path) -> None:
         raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
-TABLES = (".csv", ".tsv", ".parquet", ".feather", ".mat", ".npz")
+TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".feather", ".mat", ".npz")
 """Suffixes of tables."""
 
 

@@ -434,6 +434,8 @@ def _wants(path: Path, package: str) -> str:
 
 _READERS: Mapping[str, Callable[[Path], Any]] = {
     ".csv": _read_csv,
+    ".txt": _read_csv,
+    ".dat": _read_csv,
     ".tsv": _read_csv,
     ".parquet": _read_arrow,
     ".feather": _read_arrow,
