@@ -426,7 +426,7 @@ def test_states_that_are_blind_are_named(learnt):
     assert worth(full, replace(panel, biases=0.041 * span))[1].endswith("jumps of 4.1 % of the recorded range")
     assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0))[0]
     quiet = replace(panel.evidence, hours=0.008, counts=np.zeros(3), dt=0.5)
-    assert "(0 in 28.8 s left out" in promises(full, replace(panel, evidence=quiet))[0]
+    assert "none in 28.8 s left out (8 rec" in promises(full, replace(panel, evidence=quiet))[0]
     far = promises(full, replace(panel, evidence=quiet, biases=np.array([0.25, 11.0]) * span))[1]
     assert far.startswith("sees within 0.5 s a jump of x1 ")
     assert far.endswith("; of x2 not even a jump of ten times the recorded range")

@@ -468,10 +468,11 @@ def promises(model: UncertainLTI, panel: Panel) -> list[str]:
     sees = [f"a jump of {', '.join(each)}"] if each else []
     sees += [f"of {shortlist(blind, 4)} not even a jump of ten times the recorded range"] if blind else []
     if math.isfinite(panel.limit):
+        count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
+        shown = f"{count or 'none'} in {lasting(evidence.hours)} left out ({plural(panel.units, panel.what)})"
         first = (
-            f"false alarms: at most {float(f'{panel.limit:.2g}'):.7g} per hour with {CONFIDENCE:.0%} confidence, while "
-            f"the machine is run as in the recordings ({int(evidence.counts.sum())} in {lasting(evidence.hours)} left "
-            f"out, {plural(panel.units, panel.what)})"
+            f"false alarms: {shown}, which shows at most {most:.7g} per hour with {CONFIDENCE:.0%} confidence, while "
+            f"the machine is run as in the recordings"
         )
     else:
         first = "false alarms: one stretch says nothing of their rate; record more"
