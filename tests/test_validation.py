@@ -424,6 +424,19 @@ def test_fit_prints_and_stores_what_leaving_out_gives(folder):
     assert stored["kind"] == "transients" and stored["parts"] == 6 and len(stored["false_alarms"]) == 2
 
 
+def test_a_model_finds_its_recordings_beside_it(tmp_path, monkeypatch, cli):
+    """As `fit` was run in their folder, and `validate` from another one."""
+    engine_bag(tmp_path / "run.mcap", 200)
+    (tmp_path / "signals.yaml").write_text(SIGNALS)
+    monkeypatch.chdir(tmp_path)
+    cli("fit", "run.mcap", "--signals", "signals.yaml", "--output", "m.model.json", "--criterion", "lp")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert "left out one block at a time (10 blocks" in cli("validate", "../m.model.json", "--blocks", "10").out
+    (tmp_path / "run.mcap").unlink()
+    assert "run.mcap: there is no such file" in cli("validate", "../m.model.json", status=2).err
+
+
 def test_groups_of_a_fit_are_those_of_its_validation(folder, cli):
     """Folder, metadata and name group; what the fit was told, validate goes by."""
     bags = []

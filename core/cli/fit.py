@@ -171,6 +171,13 @@ def _files(transients: Iterable[Transient]) -> list[dict[str, str]]:
     return [{"file": name} for name in dict.fromkeys(name for t in transients for name in t.sources)]
 
 
+def _found(file: str, model: str) -> str:
+    """A recording as the model's file names it, or beside that file."""
+    beside = os.path.join(os.path.dirname(model), file)
+    there, also = (os.path.exists(path.partition("[")[0]) for path in (file, beside))
+    return beside if also and not there else file
+
+
 def _with_sources(model: UncertainLTI, sources: Iterable[dict[str, Any]], group: str | None = None) -> UncertainLTI:
     """The model with the checksums of the files that it was fitted to, and the key of their groups."""
     from uncertain_lti.base.files import sha256
@@ -260,7 +267,7 @@ def validate(options: argparse.Namespace) -> Result:
     check_rate(options.false_alarms)
     model = UncertainLTI.load(options.model)
     sources = model.fit_summary.get("sources", [])
-    bags = options.bags or list(dict.fromkeys(s["file"] for s in sources))
+    bags = options.bags or list(dict.fromkeys(_found(s["file"], options.model) for s in sources))
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
     if options.output is not None:
