@@ -378,3 +378,12 @@ def test_stamps_that_jitter_are_named_and_samples_that_do_are_not(noise):
     for pace in (0.3, 10.0):
         assert "jitter" not in said(messages(uneven(False, noise=noise, pace=pace)))
     assert "jitter" not in said(messages(run(noise=noise)))
+
+
+def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():
+    """It is new every few samples while it moves, and hardly ever where it comes to rest: 96 % repeats."""
+    t = 1e-4 * np.arange(12_000)
+    angle = 3e-4 * np.round(400 * (1.0 - np.exp(-8 * t)))
+    transient = Transient(t, angle[:, None], np.empty((len(t), 0)))
+    found = fit(transient, "lp", additive="noise").fit_summary["messages"]
+    assert (np.diff(angle) == 0).mean() > 0.8 and not any("slower than the clock" in text for text in found)

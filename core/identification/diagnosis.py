@@ -395,7 +395,8 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
             continue
         period = float(np.median(np.diff(instants)))
         # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
-        if period >= 2 and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
+        even = period * len(instants) > 0.5 * problem.N  # a coarse sensor is new often for a while, and then not at all
+        if period >= 2 and even and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
             alone = len({other.topic for other in signals}) == 1
             remedy = f"{'' if alone else 'make its topic the clock, or '}leave it out"
             remedy = "take `judged: true` away" if signal.judged else remedy
