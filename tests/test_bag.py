@@ -531,7 +531,7 @@ def test_what_a_file_is_instead(tmp_path: Path) -> None:
     assert "git lfs pull" in error_of(saved("lfs.mcap", pointer))
     assert "is empty" in error_of(saved("empty.mcap", b""))
     assert "cut after 5 bytes" in error_of(saved("short.mcap", b"\x89MCAP"))
-    assert "a text file" in error_of(saved("notes.txt", b"hello\nworld\n"))
+    assert "a text file" in error_of(saved("notes.md", b"hello\nworld\n"))
     assert "zeros only" in error_of(saved("zeros.mcap", bytes(5000)))
     assert "no kind of file that is known" in error_of(saved("noise.mcap", random.Random(5).randbytes(5000)))
     assert "another version" in error_of(saved("new.mcap", b"\x89MCAP1\r\n" + bytes(100)))
