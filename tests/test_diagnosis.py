@@ -387,3 +387,10 @@ def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():
     transient = Transient(t, angle[:, None], np.empty((len(t), 0)))
     found = fit(transient, "lp", additive="noise").fit_summary["messages"]
     assert (np.diff(angle) == 0).mean() > 0.8 and not any("slower than the clock" in text for text in found)
+    rng = np.random.default_rng(0)
+    slow = np.repeat(np.cumsum(rng.normal(size=1800)), 5)  # while the machine rests at the end, too
+    transient = Transient(
+        1e-2 * np.arange(12_000), np.append(slow, np.full(3000, slow[-1]))[:, None], np.empty((12_000, 0))
+    )
+    found = fit(transient, "lp", additive="noise").fit_summary["messages"]
+    assert any("new about every 5 samples: its topic or its sensor is slower than the clock" in text for text in found)

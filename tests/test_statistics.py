@@ -141,6 +141,8 @@ def test_all_states_together_point_to_the_one_without_which_the_rest_is_least(
     assert every[300] == every[299] and set(every) == set(np.flatnonzero(counted).tolist())
     one.reset()
     assert one.blamed == -1
+    Statistics([one], [0]).push(0.01, array("d", MEAN))
+    assert one.blamed == -1  # nothing is unusual of any
 
 
 @pytest.mark.parametrize("kind", KINDS)

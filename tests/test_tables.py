@@ -660,6 +660,8 @@ def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
     rows = [f"{k // 150 % 60:02}:{0.4 * (k % 150):04.1f},{k}" for k in range(18000)]
     bag = read_csv(tmp_path, "time,x", rows)
     assert set(np.diff(bag.times).tolist()) == {4 * 10**8} and not bag.warnings
+    back = read_csv(tmp_path, "time,x", (f"{minute}:00.5,{k}" for k, minute in enumerate([40, 41, 42, 30, 31, 32])))
+    assert (np.diff(back.times) // 10**9).tolist() == [60, 60, -720, 60, 60]  # a clock that is set, and no hour
 
 
 @pytest.mark.parametrize(
