@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -54,12 +53,11 @@ def core_count() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-_THREAD = threading.local()
-
-
 def on_cores(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]], worth_threads: bool = True) -> list[T]:
     """function(*arguments) for each, in their order, by threads where what each does takes longer than to begin one."""
-    return list(one_by_one(function, arguments) if worth_threads else (function(*some) for some in arguments))
+    if not worth_threads:
+        return [function(*some) for some in arguments]
+    return list(one_by_one(function, arguments))
 
 
 @contextmanager
@@ -79,12 +77,8 @@ def _libraries() -> Any:
 
 def one_by_one(function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> Iterator[T]:
     """As `on_cores`, each as soon as it and those before it are done; an error ends what has not begun."""
-    if len(arguments) < 2 or core_count() < 2 or getattr(_THREAD, "works", False):
+    if len(arguments) < 2 or core_count() < 2:
         yield from (function(*some) for some in arguments)
         return
-
-    def begun() -> None:
-        _THREAD.works = True
-
-    with ThreadPoolExecutor(min(core_count(), len(arguments)), initializer=begun) as pool:
+    with ThreadPoolExecutor(min(core_count(), len(arguments))) as pool:
         yield from pool.map(lambda some: function(*some), arguments)
