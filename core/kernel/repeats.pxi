@@ -43,8 +43,9 @@ cdef class Repeating:
     """Follows the repeats of every state, one transition after another, and tells which are frozen.
 
     `thresholds` (n, 7): of each state, as of `model.repeats.FrozenWatch`; `least`: steps that activity and noise need;
-    `rest`: of a state that repeated so long the fit has seen a rest, s; `counted` (n,): states that may be frozen; `margin`: of the bounds that it will be given; `most` (4, n): the longest
-    repeat so far, s, the farthest run, the largest sum and the greatest activity, in half-widths.
+    `rest`: of a state that repeated so long the fit has seen a rest, s; `counted` (n,): states that may be frozen;
+    `margin`: of the bounds that it will be given; `most` (4, n): the longest repeat so far, s, the farthest run, the
+    largest sum and the greatest activity, in half-widths.
     """
 
     cdef readonly object most

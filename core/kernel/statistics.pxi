@@ -282,15 +282,16 @@ cdef class Statistic:
     cdef void blame(self, const double* dt, Py_ssize_t count, short* blamed) noexcept nogil:
         """The state that the numbers of all together point to after each of some verdicts."""
         cdef Py_ssize_t i, q
-        cdef double value, most
+        cdef double value, weight, most
         for q in range(count):
             if self.terms[q] == self.terms[q]:
+                weight = dt[q] / (self.window + dt[q])
                 self.blamed, most = -1, 0.0
                 for i in range(self.n):
                     value = self.shares[i * _TOGETHER + q]
                     value = value * value / self.unit[i] if self.unit[i] > 0.0 else 0.0
                     value = value if value <= _MOST else _MOST
-                    self.share[i] += (value - self.share[i]) * (dt[q] / (self.window + dt[q]))
+                    self.share[i] += (value - self.share[i]) * weight
                     if self.share[i] > most:
                         self.blamed, most = i, self.share[i]
             blamed[q] = <short>self.blamed
