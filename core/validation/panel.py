@@ -37,7 +37,7 @@ from typing import Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import LARGEST, Array
+from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, on_cores
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import lasting, plural, shortlist
 from uncertain_lti.identification.memory import as_text, of_text
@@ -375,16 +375,26 @@ def _gathered(
             far = part.extrapolated > 0
             unlike.append(part.name)
         left.append(part.without(far))
+    n = parts[0].judged_by.n
     sizes, units = [sizes_of(rules, part) for part in left], unit_numbers(parts)
-    every = np.concatenate([*sizes, *(sizes_of(rules, part) for part in fitted)])
+    numbers = [len(rule.thresholds(n)) for rule in rules]
+    ends = np.cumsum(numbers).tolist()
+
+    def top_and_median(rule: StatisticRule, columns: slice) -> tuple[Array, Array]:  # of one: of many states, much
+        every = np.concatenate([*(of[:, columns] for of in sizes), *(sizes_of([rule], part) for part in fitted)])
+        return every.max(axis=0), np.median(every, axis=0, overwrite_input=True)
+
+    given = [(rule, slice(end - count, end)) for rule, count, end in zip(rules, numbers, ends, strict=True)]
+    count = sum(part.judged for part in (*left, *fitted))
+    found = on_cores(top_and_median, given, count >= WORTH_THREADS)
+    top, median = (np.concatenate(each) for each in zip(*found, strict=True))
     shown = [(part, of) for part, of in zip(left, sizes, strict=True) if part.judged]
-    peaks = np.full((int(units.max()) + 1, every.shape[1]), _NOTHING)
+    peaks = np.full((int(units.max()) + 1, len(top)), _NOTHING)
     for unit, each in zip(units.tolist(), sizes, strict=True):
         peaks[unit] = np.maximum(peaks[unit], each.max(axis=0, initial=0.0))
     widths = np.average([(p.usual_width, p.median_width) for p in parts], axis=0, weights=judged)
     hours = sum(part.hours for part, _ in shown)
-    top, median = every.max(axis=0), np.median(every, axis=0)
-    return Evidence(peaks, top, median, len(every), widths, sum(judged), hours, dt), shown, unlike
+    return Evidence(peaks, top, median, count, widths, sum(judged), hours, dt), shown, unlike
 
 
 def _threshold(windows: float, n: int, blocks: bool, peaks: Array, top: Array, median: Array) -> Array:

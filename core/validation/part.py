@@ -175,7 +175,17 @@ def judge(
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
-    width = (verdicts.upper - verdicts.lower)[judged]
+    resets = np.flatnonzero(back_and_restarts(transient.t_ns)[1])
+    places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
+    longer, longer_residual = (
+        np.pad(values[judged], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)[:, places]
+        for values in (verdicts.longer_utilisation, verdicts.longer_residual)
+    )
+    outside, outside_domain = verdicts.flags[judged] == 1.0, verdicts.outside_domain
+    utilisation, residual = verdicts.utilisation[judged], verdicts.residual[judged]
+    width = verdicts.upper[judged]
+    width -= verdicts.lower[judged]
+    del verdicts  # of many states most of the memory
     whole, own = width, np.full((len(model.horizons) + 1, model.n), np.nan)  # the last for a horizon that it lacks
     if full is not model:
         _, half = full.columns_centre_and_half(full.normalised_columns(steps), steps.dt)
@@ -186,13 +196,6 @@ def judge(
         for j, (*_, half) in enumerate(model.envelopes(steps.k, model.normalised_columns(steps), steps.dt)):
             if half.size:
                 own[j] = 2.0 * half.mean(axis=1) * model.operating_point.X
-    places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
-    longer, longer_residual = (
-        np.pad(values[judged], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)[:, places]
-        for values in (verdicts.longer_utilisation, verdicts.longer_residual)
-    )
-    outside = verdicts.flags[judged] == 1.0
-    resets = np.flatnonzero(back_and_restarts(transient.t_ns)[1])
     return Part(
         name,
         group,
@@ -201,15 +204,15 @@ def judge(
         transient,
         steps.dt,
         tuple(sorted({0, *(int(np.count_nonzero(judged[:r])) for r in resets)})),
-        verdicts.utilisation[judged],
+        utilisation,
         outside,
-        verdicts.residual[judged],
+        residual,
         longer,
         longer_residual,
         own[places],
         np.zeros(len(steps.dt), dtype=np.intp) if level is None else level(steps),
-        outside_domain=int(verdicts.outside_domain.sum()),
-        unseen=int((outside.any(axis=1) & ~verdicts.outside_domain[judged]).sum()),
+        outside_domain=int(outside_domain.sum()),
+        unseen=int((outside.any(axis=1) & ~outside_domain[judged]).sum()),
         mean_width=width.mean(axis=0),
         max_width=width.max(axis=0),
         relative_width=width.mean(axis=0) / np.maximum(whole.mean(axis=0), 1e-300),
