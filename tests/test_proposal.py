@@ -969,6 +969,18 @@ def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
     assert "grows as a clock or a counter does" in found.text and "a setting, and no measurement" in found.text
 
 
+@pytest.mark.parametrize("step", [0.02, 60.0])
+def test_the_clock_of_another_device_is_no_state(tmp_path, step):
+    """It comes every fifth row, in whatever unit, and starts again after a day or a week; a duration is measured."""
+    rng, late = np.random.default_rng(0), step * (5 * (np.arange(2000) // 5))
+    u = np.repeat(rng.normal(size=100), 20)[:, None]
+    times = {"gnss_posTime": 86_400_000 - 20_000 * step + 1e3 * late, "time_of_day": late % (1500 * step)}
+    columns = times | {"x": answers(rng, u)[:, 0], "cmd": u[:, 0], "rise_time": answers(rng, u, pole=0.8)[:, 0]}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, step * np.arange(2000))])
+    assert [c.path for c in proposal.states] == ["x", "rise_time"]
+    assert "gnss_posTime, time_of_day: grows as a clock" in proposal.text
+
+
 @pytest.mark.parametrize(("code", "shared"), [(-200.0, True), (-50.0, False), (-200.5, False), (1000.0, False)])
 def test_a_number_below_all_others_of_several_columns_stands_for_no_value(code, shared, tmp_path):
     """-200 of thirteen sensors made each of them go from -200 to its values."""
