@@ -656,6 +656,19 @@ def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):
         read_csv(tmp_path, "x,Messzeitpunkt", (f"{k % 7},shift {k}" for k in range(30)))
 
 
+@pytest.mark.parametrize("odd", ["", "-", "#NAME?"])
+@pytest.mark.parametrize("form", ["{m:02}:{s:02}.0", "13/01/14 12:{m:02}:{s:02}", "2024-03-13 12:{m:02}:{s:02}"])
+def test_a_cell_that_is_no_time_among_many_that_are_is_left_out_and_named(tmp_path, form, odd):
+    """Beyond the hour as well, where minutes and seconds alone begin again; where many are odd, all are refused."""
+    every = [form.format(m=(30 + k // 2) % 60, s=k % 2 * 30) for k in range(55 if "12:" in form else 100)]
+    bag = read_csv(tmp_path, "time,x", (f"{odd if k == 20 else cell},{k}" for k, cell in enumerate(every)))
+    assert bag.columns_by_field["x"].tolist() == [k for k in range(len(every)) if k != 20]
+    assert sorted(np.diff(bag.times).tolist()) == [30 * 10**9] * (len(every) - 3) + [60 * 10**9]
+    assert any(f"1 cell that is no time (such as '{odd}') left out" in text for text in bag.warnings) == bool(odd)
+    half = (f"{'-' if k % 2 else cell},{k}" for k, cell in enumerate(every))
+    refuses(BagError, "is neither a number nor", read_csv, tmp_path, "time,x", half)
+
+
 def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
     rows = [f"{k // 150 % 60:02}:{0.4 * (k % 150):04.1f},{k}" for k in range(18000)]
     bag = read_csv(tmp_path, "time,x", rows)

@@ -203,9 +203,13 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
         return np.array(plain, dtype=object), ""
     if odd:
-        said = f"that {'is' if odd == 1 else 'are'} no number (such as '{first[:40]}') left out"
-        return numbers, f"{plural(odd, 'cell')} {said}"
+        return numbers, left_out(odd, "number", first)
     return numbers, "decimal commas read as points" * bool(comma)
+
+
+def left_out(odd: int, what: str, first: str) -> str:
+    """How many cells are no number, or no time, and the first of them."""
+    return f"{plural(odd, 'cell')} that {'is' if odd == 1 else 'are'} no {what} (such as '{first[:40]}') left out"
 
 
 def _unique(names: Iterable[str]) -> list[str]:
