@@ -225,7 +225,8 @@ def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
 
 
-COLUMNS = [("q_des1", "reference"), ("tau_des", "reference"), ("description", "state")]
+COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "yaw_sp_move_rate", "level_sp", "ref_x")]
+COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 
 
 @pytest.mark.parametrize(("column", "role"), COLUMNS)

@@ -337,7 +337,7 @@ _LABELS = 30
 """Values that a label takes, at most."""
 
 
-_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$))")
+_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$)|(^|_)(sp|ref|des)_|_sp$)")
 
 
 _STATE = re.compile(
