@@ -27,7 +27,7 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import YEARS, Column, RawTable, left_out, once, read_table
+from uncertain_lti.recordings.table_files import ODD_SHARE, YEARS, Column, RawTable, left_out, once, read_table
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import UNITS, TableLayout
@@ -49,8 +49,6 @@ _DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _DOTTED = re.compile(r"([01]?\d|2[0-3])\.([0-5]\d)\.([0-5]\d)")  # 18.00.00
 _MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)")  # as Excel writes times with decimals
-_ODD = 0.1
-"""Share of the cells of a column of times that may be none."""
 _HALF = re.compile(r"(|.*[T\s])(\d{1,2})(?:[:.](\d\d))?(?:[:.](\d\d(?:[.,:]\d+)?))?\s*([AaPp])\.?\s?[Mm]\.?")  # 1:05 PM
 _NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
     re.compile(
@@ -188,7 +186,7 @@ def _with_colons(cells: Sequence[object]) -> Sequence[object]:
     texts = [str(cell).strip() for cell in cells]
     if any(map(_dotted, texts)):
         return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
-    if sum(map(bool, map(_MINUTES.fullmatch, texts))) < (1 - _ODD) * sum(map(bool, texts)):
+    if sum(map(bool, map(_MINUTES.fullmatch, texts))) < (1 - ODD_SHARE) * sum(map(bool, texts)):
         return cells
     minutes = {
         row: int(text.partition(":")[0])
@@ -333,7 +331,7 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
             odd.append(row)
     if odd:
         given = str(cells[odd[0]]).strip()[:40]
-        if len(odd) > _ODD * sum(map(bool, spelt)):
+        if len(odd) > ODD_SHARE * sum(map(bool, spelt)):
             neither = "is neither a number nor an ISO time such as 2026-11-22T06:28:01.25Z"
             remedy = "write all of them as one or the other"
             remedy += ", with a point before decimals" * bool(re.fullmatch(r"-?\d+,\d+", given))
@@ -374,7 +372,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
     """
     found = [match for cell in cells if cell if (match := _DAY.fullmatch(cell))]
-    if not found or len(found) < (1 - _ODD) * sum(map(bool, cells)):
+    if not found or len(found) < (1 - ODD_SHARE) * sum(map(bool, cells)):
         return cells, ""
     orders = {}
     tried = [("day, month, year", 1, 2, 3), ("month, day, year", 2, 1, 3)]
