@@ -56,7 +56,8 @@ fit had as many; there, or in alarm from early on, from which on the machine may
 JUDGED = 0.5
 """Share of the steps that must have a verdict for their quiet to say something."""
 MOVES = 0.1
-"""Share of its range in the recording from which on a signal moved while a state repeated."""
+"""Share of its range in the recording from which on a signal moved while a state repeated; of that in the fit, from
+which on a state moves in a recording."""
 APART = 10
 """Verdicts without a violation that end an episode."""
 MOST_EPISODES, MOST_EXPLAINED = 1000, 100
@@ -329,8 +330,10 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, dict) and alarm.get("worth") == "none":
         return f"the model is {alarm['headline']}"
-    if (model.domain.x_max > model.domain.x_min).any() and not np.ptp(verdicts.transient.x[verdicts.judged], 0).any():
-        return "nothing that is judged moves in it"
+    fitted = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    hardly = np.minimum(MOVES * fitted, [s["mean_width"] or 0.0 for s in data["states"].values()])
+    if fitted.any() and (np.ptp(verdicts.transient.x[verdicts.judged], axis=0) <= hardly).all():
+        return "nothing that is judged moves in it by more than its bounds are wide, so there was nothing to see"
     alarmed = verdicts.alarm[verdicts.judged]
     if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
         other = "this is another machine, in other units, or run as in no recording of the fit"
