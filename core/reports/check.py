@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import (
     Block,
     Table,
@@ -118,12 +120,24 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "repeats": _repeats(model, verdicts, verdicts.repeating),
         "explained": list(islice(_explained(model, verdicts), MOST_EXPLAINED)),
         "notes": list(transient.notes),
+        "jitter": _jitter(model, verdicts) if verdicts.alarm.any() else [],
     }
     data["reason"] = _why_unknown(model, verdicts, data)
     data["outcome"] = OUTCOMES[[data["alarm"], bool(data["reason"]), bool(violated), True].index(True)]
     if samples:
         data["verdict_per_sample"] = _per_sample(model, verdicts)
     return data
+
+
+def _jitter(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
+    """What a fit to this recording would say of its stamps."""
+    from uncertain_lti.identification.assembly import assemble
+    from uncertain_lti.identification.diagnosis import jittering
+
+    with suppress(FitError):
+        problem = assemble([verdicts.transient], model.operating_point, None, "none")
+        return jittering(model, problem, [*model.state_names, *model.control_names])
+    return []
 
 
 def _raised(r: Raised) -> dict[str, Any]:
@@ -513,6 +527,7 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
         blocks += [f"ALARM: raised {times(len(alarms))}, first at {_when(first)}", *_raised_by(first)]
         if longest_alarm is not first:
             blocks += [f"  the longest at {_when(longest_alarm)}", *_raised_by(longest_alarm)]
+        blocks += [f"  {text}, and fit again" for text in data["jitter"]]
     elif data["verdicts"]:
         blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return blocks
