@@ -345,8 +345,11 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     if isinstance(alarm, dict) and alarm.get("worth") == "none":
         return f"the model is {alarm['headline']}"
     fitted = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    fitted[np.isinf(fitted)] = 0.0  # of a model that was given
     hardly = np.minimum(MOVES * fitted, [s["mean_width"] or 0.0 for s in data["states"].values()])
-    if fitted.any() and (np.ptp(verdicts.transient.x[verdicts.judged], axis=0) <= hardly).all():
+    if (model.domain.x_max > model.domain.x_min).any() and (
+        np.ptp(verdicts.transient.x[verdicts.judged], axis=0) <= hardly
+    ).all():
         return "nothing that is judged moves in it by more than its bounds are wide, so its quiet says nothing"
     alarmed = verdicts.alarm[verdicts.judged]
     if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
