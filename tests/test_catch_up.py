@@ -120,6 +120,12 @@ def test_what_was_put_in_order_is_counted_and_told(engine: tuple[UncertainLTI, B
     assert "up to 0.599 s late" in session.caught_up and f"{session.reordered} messages" in session.caught_up
 
 
+def test_the_numbers_of_the_rule_are_not_called_as_the_counts_are(engine: tuple[UncertainLTI, Bag]) -> None:
+    """`violations` of a state in /diagnostics is a count, beside which `violations: 1` of the monitor read as one."""
+    counts = session_of(engine[0], Rule(violations=2, window=5)).counts(0.0)
+    assert (counts["rule violations"], counts["rule window"]) == ("2", "5") and "violations" not in counts
+
+
 def test_without_a_stall_nothing_waits(engine: tuple[UncertainLTI, Bag]) -> None:
     model, bag = engine
     session = session_of(model, Rule())

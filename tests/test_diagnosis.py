@@ -17,9 +17,10 @@ import pytest
 import yaml
 from tanks import Tanks
 
-from uncertain_lti import SignalMap, Transient, read_transients
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.signal_map import Signal
 
@@ -369,6 +370,15 @@ def uneven(stamps_only, seed=0, noise=1e-3, count=2000, pace=1.0):
         x[k + 1] = F @ x[k] + np.linalg.solve(pace * A, (F - np.eye(2)) @ B @ u[k]) + dt * 2e-3 * rng.standard_normal(2)
     t = np.concatenate([[0.0], np.cumsum(stated)])
     return Transient(t, x + noise * rng.standard_normal(x.shape), u, name="run")
+
+
+def test_a_check_whose_stamps_jitter_says_so_beside_its_alarm():
+    """The fit saw even stamps."""
+    model = fit(run(noise=1e-3))
+    for found, jitters in ((uneven(True), True), (uneven(False), False)):
+        data = check_data(model, EnvelopeMonitor(model).check(found), samples=False)
+        assert data["alarm"] and ("  the stamps jitter" in check_text(data)) == jitters
+        assert not jitters or check_text(data).endswith("and fit again")
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-2])

@@ -22,6 +22,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Residuals
+from uncertain_lti.reports.check import check_data
 from uncertain_lti.validation.detectable import _alarming
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
@@ -354,6 +355,37 @@ def test_what_is_not_worth_having_is_said_first():
     assert still.fit_summary["alarm"]["headline"].startswith("not worth having: nothing that is judged moves")
 
 
+@pytest.mark.parametrize(
+    ("shares", "kind", "words"),
+    [
+        ((0.02, 0.4), "good", "worth having: it sees jumps of 2 to 40 % of the recorded ranges"),
+        (
+            (0.02, 0.9),
+            "good",
+            "worth having: it sees jumps of 2 to 90 % of the recorded ranges, large ones alone of x2",
+        ),
+        ((0.6, 0.9), "some", "worth little: it sees jumps of 60 to 90 % of the recorded ranges only, which a plot "),
+        ((0.02, 1.1), "some", "sees only x1: of x2 not even a jump of the whole recorded range"),
+    ],
+)
+def test_a_monitor_that_sees_large_jumps_alone_is_not_praised(learnt, shares, kind, words):
+    full, _, panel = learnt
+    span = (full.domain.x_max - full.domain.x_min) * full.operating_point.X
+    found = worth(full, replace(panel, biases=span * shares, unlike=()))
+    assert found[0] == kind and found[1].startswith(words)
+    assert "large" in words or "large" not in found[1]
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.002, None])
+def test_quiet_of_a_machine_that_is_parked_says_nothing(model, moved):
+    """The bounds of a drone on the ground were 140 times as wide as all that it did."""
+    run = plant(1)
+    if moved is not None:
+        run = run.replace(x=np.linspace([-moved, -moved], [moved, moved], len(run)), u=0 * run.u)
+    data = check_data(model, EnvelopeMonitor(model).check(run), samples=False)
+    assert (data["outcome"] == "unknown") == (moved is not None) == data["reason"].startswith("nothing that is judged")
+
+
 def test_one_recording_does_not_vouch_for_another_day(runs):
     alarm = fit(runs[:1], "lp", additive="noise").fit_summary["alarm"]
     assert alarm["what"] == "block" and alarm["worth"] == "some"
@@ -420,7 +452,7 @@ def test_states_that_are_blind_are_named(learnt):
     span = full.domain.x_max - full.domain.x_min
     blind = replace(panel, biases=np.array([panel.biases[0], 1.01 * span[1]]))
     assert worth(full, blind)[0] == "some" and worth(full, blind)[1].startswith("sees only x1: of x2")
-    assert worth(full, replace(panel, biases=0.99 * span))[0] == "good"
+    assert [worth(full, replace(panel, biases=share * span))[0] for share in (0.49, 0.99)] == ["good", "some"]
     assert worth(full, replace(panel, biases=1.01 * span))[0] == "none"
     assert "is over ten times the recorded range" in worth(full, replace(panel, biases=1e6 * span))[1]
     assert worth(full, replace(panel, biases=0.041 * span))[1].endswith("jumps of 4.1 % of the recorded range")

@@ -11,8 +11,9 @@
 
 import math
 import re
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -27,9 +28,13 @@ from test_signals import quaternion
 from uncertain_lti import SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.proposal import init
 from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column
 from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose, functions
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
+from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
+from uncertain_lti.proposal.tune import Remembered
+from uncertain_lti.signals.field_path import KINDS, Memory
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
 JOINT, POSE_2D = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Pose2D"
@@ -220,7 +225,8 @@ def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
 
 
-COLUMNS = [("q_des1", "reference"), ("tau_des", "reference"), ("description", "state")]
+COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "yaw_sp_move_rate", "level_sp", "ref_x")]
+COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 
 
 @pytest.mark.parametrize(("column", "role"), COLUMNS)
@@ -631,6 +637,36 @@ def test_a_rate_that_is_not_recorded_is_proposed_with_what_it_gains(tmp_path):
     assert width[0] < 0.3 * width[1]
 
 
+MEMBERS = [("fan", "pump"), ('" a"', "b"), ("j 1", "j_1"), ("x:1", "y, 2"), ('"3"', '"4"'), ("{}", "no"), ("s", "data")]
+
+
+@pytest.mark.parametrize("members", MEMBERS)
+@pytest.mark.parametrize("kind", [None, *KINDS])
+def test_every_signals_file_that_is_written_can_be_read(tmp_path, monkeypatch, members, kind):
+    """Whatever members are called, with every memory of a state and of a command, delayed or not."""
+    rng, t = np.random.default_rng(0), 10**18 + 20 * MS * np.arange(200)
+    for path, delay, ignore, recalled in product(("a[{}]", "unwrap(a[{}])"), (0, 3), ((), (-1e-7, 1e9)), (0, 1)):
+
+        def moving(topic, form, path=path, ignore=ignore, **more):
+            paths = [form.replace("{}", member) for member in members]
+            return [Candidate(topic, p, [1e-9 * rng.normal(size=200)], ignore=ignore, **more) for p in paths]
+
+        states, controls = moving("/x", path), moving("/u", "a[{}]", delay=delay)
+        sources = [
+            Source(c[0].topic, FLOAT64, role, False, None, [t], [0 * t - 1], c)
+            for c, role in ((states, "state"), (controls, "control"))
+        ]
+        one = [states[0]], [controls[0]]
+        name_signals(*one)
+        set_operating_point(*one, sources)
+        remembered = (Remembered(one[recalled][0].name, Memory(kind)),) if kind else ()
+        monkeypatch.setattr(init, "choose_memories", lambda *_, found=remembered: (found, 0.5))
+        alike = init._members(*one, {(c.topic, c.path): c for c in [*states, *controls]})
+        text = signals_file([SimpleNamespace(path=tmp_path)], sources, *one, "", init._memories(*one, sources), alike)
+        signals = SignalMap.from_dict(yaml.safe_load(text))
+        assert len(signals.states) == max(1, len(alike)), text
+
+
 def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
     other = driven(("/other/state", "/other/cmd"), seed=3)
     path = save(tmp_path / "run.mcap", [*driven(), *other], {})
@@ -932,6 +968,18 @@ def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
     found = propose(files)
     assert {"sno", "ki"}.isdisjoint(candidate.path for candidate in (*found.states, *found.controls))
     assert "grows as a clock or a counter does" in found.text and "a setting, and no measurement" in found.text
+
+
+@pytest.mark.parametrize("step", [0.02, 60.0])
+def test_the_clock_of_another_device_is_no_state(tmp_path, step):
+    """It comes every fifth row, in whatever unit, and starts again after a day or a week; a duration is measured."""
+    rng, late = np.random.default_rng(0), step * (5 * (np.arange(2000) // 5))
+    u = np.repeat(rng.normal(size=100), 20)[:, None]
+    times = {"gnss_posTime": 86_400_000 - 20_000 * step + 1e3 * late, "time_of_day": late % (1500 * step)}
+    columns = times | {"x": answers(rng, u)[:, 0], "cmd": u[:, 0], "rise_time": answers(rng, u, pole=0.8)[:, 0]}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, step * np.arange(2000))])
+    assert [c.path for c in proposal.states] == ["x", "rise_time"]
+    assert "gnss_posTime, time_of_day: grows as a clock" in proposal.text
 
 
 @pytest.mark.parametrize(("code", "shared"), [(-200.0, True), (-50.0, False), (-200.5, False), (1000.0, False)])

@@ -28,7 +28,7 @@ from uncertain_lti.cli.main import main
 from uncertain_lti.proposal.init import run_column
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
-from uncertain_lti.recordings.table_files import read_table
+from uncertain_lti.recordings.table_files import _of_arrays, read_table
 from uncertain_lti.signals.values import TableLayout
 
 SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"
@@ -243,12 +243,37 @@ def test_what_is_missing_is_nan_and_what_is_odd_is_reported(tmp_path):
     ]
 
 
+def test_signals_that_simulink_logged_are_called_as_they_are(tmp_path):
+    """As structures with time, of one signal or several; what is left out is one sentence for each reason."""
+    from scipy.io import savemat
+    from scipy.io.matlab import MatlabOpaque
+
+    t = 0.1 * np.arange(50)
+
+    def logged(*values):
+        one = [{"values": v, "dimensions": 1.0, "label": np.empty((0, 0))} for v in values]
+        return {"time": t, "signals": one[0] if len(one) == 1 else one}
+
+    every = {f"s{i}": logged(np.sin(t + i)) for i in range(9)} | {"scope": logged(np.cos(t), t**2)}
+    savemat(tmp_path / "a.mat", every)
+    table = open_recording(tmp_path / "a.mat")
+    assert {"s0", "s8", "scope_1", "scope_2"} < set(table.columns_by_field)
+    assert (
+        sum("left out" in text for text in table.warnings) == 1
+        and "and 7 more left out, no vector" in table.warnings[0]
+    )
+    kinds = [(key, object) for key in ("s0", "s1", "s2", "arr")]
+    dataset = np.array([(b"logs", b"MCOS", b"Dataset", 0)], dtype=kinds).view(MatlabOpaque)
+    words = r"'logs' left out, an object of class Dataset: .*Dataset s by t = s\{1\}.Values.Time; .*save\('b.mat', "
+    refuses(BagError, words, _of_arrays, Path("b.mat"), {"logs": dataset})
+
+
 def test_a_matrix_is_an_array(tmp_path):
     q = np.arange(10.0).reshape(5, 2)
     np.savez(tmp_path / "a.npz", t=np.arange(5.0), q=q, across=q.T, few=np.ones(3), name=np.array("bench"))
     table = open_recording(tmp_path / "a.npz")
     assert [f.fields for f in table.facts()] == [("q[0..1]", "across[0..1]")]
-    assert np.array_equal(table.columns_by_field["across"], q) and "'few' left out, it has 3" in table.warnings[0]
+    assert np.array_equal(table.columns_by_field["across"], q) and "'few (3)' left out, not of 5" in table.warnings[0]
     signals = SignalMap.from_dict({"states": [{"name": "q1", "topic": "/table", "field": "q[1]"}]})
     (read,) = read_transients(tmp_path / "a.npz", signals)
     assert read.x[:, 0].tolist() == [1.0, 3.0, 5.0, 7.0, 9.0]
@@ -654,6 +679,19 @@ def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):
     assert set(np.diff(bag.times).tolist()) == {25 * 10**8} and "grows from row to row" in bag.warnings[0]
     with pytest.raises(BagError, match="column 'Messzeitpunkt' holds 'shift 0', which is not read as a time, and no"):
         read_csv(tmp_path, "x,Messzeitpunkt", (f"{k % 7},shift {k}" for k in range(30)))
+
+
+@pytest.mark.parametrize("odd", ["", "-", "#NAME?"])
+@pytest.mark.parametrize("form", ["{m:02}:{s:02}.0", "13/01/14 12:{m:02}:{s:02}", "2024-03-13 12:{m:02}:{s:02}"])
+def test_a_cell_that_is_no_time_among_many_that_are_is_left_out_and_named(tmp_path, form, odd):
+    """Beyond the hour as well, where minutes and seconds alone begin again; where many are odd, all are refused."""
+    every = [form.format(m=(30 + k // 2) % 60, s=k % 2 * 30) for k in range(55 if "12:" in form else 100)]
+    bag = read_csv(tmp_path, "time,x", (f"{odd if k == 20 else cell},{k}" for k, cell in enumerate(every)))
+    assert bag.columns_by_field["x"].tolist() == [k for k in range(len(every)) if k != 20]
+    assert sorted(np.diff(bag.times).tolist()) == [30 * 10**9] * (len(every) - 3) + [60 * 10**9]
+    assert any(f"1 cell that is no time (such as '{odd}') left out" in text for text in bag.warnings) == bool(odd)
+    half = (f"{'-' if k % 2 else cell},{k}" for k, cell in enumerate(every))
+    refuses(BagError, "is neither a number nor", read_csv, tmp_path, "time,x", half)
 
 
 def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):

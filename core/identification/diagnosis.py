@@ -60,7 +60,7 @@ FED_BACK = 0.9
 FROZEN = 25
 """Samples for which a value does not change while the others move, from which on it may be frozen."""
 UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
-"""|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `_jittering`."""
+"""|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `jittering`."""
 
 CONSTANT = "never moved in what was fitted"
 """Words on controls that never moved: nothing is to be mended for the operation that was recorded."""
@@ -159,7 +159,7 @@ def describe(
         messages += _carried(few, discarded, problem, names, transients)
         alike = _collinear(problem, sums, names, past)
         noisy, late, held = _noise_like(part, names), _delayed(part, signals, past), _held(part, signals)
-        messages += [*alike, *late, *held, *_jittering(model, part, names), *_frozen(part, names, transients)]
+        messages += [*alike, *late, *held, *jittering(model, part, names), *_frozen(part, names, transients)]
         lacking = {} if late else _missing(part, signals)
         lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
         messages += lacking.values()
@@ -352,7 +352,7 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
     return messages
 
 
-def _jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> list[str]:
+def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> list[str]:
     """Stamps that are unevenly spaced where the samples are not.
 
     Over the uneven steps, what a constant step explains is compared with what the stated one does. Of samples that are

@@ -66,8 +66,8 @@ class Candidate:
 
     @property
     def element(self) -> str:
-        """Name of the entry it is (`j0` of `position[j0]`), or ""."""
-        match = re.search(r'\["?([^\[\]"]+)"?\]$', self.path)
+        """Name of the entry it is (`j0` of `position[j0]`), or ""; one in quotes is not told from an index."""
+        match = re.search(r'\[([^\[\]"]+)\]$', self.path)
         return match[1] if match and not match[1].isdigit() else ""
 
     @property
@@ -337,7 +337,7 @@ _LABELS = 30
 """Values that a label takes, at most."""
 
 
-_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$))")
+_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$)|(^|_)(sp|ref|des)_|_sp$)")
 
 
 _STATE = re.compile(

@@ -52,6 +52,7 @@ from uncertain_lti.proposal.signals_file import (
     set_operating_point,
     set_own_scale,
     signals_file,
+    words_of,
 )
 from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
@@ -76,6 +77,7 @@ _RUN = re.compile(
 )  # name of a column that says which run a row is of
 
 
+_CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch"}  # words in the name of one
 _APART = "not in every recording"
 
 
@@ -274,7 +276,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    if source.role != "control" and all(map(_counts, candidate.values, source.arrival)):
+    steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
+    clock = _CLOCK & {*words_of(candidate.path)} and np.mean(steps[steps != 0] > 0) > 0.9  # that of a day starts anew
+    if source.role != "control" and (clock or all(map(_counts, candidate.values, source.arrival))):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 

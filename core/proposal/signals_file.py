@@ -67,16 +67,17 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     """Words of a name: those of the path that say something, else the topic's last."""
     if candidate.element:
         words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
-        return [*words, *_split(candidate.kind)] if several_kinds else words
+        return [*words, *words_of(candidate.kind)] if several_kinds else words
     inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
     inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
-    words = [w for w in _split(inner) if w not in _DULL]
+    words = [w for w in words_of(inner) if w not in _DULL]
     if candidate.topic != TOPIC and all(len(w) == 1 or w.isdigit() for w in words):  # that of a table says nothing
-        words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
+        words = [*words_of(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
     return words or ["signal"]
 
 
-def _split(text: str) -> list[str]:
+def words_of(text: str) -> list[str]:
+    """Words of a name, in small letters: `gnss`, `pos`, `time` of `gnss_posTime`."""
     return [w.lower() for w in _PARTS.findall(text)]
 
 

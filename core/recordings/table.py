@@ -27,7 +27,7 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import YEARS, Column, RawTable, once, read_table
+from uncertain_lti.recordings.table_files import ODD_SHARE, YEARS, Column, RawTable, left_out, once, read_table
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import UNITS, TableLayout
@@ -48,7 +48,7 @@ _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\
 _DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _DOTTED = re.compile(r"([01]?\d|2[0-3])\.([0-5]\d)\.([0-5]\d)")  # 18.00.00
-_MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)$")  # as Excel writes times with decimals
+_MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)")  # as Excel writes times with decimals
 _HALF = re.compile(r"(|.*[T\s])(\d{1,2})(?:[:.](\d\d))?(?:[:.](\d\d(?:[.,:]\d+)?))?\s*([AaPp])\.?\s?[Mm]\.?")  # 1:05 PM
 _NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
     re.compile(
@@ -186,11 +186,17 @@ def _with_colons(cells: Sequence[object]) -> Sequence[object]:
     texts = [str(cell).strip() for cell in cells]
     if any(map(_dotted, texts)):
         return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
-    minutes = [int(match[1]) for match in map(_MINUTES.fullmatch, texts) if match]
-    if len(minutes) < len(cells):
+    if sum(map(bool, map(_MINUTES.fullmatch, texts))) < (1 - ODD_SHARE) * sum(map(bool, texts)):
         return cells
-    hours = np.cumsum(np.diff(minutes, prepend=minutes[:1]) < -30).tolist()
-    return [f"{hour}:{text}" for hour, text in zip(hours, texts, strict=True)]
+    minutes = {
+        row: int(text.partition(":")[0])
+        for row, text in enumerate(texts)
+        if re.fullmatch(r"\d\d?:[0-5]\d([.,]\d+)?", text)
+    }
+    hours = np.cumsum(np.diff([*minutes.values()], prepend=[*minutes.values()][:1]) < -30).tolist()
+    for row, hour in zip(minutes, hours, strict=True):
+        texts[row] = f"{hour}:{texts[row]}"
+    return texts
 
 
 def _dotted(text: str) -> bool:
@@ -304,11 +310,15 @@ def _too_late(where: str) -> BagError:
 
 
 def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
-    """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted."""
+    """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted.
+
+    A cell that is neither has no time, if few are.
+    """
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
     spelt, order = _as_iso(where, [_spelt(str(cell)) for cell in cells], cells)
     plain: dict[int, str] = {}  # by row
     shifts: list[int] = []
+    odd: list[int] = []
     for row, text in enumerate(spelt):
         if match := _ISO.match(text):
             plain[row], shift = _of_iso(where, *match.groups())
@@ -318,10 +328,15 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
             fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
             times[row] = (int(hours) * 60 + int(minutes)) * 60 * 10**9 + int(fraction)
         elif text:
-            given, point = str(cells[row]).strip()[:40], bool(re.fullmatch(r"-?\d+,\d+", text))
+            odd.append(row)
+    if odd:
+        given = str(cells[odd[0]]).strip()[:40]
+        if len(odd) > ODD_SHARE * sum(map(bool, spelt)):
             neither = "is neither a number nor an ISO time such as 2026-11-22T06:28:01.25Z"
-            remedy = "write all of them as one or the other" + ", with a point before decimals" * point
-            raise BagError(f"{where}: '{given}' in row {row + 1} {neither}; {remedy}")
+            remedy = "write all of them as one or the other"
+            remedy += ", with a point before decimals" * bool(re.fullmatch(r"-?\d+,\d+", given))
+            raise BagError(f"{where}: '{given}' in row {odd[0] + 1} {neither}; {remedy}")
+        order = " and ".join(filter(None, (order, left_out(len(odd), "time", given))))
     if plain:
         times[list(plain)] = _parsed(where, list(plain.values())) - np.array(shifts)
     if (times == NO_TIME).all():
@@ -357,7 +372,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
     """
     found = [match for cell in cells if cell if (match := _DAY.fullmatch(cell))]
-    if not found or len(found) < sum(map(bool, cells)):
+    if not found or len(found) < (1 - ODD_SHARE) * sum(map(bool, cells)):
         return cells, ""
     orders = {}
     tried = [("day, month, year", 1, 2, 3), ("month, day, year", 2, 1, 3)]
@@ -381,7 +396,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
         which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
         raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
     iso = iter(orders[taken[0]])
-    return [cell and next(iso) for cell in cells], note
+    return [next(iso) if _DAY.fullmatch(cell) else cell for cell in cells], note
 
 
 def _is_even(texts: Sequence[str]) -> bool:

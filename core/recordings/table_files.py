@@ -43,7 +43,7 @@ _INSTANT = re.compile(
 )
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
-_ODD_SHARE = 0.1  # of lines with another number of cells, above which the file is no table
+ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
 
 Column = NDArray[Any]
 """Numbers, (rows,) or (rows, parts); text, (rows,) of object; or instants, (rows,) of datetime64[ns]."""
@@ -150,7 +150,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
         for column, cell in zip(columns, cells, strict=False):
             column.append(cell)
     rows = len(columns[0])
-    if odd > max(1, _ODD_SHARE * (odd + rows)) or (odd and not rows):
+    if odd > max(1, ODD_SHARE * (odd + rows)) or (odd and not rows):
         others = f"{plural(odd, 'line')} with another number of cells than the {wide} of its header"
         raise BagError(f"{path}: {others}, the first is line {first_odd}; mend the file, or its header")
     if not rows:
@@ -203,9 +203,13 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
         return np.array(plain, dtype=object), ""
     if odd:
-        said = f"that {'is' if odd == 1 else 'are'} no number (such as '{first[:40]}') left out"
-        return numbers, f"{plural(odd, 'cell')} {said}"
+        return numbers, left_out(odd, "number", first)
     return numbers, "decimal commas read as points" * bool(comma)
+
+
+def left_out(odd: int, what: str, first: str) -> str:
+    """How many cells are no number, or no time, and the first of them."""
+    return f"{plural(odd, 'cell')} that {'is' if odd == 1 else 'are'} no {what} (such as '{first[:40]}') left out"
 
 
 def _unique(names: Iterable[str]) -> list[str]:
@@ -304,7 +308,7 @@ def _read_arrow(path: Path) -> RawTable:
     except (pa.ArrowException, ValueError, OSError) as error:
         raise BagError(f"{path}: is damaged or no {path.suffix} file ({one_line(error)}); copy it again") from None
     found: dict[str, Any] = {}
-    notes = []
+    notes: dict[str, list[str]] = {}
     columns = dict(zip(_unique(map(str, table.column_names)), table.columns, strict=True))
     for name, column in columns.items():
         kind = column.type
@@ -319,7 +323,7 @@ def _read_arrow(path: Path) -> RawTable:
         elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
             found[name] = np.array([text or "" for text in column.to_pylist()], dtype=object)
         else:
-            notes.append(f"column '{name}' left out, it is of type {kind}")
+            notes.setdefault(f"of type {kind}", []).append(name)
     read = _of_one_length(path, found, notes)
     read.exact = lambda name: [str(value) for value in columns[name].to_pylist()]  # integers with gaps
     return read
@@ -376,14 +380,23 @@ def _read_npz(path: Path) -> RawTable:
 def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
     """Columns among variables: vectors, and matrices whose lines are samples; records and structures field by field."""
     found: dict[str, Any] = {}
-    notes: list[str] = []
+    notes: dict[str, list[str]] = {}  # why variables are left out, and their names
     waiting = list(variables.items())[::-1]
     while waiting:
         name, value = waiting.pop()
+        if isinstance(value, list) and value and all(isinstance(one, Mapping) for one in value):
+            value = {str(number): one for number, one in enumerate(value, 1)}
         if isinstance(value, Mapping):
             waiting += [(f"{name}_{key}", inner) for key, inner in list(value.items())[::-1]]
             continue
         array = np.asarray(value) if value is not None else np.empty(0, dtype=object)
+        if {"s0", "s2", "arr"}.issubset(array.dtype.names or ()):
+            save = f"t = s{{1}}.Values.Time; x = s{{1}}.Values.Data; save('{path.name}', 't', 'x', '-v7')"
+            kind = next(iter(array["s2"].ravel()), "")
+            kind = kind.decode(errors="replace") if isinstance(kind, bytes) else str(kind)
+            what = f"an object of class {kind[:40]}: save its vectors, those of a Dataset s by {save}"
+            notes.setdefault(what, []).append(name)
+            continue
         if array.dtype.names:
             waiting += [(f"{name}_{key}", array[key]) for key in reversed(array.dtype.names)]
             continue
@@ -396,12 +409,13 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
         elif array.dtype.kind in "bf":
             array = array.astype(np.float64)
         elif array.dtype.kind not in "iu" and not _is_text(array):
-            notes.append(f"'{name}' left out, it is no array of numbers")
+            notes.setdefault("no array of numbers", []).append(name)
             continue
         if array.ndim in (1, 2) and array.shape[0] > 1:
-            found[name] = array
+            short = re.sub(r"_signals((?:_\d+)?)_values$", r"\1", name)  # as Simulink logs a signal beside its time
+            found[name if short in found else short] = array
         elif array.ndim:
-            notes.append(f"'{name}' left out, it is no vector")
+            notes.setdefault("no vector", []).append(name)
     return _of_one_length(path, found, notes)
 
 
@@ -409,12 +423,12 @@ def _is_text(array: NDArray[Any]) -> bool:
     return array.dtype.kind == "O" and array.ndim == 1 and len(array) > 0 and all(isinstance(v, str) for v in array)
 
 
-def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) -> RawTable:
+def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, list[str]]) -> RawTable:
     """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
     vectors = [len(column) for column in found.values() if column.ndim == 1]
     lengths = Counter(vectors or map(len, found.values()))
     if not lengths:
-        there = "; ".join(notes[:3]) or "nothing"
+        there = "; ".join(_left_out(notes)[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
     length = max(lengths, key=lambda number: (lengths[number], number))
     kept: dict[str, Column] = {}
@@ -424,8 +438,13 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) ->
         elif column.ndim == 2 and column.shape[1] == length:
             kept[name] = column.T
         else:
-            notes.append(f"'{name}' left out, it has {len(column)} entries and the others {length}")
-    return RawTable(kept, notes)
+            notes.setdefault(f"not of {length} entries as the others", []).append(f"{name} ({len(column)})")
+    return RawTable(kept, _left_out(notes))
+
+
+def _left_out(notes: Mapping[str, Sequence[str]]) -> list[str]:
+    """A sentence for each reason why variables are left out."""
+    return [f"{shortlist([repr(name) for name in names], 4)} left out, {why}" for why, names in notes.items()]
 
 
 def _wants(path: Path, package: str) -> str:

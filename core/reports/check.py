@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from itertools import islice
 from typing import Any
 
@@ -21,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import (
     Block,
     Table,
@@ -56,7 +58,8 @@ fit had as many; there, or in alarm from early on, from which on the machine may
 JUDGED = 0.5
 """Share of the steps that must have a verdict for their quiet to say something."""
 MOVES = 0.1
-"""Share of its range in the recording from which on a signal moved while a state repeated."""
+"""Share of its range in the recording from which on a signal moved while a state repeated; of that in the fit, from
+which on a state moves in a recording."""
 APART = 10
 """Verdicts without a violation that end an episode."""
 MOST_EPISODES, MOST_EXPLAINED = 1000, 100
@@ -117,12 +120,24 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "repeats": _repeats(model, verdicts, verdicts.repeating),
         "explained": list(islice(_explained(model, verdicts), MOST_EXPLAINED)),
         "notes": list(transient.notes),
+        "jitter": _jitter(model, verdicts) if verdicts.alarm.any() else [],
     }
     data["reason"] = _why_unknown(model, verdicts, data)
     data["outcome"] = OUTCOMES[[data["alarm"], bool(data["reason"]), bool(violated), True].index(True)]
     if samples:
         data["verdict_per_sample"] = _per_sample(model, verdicts)
     return data
+
+
+def _jitter(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
+    """What a fit to this recording would say of its stamps."""
+    from uncertain_lti.identification.assembly import assemble
+    from uncertain_lti.identification.diagnosis import jittering
+
+    with suppress(FitError):
+        problem = assemble([verdicts.transient], model.operating_point, None, "none")
+        return jittering(model, problem, [*model.state_names, *model.control_names])
+    return []
 
 
 def _raised(r: Raised) -> dict[str, Any]:
@@ -329,8 +344,13 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, dict) and alarm.get("worth") == "none":
         return f"the model is {alarm['headline']}"
-    if (model.domain.x_max > model.domain.x_min).any() and not np.ptp(verdicts.transient.x[verdicts.judged], 0).any():
-        return "nothing that is judged moves in it"
+    fitted = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    fitted[np.isinf(fitted)] = 0.0  # of a model that was given
+    hardly = np.minimum(MOVES * fitted, [s["mean_width"] or 0.0 for s in data["states"].values()])
+    if (model.domain.x_max > model.domain.x_min).any() and (
+        np.ptp(verdicts.transient.x[verdicts.judged], axis=0) <= hardly
+    ).all():
+        return "nothing that is judged moves in it by more than its bounds are wide, so its quiet says nothing"
     alarmed = verdicts.alarm[verdicts.judged]
     if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():
         other = "this is another machine, in other units, or run as in no recording of the fit"
@@ -510,6 +530,7 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
         blocks += [f"ALARM: raised {times(len(alarms))}, first at {_when(first)}", *_raised_by(first)]
         if longest_alarm is not first:
             blocks += [f"  the longest at {_when(longest_alarm)}", *_raised_by(longest_alarm)]
+        blocks += [f"  {text}, and fit again" for text in data["jitter"]]
     elif data["verdicts"]:
         blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return blocks

@@ -75,6 +75,8 @@ NEARBY = 0.75
 """Down to this share of the thresholds, alarms are assumed to cluster as they do at the thresholds."""
 BLIND = 1.0
 """What jumps by more than this share of the range of a state shows in any plot, without an alarm."""
+COARSE = 0.5
+"""Likewise, of jumps that are worth little to see."""
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
 _FAR = 10.0
@@ -451,15 +453,19 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         why = [f"{', '.join(still)} never moved"] if still else []
         why += [f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []
         return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
+    low, high = (f"{100 * extreme:.2g}" for extreme in (share.min(), share.max()))
+    ranges = f"{low} % of the recorded range" if low == high else f"{low} to {high} % of the recorded ranges"
+    coarse = [name for name, s in zip(names, share.tolist(), strict=True) if s > COARSE]
+    if len(coarse) == model.n:
+        missing = "what moves the states may be missing among the controls"
+        return "some", f"worth little: it sees jumps of {ranges} only, which a plot shows as well; {missing}"
     if count := len(panel.unlike):
         verb = "does" if count == 1 else "do"
         return "some", (
             f"worth having within what was recorded: {plural(count, panel.what)} of {panel.units} {verb} not repeat "
             f"what the others show, so nothing vouches for operation that none of them shows"
         )
-    low, high = (f"{100 * extreme:.2g}" for extreme in (share.min(), share.max()))
-    ranges = f"{low} % of the recorded range" if low == high else f"{low} to {high} % of the recorded ranges"
-    sees = f"it sees jumps of {ranges}"
+    sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
     if panel.what == "block":
         return "some", (
             f"worth having while the machine runs as in the one recording, which says nothing of another day: check it "
