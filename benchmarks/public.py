@@ -7,16 +7,18 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Four public data sets with labelled faults, by the protocol that was published with each: `fit` beside its peers.
+"""Five public data sets with labelled faults: `fit` beside its peers, by the protocol published with each, if one was.
 
     ./run python benchmarks/public.py tep --data FOLDER      # d00.dat, d00_te.dat, ... d21_te.dat
     ./run python benchmarks/public.py batadal --data FOLDER  # dataset03.csv, dataset04.csv, test_dataset.csv
     ./run python benchmarks/public.py skab --data FOLDER     # data/valve1/0.csv, ... of the repository
     ./run python benchmarks/public.py genesis --data FOLDER  # Genesis_AnomalyLabels.csv
+    ./run python benchmarks/public.py lbnl --data FOLDER     # MZVAV-2-1.csv, MZVAV-2-2.csv
 
 tep: github.com/camaramm/tennessee-eastman-profBraatz (licence of the University of Illinois); batadal:
 github.com/rtaormina/aeed (no licence stated); skab: github.com/waico/SKAB (GPL-3); genesis: folder genesis of
-github.com/pushbhat/timedata_2 (no licence stated), by this page's protocol. No data is part of this repository.
+github.com/pushbhat/timedata_2 (no licence stated), by this page's protocol; lbnl: Granderson et al. 2020, as
+air_handling_unit/ahu_data at commit 7cfb2bba of github.com/bbartling/open-fdd, by this page's. None is part of this.
 
 Ours is `fit(recording)` and `EnvelopeMonitor(model).check(...)`, without an option, from healthy data alone; lines that
 need more say what; "by init": `uncertain-lti init`, `fit`, `check` on files of all columns, with no option but their
@@ -67,21 +69,21 @@ class Signals:
         return Transient(t, rows[:, list(self.states)], rows[:, list(self.controls)], at=at)
 
 
-def ours(name: str, healthy: Array, t: Array, signals: Signals) -> Callable[[Array, Array], Verdicts]:
-    """What `fit` gives by itself: the verdicts on rows at times t."""
+def ours(name: str, signals: Signals, *healthy: tuple[Array, Array]) -> Callable[[Array, Array], Verdicts]:
+    """What `fit` gives by itself on recordings, rows and times: the verdicts on rows at times t."""
     began = time.process_time()
-    monitor = EnvelopeMonitor(fit(signals.recording(healthy, t)))
+    monitor = EnvelopeMonitor(fit([signals.recording(*some) for some in healthy]))
     print(f"{name}: fit in {time.process_time() - began:.1f} s of processor time", file=sys.stderr)
     return lambda rows, t: monitor.check(signals.recording(rows, t))
 
 
-def by_init(names: Sequence[str], healthy: Array, t: Array) -> Callable[[Array, Array], Array]:
+def by_init(names: Sequence[str], *healthy: tuple[Array, Array]) -> Callable[[Array, Array], Array]:
     """What the command line gives, with no option but the names of files: the alarm of rows at times t."""
     folder = tempfile.TemporaryDirectory()
     signals, model = f"{folder.name}/signals.yaml", f"{folder.name}/machine.model.json"
 
-    def written(rows: Array, t: Array) -> str:
-        file, header = f"{folder.name}/machine.csv", ",".join(["time", *names])
+    def written(rows: Array, t: Array, number: int = 0) -> str:
+        file, header = f"{folder.name}/machine_{number}.csv", ",".join(["time", *names])
         np.savetxt(file, np.column_stack([t, rows]), "%.15g", ",", header=header, comments="")
         return file
 
@@ -96,8 +98,9 @@ def by_init(names: Sequence[str], healthy: Array, t: Array) -> Callable[[Array, 
         stamps, alarm = zip(*((v["t_ns"], v["alarm"]) for v in data["verdict_per_sample"]), strict=True)
         return np.array(alarm)[np.searchsorted(stamps, np.rint(1e9 * t) + 1e3, side="right") - 1]
 
-    run("init", written(healthy, t), "--output", signals)
-    run("fit", written(healthy, t), "--signals", signals, "--output", model)
+    files = [written(*some, number) for number, some in enumerate(healthy)]
+    run("init", *files, "--output", signals)
+    run("fit", *files, "--signals", signals, "--output", model)
     return alarm
 
 
@@ -108,16 +111,19 @@ def blocks(rows: Array, count: int) -> Iterator[tuple[Array, list[Array]]]:
         yield rows[a:b], [part for part in (rows[:a], rows[b:]) if len(part) > 30]
 
 
-def peers(healthy: Array, count: int = BLOCKS) -> dict[str, tuple[Callable[[Array], Array], float]]:
-    """By name: the score, and its largest value on the blocks left out."""
-    found = {}
+def peers(healthy: Array | Sequence[Array], count: int = BLOCKS) -> dict[str, tuple[Callable[[Array], Array], float]]:
+    """By name: the score, and its largest value on the blocks, or on the recordings, that were left out in turn."""
+    found, runs = {}, [healthy] if isinstance(healthy, np.ndarray) else list(healthy)
+    left_out = [(run, runs[:i] + runs[i + 1 :]) for i, run in enumerate(runs)]
+    if len(runs) == 1:
+        left_out = list(blocks(runs[0], count))
     for name, learn in DETECTORS.items():
         limits = dict.fromkeys((1, *WINDOWS), -np.inf)
-        for block, others in blocks(healthy, count):
+        for block, others in left_out:
             score = learn(others)
             for window in limits:
                 limits[window] = max(limits[window], float(averaged(score, window)(block).max()))
-        score = learn([healthy])
+        score = learn(runs)
         for window, limit in limits.items():
             found[name if window == 1 else f"{name}, mean of {window}"] = (averaged(score, window), limit)
     return found
@@ -162,10 +168,10 @@ def tep(folder: Path) -> Iterator[list[str]]:
         ("ours", Signals(MEASURED, MANIPULATED)),
         ("ours, all 33 signals as states", Signals([*MEASURED, *MANIPULATED])),
     ):
-        check = ours(name, healthy, t[: len(healthy)], signals)
+        check = ours(name, signals, (healthy, t[: len(healthy)]))
         yield line(name, "left out", [check(rows, t).alarm for rows in tested])
     names = [*(f"XMEAS_{i}" for i in range(1, 42)), *(f"XMV_{i}" for i in range(1, 12))]
-    alarm = by_init(names, every[0], t[: len(healthy)])
+    alarm = by_init(names, (every[0], t[: len(healthy)]))
     yield line("ours, by init", "left out", [alarm(rows, t) for rows in every[1:]])
     for name, (score, limit) in peers(healthy).items():
         scores = [score(rows) for rows in tested]
@@ -220,11 +226,11 @@ def batadal(folder: Path) -> Iterator[list[str]]:
 
     hours = 3600.0 * np.arange(len(healthy))
     for name, both in (("ours", False), ("ours, controls at both ends of a step", True)):
-        check = ours(name, healthy, hours, Signals(tanks, commands, both))
+        check = ours(name, Signals(tanks, commands, both), (healthy, hours))
         found, before = (check(rows, hours[: len(rows)]) for rows in (test, develop))
         yield line(name, "left out", found.alarm)
         yield line(name, "best on dataset04", largest(found) > best(largest(before)))
-    yield line("ours, by init", "left out", by_init(names, healthy, hours)(test, hours[: len(test)]))
+    yield line("ours, by init", "left out", by_init(names, (healthy, hours))(test, hours[: len(test)]))
     for name, (score, limit) in peers(healthy[:, moving]).items():
         found, before = score(test[:, moving]), score(develop[:, moving])
         yield line(name, "left out", found > limit)
@@ -254,7 +260,8 @@ def skab(folder: Path) -> Iterator[list[str]]:
         rows = np.array([[float(v) for v in line[1:9]] for line in lines])
         truth.append(np.array([float(line[9]) for line in lines])[FITTED:] == 1)
         healthy, judged, (before, after) = rows[:FITTED], rows[FITTED:], np.split(t - t[0], [FITTED])
-        check, alarm = ours(file.name, healthy, before, Signals(range(8))), by_init(header[1:9], healthy, before)
+        run = healthy, before
+        check, alarm = ours(file.name, Signals(range(8)), run), by_init(header[1:9], run)
         alarms.setdefault("ours", []).append(check(judged, after).alarm)
         alarms.setdefault("ours, by init", []).append(alarm(judged, after))
         for name, (score, limit) in peers(healthy, SKAB_BLOCKS).items():
@@ -298,17 +305,52 @@ def genesis(folder: Path) -> Iterator[list[str]]:
             f"{sum(np.isfinite(delays))} of {len(delays)}", f"{np.median(delays):g}",
         ]  # fmt: skip
 
-    yield line("ours", ours("ours", rows[:half], t[:half], Signals(measured, switched))(rows[half:], t[half:]).alarm)
-    yield line("ours, by init", by_init(names[2:], rows[:half], t[:half])(rows[half:], t[half:]))
+    run, judged = (rows[:half], t[:half]), (rows[half:], t[half:])
+    yield line("ours", ours("ours", Signals(measured, switched), run)(*judged).alarm)
+    yield line("ours, by init", by_init(names[2:], run)(*judged))
     for what, columns in (("", [*measured, *switched]), (", measured alone", measured)):
         for name, (score, limit) in peers(rows[:half, columns]).items():
             yield line(name + what, score(rows[half:, columns]) > limit)
+
+
+# --- LBNL ---
+
+
+def lbnl(folder: Path) -> Iterator[list[str]]:
+    """Two thirds of the healthy days of two air handlers are learnt from in turn; others and faulty ones judged."""
+    healthy_days, faulty_days, t = dict[str, int](), dict[str, list[float]](), 60.0 * np.arange(24 * 60)
+    judged = [0, 0]
+    for name in ("MZVAV-2-1", "MZVAV-2-2"):
+        (_, *names, _), *lines = [line.split(",") for line in (folder / f"{name}.csv").read_text().splitlines()]
+        days = np.array([line[1:] for line in lines], dtype=float).reshape(-1, len(t), len(names) + 1)
+        healthy, faulty = ([day[:, :-1] for day in days if (day[:, -1] == kind).all()] for kind in (0, 1))
+        moving = np.ptp(np.concatenate(healthy), axis=0) > 0
+        state = np.array([n.endswith(("Temperature", "Static Pressure")) for n in names])
+        signals = Signals(np.flatnonzero(moving & state), np.flatnonzero(moving & ~state))
+        for fold in range(3):
+            kept = [day for i, day in enumerate(healthy) if i % 3 != fold]
+            runs, others = [(day, t) for day in kept], healthy[fold::3]
+            check, alarm = ours(f"{name}, {fold}", signals, *runs), by_init(names, *runs)
+            alarms: dict[str, Callable[[Array], Array]] = {
+                "ours": lambda day, check=check: check(day, t).alarm,
+                "ours, by init": lambda day, alarm=alarm: alarm(day, t),
+            }
+            for peer, (score, limit) in peers([day[:, moving] for day in kept]).items():
+                alarms[peer] = lambda day, s=score, limit=limit, on=moving: s(day[:, on]) > limit
+            judged = [judged[0] + len(others), judged[1] + len(faulty)]
+            for one, rule in alarms.items():
+                healthy_days[one] = healthy_days.get(one, 0) + sum(bool(rule(day).any()) for day in others)
+                faulty_days.setdefault(one, []).extend(first(rule(day)) for day in faulty)
+    for one, delays in faulty_days.items():
+        seen = f"{int(np.isfinite(delays).sum())} of {judged[1]}"
+        yield [one, "left out", f"{healthy_days[one]} of {judged[0]}", seen, f"{np.median(delays):g}"]
 
 
 PARTS: dict[str, tuple[Callable[[Path], Iterator[list[str]]], tuple[str, ...]]] = {
     "tep": (tep, ("false alarms, %", "seen of 18 faults, %", "seen of 21, %", "median delay, samples of 3 min")),
     "batadal": (batadal, ("S", "TPR", "TNR", "attacks seen", "median delay, h")),
     "skab": (skab, ("F1", "false alarms, %", "missed, %", "median delay, samples")),
+    "lbnl": (lbnl, ("healthy days in alarm", "faulty days seen", "median delay, min")),
     "genesis": (genesis, ("false alarms, %", "anomalous rows seen, %", "stretches seen", "median delay, rows")),
 }
 
