@@ -315,7 +315,7 @@ def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
         ("{time: clok}", r"there is no column 'clok', which the signals file names for the time \(is clock meant\?\)"),
         ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
         ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
-        ("{unit: min}", r"s.yaml: table: unit is 'min'.*; write one of s, ms, us, ns"),
+        ("{unit: day}", r"s.yaml: table: unit is 'day'.*; write one of s, ms, us, ns, min, h"),
         ("{time: []}", r"s.yaml: table: time is \[\]; write the name of a column"),
         ("5", r"s.yaml: table: a mapping is wanted here, not a number"),
     ],
@@ -354,6 +354,9 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),
         *(("a.csv", b"time,x\n2026-11-22T06:28:01+%b,1\n" % zone, "time zone") for zone in (b"99:99", b"15:00")),
         *(("a.csv", b"time,x\n%b,1\n" % day, "after 2261") for day in (b"3026-11-22", b"1500-01-01")),
+        ("a.xlsx", b"PK\x03\x04nothing", "a spreadsheet; save its sheet as .csv"),
+        ("a.ulg", b"ULog\x01\x12\x35", "a log of PX4; write its messages as .csv"),
+        ("1.BIN", b"\xa3\x95\x80\x80", "a log of ArduPilot; write its messages as .csv"),
         ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "is damaged or no .mat file|holds no column"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(200), r"save\('a.mat', '-v7'\)"),
@@ -654,6 +657,33 @@ def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):
     assert set(np.diff(bag.times).tolist()) == {25 * 10**8} and "grows from row to row" in bag.warnings[0]
     with pytest.raises(BagError, match="column 'Messzeitpunkt' holds 'shift 0', which is not read as a time, and no"):
         read_csv(tmp_path, "x,Messzeitpunkt", (f"{k % 7},shift {k}" for k in range(30)))
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("Time (min)", 60.0), ("t [h]", 3600.0), ("tempo_ms", 1e-3), ("zeit_s", 1.0)]
+)
+def test_a_time_says_its_unit_behind_its_name_in_any_language(name, unit, tmp_path):
+    """`Time (min)` was read as seconds, and `tempo_ms` was found only where it came first and never fell."""
+    bag = read_csv(tmp_path, f"x,{name}", (f"{k % 7},{k % 20}" for k in range(40)))
+    assert np.median(np.diff(bag.times)) == round(unit * 1e9) and list(bag.columns_by_field) == ["x"]
+
+
+def test_a_day_above_twelve_says_the_order_where_the_clock_is_put_back(tmp_path):
+    days = [f"{31 - (k < 8)}/10/2021 {(k % 8) // 4 + 2:02}:{15 * (k % 4):02},{k}" for k in range(16)]
+    bag = read_csv(tmp_path, "time,x", [*days, *days[-4:]])
+    assert (
+        bag.times[0] == np.datetime64("2021-10-30T02:00", "ns").astype(np.int64) and (np.diff(bag.times) < 0).sum() == 1
+    )
+
+
+def test_another_time_is_told_where_most_rows_share_one(tmp_path):
+    bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
+    assert bag.warnings[0].endswith(
+        "write times with more decimals, or take column 't [ms]', `table: {time: 't [ms]'}`"
+    )
+    bag = read_csv(tmp_path, "time,x", (f"{k - k // 4},{k}" for k in range(100)))
+    assert "only the first of such rows counts: write times" in bag.warnings[0]
+    assert not read_csv(tmp_path, "time_s,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9))).warnings
 
 
 def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
