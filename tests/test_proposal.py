@@ -221,6 +221,7 @@ def test_a_controller_publishes_all_kinds(topic, role):
 
 
 COLUMNS = [("q_des1", "reference"), ("tau_des", "reference"), ("description", "state")]
+COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
 
 
 @pytest.mark.parametrize(("column", "role"), COLUMNS)
@@ -440,11 +441,26 @@ def test_a_table_of_many_columns_takes_seconds(tmp_path):
     x += 0.005 * rng.normal(size=x.shape)
     x[:, 3], x[:, 7] = 2 * x[:, 4] + 3, x[:, 8] ** 2
     names = [f"cmd_{j}" for j in range(commands)] + [f"temp_{j}" for j in range(measured)]
+    names[commands + 7] = "head"
     columns = dict(zip(names, np.column_stack([u, x]).T, strict=True))
     table_of(tmp_path / "a.csv", columns, 0.1 * np.arange(rows), fmt="%.6g")
     with bounded(seconds=60):  # 400 columns took 442 s
         text = propose([tmp_path / "a.csv"]).text
-    assert "temp_4: moves with temp_3" in text and "temp_7: says what temp_8 says already" in text
+    assert "temp_4: moves with temp_3" in text and "head: says what temp_8 says already" in text
+
+
+def test_motors_that_follow_one_command_alike_are_all_states(tmp_path):
+    """Of four wheels one was proposed, and nothing saw the other three fail."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=40), 25)
+    speed = answers(rng, u[:, None])[:, 0]
+    columns = {f"m{i}": speed + 0.01 * rng.normal(size=len(u)) for i in (1, 2, 3)}
+    columns |= {"m4": np.round(2 * columns["m1"] + 1, 6), "rpm": columns["m2"] * 9.55, "speed_cmd": u}
+    columns |= {"referencia": u + 0.1 * rng.normal(size=len(u)), "row": np.arange(len(u)) % 300}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.01 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == ["m1", "m2", "m3"] and "m4: moves with m1" in proposal.text
+    assert "/table referencia: a reference for some controller" in proposal.text
+    assert "/table row: grows as a clock or a counter does" in proposal.text
 
 
 def follows(of, values):

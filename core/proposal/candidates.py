@@ -337,7 +337,7 @@ _LABELS = 30
 """Values that a label takes, at most."""
 
 
-_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$))")
+_REFERENCE = re.compile(r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)soll|demand|ref$|_des(_|\d|$))")
 
 
 _STATE = re.compile(

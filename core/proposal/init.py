@@ -56,7 +56,7 @@ from uncertain_lti.proposal.signals_file import (
 from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
-from uncertain_lti.recordings.table import TYPE, Table
+from uncertain_lti.recordings.table import TYPE, Table, called_time, goes_forward
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
@@ -274,15 +274,18 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    if source.role != "control" and all(map(_counts, candidate.values, source.arrival)):
+    named = source.type == TYPE and called_time(candidate.path) and goes_forward(finite)
+    if source.role != "control" and (named or all(map(_counts, candidate.values, source.arrival))):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
 def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
-    """Never falls, and is a whole number or follows the time of arrival."""
+    """Never falls, and is a whole number or follows the time of arrival; or counts by one, if it begins again."""
     good = np.isfinite(values)
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
+    if len(finite) > 2 and np.mean(np.diff(finite) == 1) > 0.9:
+        return True
     if len(finite) < 3 or (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
         return False
     if (finite == np.rint(finite)).all():

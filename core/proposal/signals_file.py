@@ -24,7 +24,7 @@ from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, held
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.recordings.table import TOPIC
+from uncertain_lti.recordings.table import TOPIC, TYPE
 from uncertain_lti.sampling.clock import coarse_ns
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS
@@ -278,7 +278,7 @@ def _left_out(sources: Sequence[Source], chosen: set[Candidate]) -> list[str]:
             if candidate not in chosen and not candidate.ready:
                 groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
         of = {reason: f" {shortlist(paths, 6)}" for reason, paths in groups.items()}
-        if source.reason and set(groups) <= {source.reason}:
+        if source.reason and set(groups) <= {source.reason} and source.type != TYPE:  # whose roles have columns
             of = {source.reason: ""}
         lines += [f"#   {source.topic}{paths}: {' '.join(reason.split())}" for reason, paths in of.items()]
     return lines
