@@ -85,6 +85,7 @@ WORDS = {
     "missing": "one sample earlier explains",
     "code": "stands for no value",
     "jitter": "the stamps jitter",
+    "bursts": "come in bursts",
     "flip": "change sign together",
     "wrap": "wraps around",
 }
@@ -378,6 +379,21 @@ def test_stamps_that_jitter_are_named_and_samples_that_do_are_not(noise):
     for pace in (0.3, 10.0):
         assert "jitter" not in said(messages(uneven(False, noise=noise, pace=pace)))
     assert "jitter" not in said(messages(run(noise=noise)))
+
+
+def test_messages_that_come_in_bursts_are_told_how_they_count():
+    """Of an even clock behind a slow link a third was lost as gaps, and the rest was taken for 20 kHz."""
+    even = run()
+    t = even.t_ns.astype(float)
+    for tell, times in (
+        (True, t[np.arange(len(t)) // 8 * 8] + 1e5 * (np.arange(len(t)) % 8)),
+        (False, t),
+        (False, t + np.where(np.arange(len(t)) > 300, 1e15, 0.0)),  # one long pause
+        (False, np.cumsum(np.where(np.random.default_rng(3).random(len(t)) < 0.03, 1e10, 1e6))),  # sent on a change
+    ):
+        found = messages(Transient(np.rint(times) * 1e-9, even.x, even.u, name="run"))
+        assert ("bursts" in said(found)) == tell
+        assert not tell or "write `step: constant` and `max_gap: 0" in found[0]
 
 
 def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():

@@ -11,6 +11,7 @@
 
 import math
 import re
+import struct
 from itertools import combinations, permutations
 from pathlib import Path
 
@@ -277,6 +278,22 @@ def test_angles_are_unwrapped(tmp_path, kind, sent, field):
     model = fitted([path], proposal)
     assert model.fit_summary["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
     assert model.domain.anywhere == [True, False], "however many turns there were"
+
+
+def test_a_topic_of_unknown_name_is_taken_where_no_state_answers_and_its_bursts_count(tmp_path):
+    """A noisy sensor was the state, the clock in the command's message a control, and eight messages at once a rate."""
+    rng, late = np.random.default_rng(3), []
+    for k, m in enumerate(
+        driven(("/motor/listen", "/motor/cmd"), 1600, extra=lambda k, x, u: [f64("/imu_sensor", at(k), 0)])
+    ):
+        data = m.data if m.topic != "/imu_sensor" else cdr(FLOAT64, data=rng.normal())
+        data += struct.pack("<d", k) * (m.topic == "/motor/cmd")
+        late.append(Message(m.topic, at(k // 24 * 8 + 8) + 1000 * (k % 24), data))
+    topics = [Topic("/motor/listen"), Topic("/imu_sensor")]
+    topics.append(Topic("/motor/cmd", "my_msgs/msg/Cmd", schema="float64 data\nfloat64 t\n"))
+    proposal = propose([write(topics, late).save(tmp_path / "a.mcap")])
+    assert signals_of(proposal) == ([("/motor/listen", "data")], [("/motor/cmd", "data")]), proposal.text
+    assert "step: constant\nmax_gap: 0." in proposal.text
 
 
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):

@@ -274,8 +274,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    named = source.type == TYPE and called_time(candidate.path) and goes_forward(finite)
-    if source.role != "control" and (named or all(map(_counts, candidate.values, source.arrival))):
+    named = called_time(candidate.path.rpartition(".")[2]) and goes_forward(finite)
+    if named or (source.role != "control" and all(map(_counts, candidate.values, source.arrival))):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 

@@ -25,7 +25,7 @@ from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, held
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TOPIC, TYPE
-from uncertain_lti.sampling.clock import coarse_ns
+from uncertain_lti.sampling.clock import coarse_ns, longest_pause
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS
 from uncertain_lti.signals.signal_map import Signal
@@ -166,7 +166,10 @@ def signals_file(
         f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
-    if unit := coarse_ns([clock.instants(clock, number)[0] for number in range(len(clock.arrival))]):
+    instants = [clock.instants(clock, number)[0] for number in range(len(clock.arrival))]
+    if pause := longest_pause(instants):
+        lines += ["", "# They come in bursts, and their samples evenly.", "step: constant", f"max_gap: {pause:g}"]
+    elif unit := coarse_ns(instants):
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
