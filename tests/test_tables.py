@@ -351,6 +351,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b'time,y\n"0,125","6,2"\n"0,250","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-11-22T06:28:00,2\n2026-13-22T06:28:01,3\n", "'2026-13-22T06:28:01' is no day or"),
+        ("a.csv", b"time,y,z\n1,2,3\n2,3,4\ntime,z,y\n1,2,3\n2,3,4\n", "line 4 names other columns, or in another"),
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),
         *(("a.csv", b"time,x\n2026-11-22T06:28:01+%b,1\n" % zone, "time zone") for zone in (b"99:99", b"15:00")),
         *(("a.csv", b"time,x\n%b,1\n" % day, "after 2261") for day in (b"3026-11-22", b"1500-01-01")),
@@ -674,6 +675,20 @@ def test_a_day_above_twelve_says_the_order_where_the_clock_is_put_back(tmp_path)
     assert (
         bag.times[0] == np.datetime64("2021-10-30T02:00", "ns").astype(np.int64) and (np.diff(bag.times) < 0).sum() == 1
     )
+
+
+def test_names_that_are_repeated_between_the_rows_are_left_out_and_told(tmp_path):
+    bag = read_csv(tmp_path, "time,x", (f"{k},{k % 7}" if k % 20 else "time,x" for k in range(1, 50)))
+    assert (
+        bag.warnings == [f"{bag.path}: 2 lines left out that repeat the names of the columns"] and len(bag.times) == 47
+    )
+
+
+def test_names_that_fit_the_rows_are_theirs_and_not_older_ones_above(tmp_path):
+    """Of a logger whose columns were changed after four rows, all later rows had the first names, one to the left."""
+    rows = [f"{k}|{k % 3}|{k % 5}|7|" for k in range(40)]
+    bag = read_csv(tmp_path, "time|speed|level|", ["0|1|2|", "", "time|flow|speed|level|", *rows])
+    assert list(bag.columns_by_field) == ["flow", "speed", "level"] and len(bag.times) == 40
 
 
 def test_another_time_is_told_where_most_rows_share_one(tmp_path):
