@@ -413,6 +413,23 @@ def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     assert "Pump_speed_cmd" not in model.state_names and "Valve_cmd" in model.state_names
 
 
+def test_millivolts_are_measured_and_entries_of_a_matrix_have_its_name(tmp_path):
+    """`Load_Cell_mV` was set by a controller, as `mv` is a manipulated variable; `data[2]` was called 2."""
+    rng = np.random.default_rng(0)
+    valve = np.repeat(rng.integers(0, 2, 40), 10)
+    columns = {
+        "Load_Cell_mV": answers(rng, 1.0 * valve[:, None], 0.01)[:, 0],
+        "Tank_mv": np.cumsum(rng.normal(size=400)),
+    }
+    path = table_of(tmp_path / "a.csv", columns | {"valve": valve}, 10.0 * np.arange(400))
+    assert [c.path for c in propose([path]).states] == ["Load_Cell_mV"]
+    u = np.repeat(rng.normal(size=40), 25)
+    data = np.vstack([0.01 * np.arange(1000), u, answers(rng, u[:, None])[:, 0]])
+    np.savez(tmp_path / "a.npz", data=data)
+    proposal = propose([tmp_path / "a.npz"])
+    assert [c.name for c in proposal.states] == ["data_1"] and [c.name for c in proposal.controls] == ["data_0"]
+
+
 @pytest.mark.parametrize("names", ["B1_Temp,B1_Press,B1_Valve1,B1_Valve2", "Temp1,Temp2,Temp3,Temp4"])
 def test_what_differs_in_its_numbers_alone_goes_together_and_some_state_is_left(tmp_path, names):
     """All of a unit, whose number the names begin with, went with its two valves: no state was left."""

@@ -691,6 +691,17 @@ def test_names_that_fit_the_rows_are_theirs_and_not_older_ones_above(tmp_path):
     assert list(bag.columns_by_field) == ["flow", "speed", "level"] and len(bag.times) == 40
 
 
+@pytest.mark.parametrize("tall", [False, True])
+def test_a_matrix_whose_first_line_grows_has_its_time_there(tall, tmp_path):
+    """As `To File` of Simulink writes it; no file of it could be read."""
+    lines = np.vstack([0.002 * np.arange(50), np.sin(np.arange(50)), np.cos(np.arange(50))])
+    np.savez(tmp_path / "a.npz", data=lines.T if tall else lines)
+    bag = open_recording(tmp_path / "a.npz")
+    assert bag.facts()[0].fields == ("data[0..1]",) and bag.facts()[0].rate == pytest.approx(500.0)
+    np.savez(tmp_path / "b.npz", data=lines[1:])
+    refuses(BagError, "no column is called time", open_recording, tmp_path / "b.npz")
+
+
 def test_another_time_is_told_where_most_rows_share_one(tmp_path):
     bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
     assert bag.warnings[0].endswith(

@@ -504,7 +504,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
 def _is_set(candidate: Candidate, called: bool) -> bool:
     """Whether a column is a control by its values or its name, or is `called` one; says why."""
     values = np.unique(candidate.finite)
-    by_name = called or _TURNED.search(candidate.path.lower())
+    by_name = called or _TURNED.search(candidate.path.removesuffix("_mV").lower())  # no manipulated variable
     if len(values) == 1:
         candidate.why = (
             f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"

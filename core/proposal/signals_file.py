@@ -71,8 +71,12 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
     inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
     words = [w for w in _split(inner) if w not in _DULL]
-    if candidate.topic != TOPIC and all(len(w) == 1 or w.isdigit() for w in words):  # that of a table says nothing
-        words = [*_split(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
+    if all(len(w) == 1 or w.isdigit() for w in words):
+        of_table = candidate.kind if "[" in candidate.path else ""  # whose topic says nothing
+        words = [
+            *_split(of_table if candidate.topic == TOPIC else candidate.topic.rstrip("/").rpartition("/")[2]),
+            *words,
+        ]
     return words or ["signal"]
 
 

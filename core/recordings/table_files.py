@@ -428,6 +428,12 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) ->
     if not lengths:
         there = "; ".join(notes[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
+    if not vectors and len(found) == 1:
+        ((name, matrix),) = found.items()
+        first, *others = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
+        if others and (np.diff(first) > 0).all():  # as Simulink writes to a file
+            said = f"the first line of '{name}' is taken for the time, as it grows"
+            return RawTable({"time": first, name: np.column_stack(others)}, [*notes, said])
     length = max(lengths, key=lambda number: (lengths[number], number))
     kept: dict[str, Column] = {}
     for name, column in found.items():
