@@ -490,11 +490,12 @@ def test_motors_that_follow_one_command_alike_are_all_states(tmp_path):
     speed = answers(rng, u[:, None])[:, 0]
     columns = {f"m{i}": speed + 0.01 * rng.normal(size=len(u)) for i in (1, 2, 3)}
     columns |= {"m4": np.round(2 * columns["m1"] + 1, 6), "rpm": columns["m2"] * 9.55, "speed_cmd": u}
+    columns |= {"imu_ts": 1.7e9 + 0.01 * np.arange(len(u)) - 0.05 * (np.arange(len(u)) % 97 == 5)}
     columns |= {"referencia": u + 0.1 * rng.normal(size=len(u)), "row": np.arange(len(u)) % 300}
     proposal = propose([table_of(tmp_path / "a.csv", columns, 0.01 * np.arange(len(u)))])
     assert [c.path for c in proposal.states] == ["m1", "m2", "m3"] and "m4: moves with m1" in proposal.text
     assert "/table referencia: a reference for some controller" in proposal.text
-    assert "/table row: grows as a clock or a counter does" in proposal.text
+    assert "/table imu_ts, row: grows as a clock or a counter does" in proposal.text
 
 
 def follows(of, values):

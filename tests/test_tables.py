@@ -702,6 +702,13 @@ def test_a_matrix_whose_first_line_grows_has_its_time_there(tall, tmp_path):
     refuses(BagError, "no column is called time", open_recording, tmp_path / "b.npz")
 
 
+def test_times_since_1970_are_found_without_a_name_though_some_step_back(tmp_path):
+    rows = [f"{1455208122.28 + k - 2.5 * (k % 40 == 9):.2f},{k % 7}" for k in range(100)]
+    bag = read_csv(tmp_path, "column,x", rows)
+    assert np.median(np.diff(bag.times)) == 10**9 and "taken for the time" in bag.warnings[0]
+    refuses(BagError, "no column is called time", read_csv, tmp_path, "column,x", [row[3:] for row in rows])
+
+
 def test_another_time_is_told_where_most_rows_share_one(tmp_path):
     bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
     assert bag.warnings[0].endswith(

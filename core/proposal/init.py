@@ -281,17 +281,21 @@ def _unfit(candidate: Candidate, source: Source) -> str:
 
 
 def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
-    """Never falls, and is a whole number or follows the time of arrival; or counts by one, if it begins again."""
+    """Never falls, and is a whole number or follows the time of arrival; or counts rows or is a stamp, if it falls."""
     good = np.isfinite(values)
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
-    if len(finite) > 2 and np.mean(np.diff(finite) == 1) > 0.9:
-        return True
-    if len(finite) < 3 or (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+    if len(finite) < 3 or np.ptp(t) == 0:
         return False
-    if (finite == np.rint(finite)).all():
+    rest, slope = (
+        residual(t[:, None], finite[:, None])[0],
+        float(np.polyfit(t - t.mean(), finite - finite.mean(), 1)[0]),
+    )
+    follows = bool(rest < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+    if np.mean(np.diff(finite) == 1) > 0.9 or (follows and any(abs(slope / 1000**k - 1) < 1e-3 for k in range(4))):
         return True
-    rest = residual(t[:, None], finite[:, None])[0]
-    return bool(rest < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+    if (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+        return False
+    return follows or bool((finite == np.rint(finite)).all())
 
 
 def _wrapped(source: Source) -> None:

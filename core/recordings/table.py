@@ -159,9 +159,12 @@ def called_time(name: str) -> bool:
 
 
 def _grows(column: Column) -> bool:
-    """Whether numbers grow from each row to the next."""
-    numbers = column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2
-    return numbers and bool((column[1:] > column[:-1]).all())
+    """Whether numbers grow from each row to the next, or nearly so and are times since 1970."""
+    if column.ndim != 1 or column.dtype.kind not in "iuf" or len(column) < 3:
+        return False
+    size = float(np.median(column))
+    since = any(0.9 < size / 10**digits < 4.1 for digits in (9, 12, 15, 18))  # from 1998 to 2099, s to ns
+    return bool((column[1:] > column[:-1]).all()) or (since and goes_forward(column))
 
 
 def _days_beside(table: RawTable, column: str) -> str:
