@@ -354,7 +354,10 @@ def test_an_angle_that_wraps_is_named():
     for x, wraps in ((angle, False), ((angle * 20 + np.pi) % (2 * np.pi) - np.pi, True)):
         found = messages(Transient(np.arange(1501) * 0.05, x[:, None], u, name="run", state_names=["yaw"]))
         assert ("wrap" in said(found)) == wraps
-    assert any("'unwrap(yaw)'" in m or "unwrap(" in m for m in found)
+    assert any("use 'unwrap(yaw)'" in m for m in found)
+    degrees = np.degrees((angle * 20 + np.pi) % (2 * np.pi))
+    found = messages(Transient(np.arange(1501) * 0.05, degrees[:, None], u, name="run", state_names=["yaw"]))
+    assert any("use 'unwrap(yaw, 360)'" in m for m in found)
 
 
 def uneven(stamps_only, seed=0, noise=1e-3, count=2000, pace=1.0):

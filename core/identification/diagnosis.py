@@ -332,14 +332,14 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
             continue
         before, after = (values[:, 0] for values in ends([i]))
         step = np.abs(after - before)
-        for turn in (2 * np.pi, 360.0):
+        for turn, unit in ((2 * np.pi, ""), (360.0, ", 360")):
             jumps = np.abs(step - turn) < 0.1 * turn
             inside = np.abs(before).max() < 0.51 * turn or (before.min() >= 0 and before.max() < turn)
             if inside and 0 < jumps.sum() < 0.05 * problem.N and step[~jumps].max() < 0.3 * turn:
                 messages.append(
                     f"'{signal.name}' wraps around in {plural(int(jumps.sum()), 'step')} "
                     f"({_where(problem, np.flatnonzero(jumps).tolist(), transients)}), by {turn:.4g}: that jump is no "
-                    f"movement, and the envelope is fitted to it; use 'unwrap({signal.field or signal.name})'"
+                    f"movement, and the envelope is fitted to it; use 'unwrap({signal.field or signal.name}{unit})'"
                 )
     for those in groups.values():
         one, other = ends(those)

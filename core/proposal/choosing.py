@@ -496,7 +496,8 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         source.reason = ""
     for candidate in free:
         set_own_scale(candidate)
-        candidate.name, candidate.scale = candidate.path, candidate.scale or 1.0
+        name = re.sub(r"^unwrap\((.*?)(, \d+)?\)$", r"\1", candidate.path)
+        candidate.name, candidate.scale = name, candidate.scale or 1.0
         candidate.steady = 0.0  # what returns to its median would alarm on every change of load
     return states, [c for c in free if c in controls]
 

@@ -303,17 +303,19 @@ def _wrapped(source: Source) -> None:
     for candidate in source.free:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         finite = [values[np.isfinite(values)] for values in candidate.values]
-        within = [values for values in finite if len(values) and np.ptp(values) <= 2.2 * np.pi]
-        jumps = any((np.abs(np.diff(values)) > 1.6 * np.pi).any() for values in within)
-        if angle or (jumps and re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)):
-            candidate.path = f"unwrap({candidate.path})"
-            candidate.values = [_unwrapped(v) for v in candidate.values]
+        steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
+        jumps = (t for t in (math.tau, 360.0) if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
+        turn = math.tau if angle else next(jumps, 0.0)
+        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)
+        if angle or (turn and named):
+            candidate.path = f"unwrap({candidate.path}{', 360' * (turn > 7)})"
+            candidate.values = [_unwrapped(v, turn) for v in candidate.values]
 
 
-def _unwrapped(values: Array) -> Array:
+def _unwrapped(values: Array, turn: float) -> Array:
     finite = np.isfinite(values)
     out = values.copy()
-    out[finite] = np.unwrap(values[finite])
+    out[finite] = np.unwrap(values[finite], period=turn)
     return out
 
 

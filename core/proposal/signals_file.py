@@ -27,7 +27,7 @@ from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TOPIC, TYPE
 from uncertain_lti.sampling.clock import coarse_ns, longest_pause
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.signals.field_path import FUNCTIONS
+from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.signals.values import CHOICES_TEXT
 
@@ -69,7 +69,7 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
         words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
         return [*words, *_split(candidate.kind)] if several_kinds else words
     inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
-    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
+    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|(, \d+)?\)+$", "", inner)
     words = [w for w in _split(inner) if w not in _DULL]
     if all(len(w) == 1 or w.isdigit() for w in words):
         of_table = candidate.kind if "[" in candidate.path else ""  # whose topic says nothing
@@ -223,7 +223,8 @@ def signals_file(
 def _turns(candidate: Candidate) -> bool:
     """Whether an angle went round by half a turn or more."""
     spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
-    return candidate.path.startswith("unwrap(") and max(spans, default=0.0) >= np.pi
+    turn = FieldPath(candidate.path).unwrap
+    return turn > 0 and max(spans, default=0.0) >= turn / 2
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
