@@ -684,6 +684,16 @@ def test_names_that_are_repeated_between_the_rows_are_left_out_and_told(tmp_path
     )
 
 
+def test_signals_have_the_length_of_a_recording_and_not_that_of_its_parameters(tmp_path):
+    """Of a robot's file with 24 parameters of six joints each joint was a row, and there was no time."""
+    parameters = {f"p{i}": np.arange(6.0) + i for i in range(9)}
+    t, q = 0.004 * np.arange(250), np.random.default_rng(0).normal(size=(6, 250))
+    np.savez(tmp_path / "a.npz", **parameters, rec_time=t, q=q, v=q)
+    bag = open_recording(tmp_path / "a.npz")
+    assert bag.facts()[0].fields == ("q[0..5]", "v[0..5]") and len(bag.times) == 250
+    assert len(bag.warnings) == 2 and "'p0', 'p1'" in bag.warnings[0] and "they have 6 entries" in bag.warnings[0]
+
+
 def test_names_that_fit_the_rows_are_theirs_and_not_older_ones_above(tmp_path):
     """Of a logger whose columns were changed after four rows, all later rows had the first names, one to the left."""
     rows = [f"{k}|{k % 3}|{k % 5}|7|" for k in range(40)]

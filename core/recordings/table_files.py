@@ -423,26 +423,32 @@ def _is_text(array: NDArray[Any]) -> bool:
 
 def _of_one_length(path: Path, found: Mapping[str, Column], notes: list[str]) -> RawTable:
     """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
-    vectors = [len(column) for column in found.values() if column.ndim == 1]
-    lengths = Counter(vectors or map(len, found.values()))
+    vectors = [name for name, column in found.items() if column.ndim == 1]
+    lengths = Counter({len(column): 0 for column in found.values()})
+    for column in found.values():
+        lengths[max(column.shape) if vectors else len(column)] += min(column.shape) if column.ndim > 1 else 1
     if not lengths:
         there = "; ".join(notes[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
     if not vectors and len(found) == 1:
         ((name, matrix),) = found.items()
-        first, *others = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
-        if others and (np.diff(first) > 0).all():  # as Simulink writes to a file
+        first, *rest = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
+        if rest and (np.diff(first) > 0).all():  # as Simulink writes to a file
             said = f"the first line of '{name}' is taken for the time, as it grows"
-            return RawTable({"time": first, name: np.column_stack(others)}, [*notes, said])
+            return RawTable({"time": first, name: np.column_stack(rest)}, [*notes, said])
     length = max(lengths, key=lambda number: (lengths[number], number))
     kept: dict[str, Column] = {}
+    others: dict[int, list[str]] = {}
     for name, column in found.items():
         if len(column) == length:
             kept[name] = column
         elif column.ndim == 2 and column.shape[1] == length:
             kept[name] = column.T
         else:
-            notes.append(f"'{name}' left out, it has {len(column)} entries and the others {length}")
+            others.setdefault(len(column), []).append(f"'{name}'")
+    for number, names in others.items():
+        have = "it has" if len(names) == 1 else "they have"
+        notes.append(f"{shortlist(names, 6)} left out, {have} {number} entries and the others {length}")
     return RawTable(kept, notes)
 
 
