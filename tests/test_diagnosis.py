@@ -20,6 +20,7 @@ from tanks import Tanks
 from uncertain_lti import SignalMap, Transient, read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.reports.model_text import next_text
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.signal_map import Signal
 
@@ -413,3 +414,9 @@ def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():
     )
     found = fit(transient, "lp", additive="noise").fit_summary["messages"]
     assert any("new about every 5 samples: its topic or its sensor is slower than the clock" in text for text in found)
+
+
+def test_what_asks_for_nothing_is_not_what_to_look_at_first():
+    model = fit([run()], "qp", additive="both")
+    told = "Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0"
+    assert told in model.fit_summary["messages"] and "look first at: Δt" not in next_text(model, "m.json")
