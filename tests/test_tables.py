@@ -661,7 +661,7 @@ def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "unit"), [("Time (min)", 60.0), ("t [h]", 3600.0), ("tempo_ms", 1e-3), ("zeit_s", 1.0)]
+    ("name", "unit"), [("Time (min)", 60.0), ("t [h]", 3600.0), ("tempo_ms", 1e-3), ("zeit_s", 1.0), ("TimeUS", 1e-6)]
 )
 def test_a_time_says_its_unit_behind_its_name_in_any_language(name, unit, tmp_path):
     """`Time (min)` was read as seconds, and `tempo_ms` was found only where it came first and never fell."""

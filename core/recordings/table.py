@@ -150,7 +150,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
 def _bare(name: str) -> str:
     """Name of a column without its unit, as `_NAMES` has it."""
     low = re.sub(r"[\s/]+", "_", re.sub(r"[\[(].*", "", name).strip(" /").lower())
-    return re.sub(rf"_({'|'.join(_UNIT.values())})$", "", low)
+    return re.sub(rf"(_|(?<=time))({'|'.join(_UNIT.values())})$", "", low)
 
 
 def called_time(name: str) -> bool:
@@ -245,7 +245,7 @@ def _unit(name: str, values: Column, stated: str = "") -> str:
         if re.fullmatch(rf"[\[(]?\s*({pattern})\s*[\])]?", stated.lower().replace("μ", "µ")):
             return unit
     for unit, pattern in _UNIT.items():
-        if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"[_\s]({pattern})$", low):
+        if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"([_\s]|time)({pattern})$", low):
             return unit
         if unit != "s" and re.fullmatch(rf"({pattern})(_.*)?", low):
             return unit
