@@ -500,6 +500,9 @@ def test_motors_that_follow_one_command_alike_are_all_states(tmp_path):
     assert [c.path for c in proposal.states] == ["m1", "m2", "m3"] and "m4: moves with m1" in proposal.text
     assert "/table referencia: a reference for some controller" in proposal.text
     assert "/table imu_ts, row: grows as a clock or a counter does" in proposal.text
+    rows = np.column_stack([0.01 * np.arange(len(u)), *columns.values()])[:, [0, 1, 2, 6]]
+    np.savetxt(tmp_path / "b.csv", rows, delimiter=",")
+    assert len(propose([tmp_path / "b.csv"]).states) == 1, "no names say that the columns are of parts that are alike"
 
 
 def follows(of, values):

@@ -218,7 +218,8 @@ def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
 def _alike(one: Candidate, other: Candidate) -> bool:
     """Whether names of columns differ in their digits alone, as of parts that do the same: each may fail alone."""
     names = {re.sub(r"\d+", "#", c.path) for c in (one, other)}
-    return one.topic == other.topic == TOPIC and len(names) == 1 and "[" not in one.path
+    given = "[" not in one.path and names != {"column_#"}  # by who wrote the file, and not by its reader
+    return one.topic == other.topic == TOPIC and len(names) == 1 and given
 
 
 def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
