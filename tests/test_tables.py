@@ -694,6 +694,17 @@ def test_signals_have_the_length_of_a_recording_and_not_that_of_its_parameters(t
     assert len(bag.warnings) == 2 and "'p0', 'p1'" in bag.warnings[0] and "they have 6 entries" in bag.warnings[0]
 
 
+def test_cells_of_several_numbers_are_told(tmp_path):
+    """Two pressures and a clock in one quoted cell were gone without a word."""
+    bag = read_csv(
+        tmp_path,
+        "time,x,raw,at,say",
+        (f'{k},{k % 7},"1.0{k % 9},2.54,59{k}",2026-11-22 06:28:00,3 ok' for k in range(9)),
+    )
+    (said,) = bag.warnings
+    assert "column 'raw' left out" in said and "several numbers, such as '1.00,2.54,590': write a column for" in said
+
+
 def test_names_that_fit_the_rows_are_theirs_and_not_older_ones_above(tmp_path):
     """Of a logger whose columns were changed after four rows, all later rows had the first names, one to the left."""
     rows = [f"{k}|{k % 3}|{k % 5}|7|" for k in range(40)]
