@@ -287,7 +287,11 @@ def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, wor
     t_ns = np.round((begin_s + step_s * np.arange(200)) * 1e9).astype(np.int64)
     model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[0.5])
     verdicts = EnvelopeMonitor(model).check(Transient(t_ns, x, np.zeros((200, 1))))
-    assert f"ALARM: raised once, {words}" in check_text(check_data(model, verdicts))
+    data = check_data(model, verdicts)
+    assert f"ALARM: raised once, {words}" in check_text(data)
+    data["states"]["x1"]["jump"] = {**data["alarms"][0], "text": "x1 jumped"}
+    at = words.removeprefix("first at ").rpartition(" for ")[0].rstrip(",")
+    assert f"x1 jumped at {at}" in check_text(data).splitlines()
 
 
 def test_the_longest_alarm_is_told_beside_the_first():

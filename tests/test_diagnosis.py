@@ -21,6 +21,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.reports.model_text import next_text
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.signal_map import Signal
 
@@ -86,6 +87,7 @@ WORDS = {
     "missing": "one sample earlier explains",
     "code": "stands for no value",
     "jitter": "the stamps jitter",
+    "bursts": "come in bursts",
     "flip": "change sign together",
     "wrap": "wraps around",
 }
@@ -354,7 +356,10 @@ def test_an_angle_that_wraps_is_named():
     for x, wraps in ((angle, False), ((angle * 20 + np.pi) % (2 * np.pi) - np.pi, True)):
         found = messages(Transient(np.arange(1501) * 0.05, x[:, None], u, name="run", state_names=["yaw"]))
         assert ("wrap" in said(found)) == wraps
-    assert any("'unwrap(yaw)'" in m or "unwrap(" in m for m in found)
+    assert any("use 'unwrap(yaw)'" in m for m in found)
+    degrees = np.degrees((angle * 20 + np.pi) % (2 * np.pi))
+    found = messages(Transient(np.arange(1501) * 0.05, degrees[:, None], u, name="run", state_names=["yaw"]))
+    assert any("use 'unwrap(yaw, 360)'" in m for m in found)
 
 
 def uneven(stamps_only, seed=0, noise=1e-3, count=2000, pace=1.0):
@@ -390,6 +395,21 @@ def test_stamps_that_jitter_are_named_and_samples_that_do_are_not(noise):
     assert "jitter" not in said(messages(run(noise=noise)))
 
 
+def test_messages_that_come_in_bursts_are_told_how_they_count():
+    """Of an even clock behind a slow link a third was lost as gaps, and the rest was taken for 20 kHz."""
+    even = run()
+    t = even.t_ns.astype(float)
+    for tell, times in (
+        (True, t[np.arange(len(t)) // 8 * 8] + 1e5 * (np.arange(len(t)) % 8)),
+        (False, t),
+        (False, t + np.where(np.arange(len(t)) > 300, 1e15, 0.0)),  # one long pause
+        (False, np.cumsum(np.where(np.random.default_rng(3).random(len(t)) < 0.03, 1e10, 1e6))),  # sent on a change
+    ):
+        found = messages(Transient(np.rint(times) * 1e-9, even.x, even.u, name="run"))
+        assert ("bursts" in said(found)) == tell
+        assert not tell or "write `step: constant` and `max_gap: 0" in found[0]
+
+
 def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():
     """It is new every few samples while it moves, and hardly ever where it comes to rest: 96 % repeats."""
     t = 1e-4 * np.arange(12_000)
@@ -404,3 +424,9 @@ def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():
     )
     found = fit(transient, "lp", additive="noise").fit_summary["messages"]
     assert any("new about every 5 samples: its topic or its sensor is slower than the clock" in text for text in found)
+
+
+def test_what_asks_for_nothing_is_not_what_to_look_at_first():
+    model = fit([run()], "qp", additive="both")
+    told = "Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0"
+    assert told in model.fit_summary["messages"] and "look first at: Δt" not in next_text(model, "m.json")

@@ -11,6 +11,7 @@
 
 import math
 import re
+import struct
 from itertools import combinations, permutations, product
 from pathlib import Path
 from types import SimpleNamespace
@@ -62,8 +63,9 @@ def pose(topic, t_ns, yaw):
     return Message(topic, t_ns, cdr(POSE, header=header(t_ns), pose=body), t_ns)
 
 
-def wrapped(topic, t_ns, yaw):
-    return Message(topic, t_ns, cdr(POSE_2D, x=0.0, y=0.0, theta=math.remainder(yaw, math.tau)), t_ns)
+def wrapped(topic, t_ns, yaw, turn=0.0):
+    theta = yaw / math.tau * turn % turn if turn else math.remainder(yaw, math.tau)
+    return Message(topic, t_ns, cdr(POSE_2D, x=0.0, y=0.0, theta=theta), t_ns)
 
 
 def driven(names=("/plant/state", "/plant/cmd"), count=400, seed=0, extra=lambda k, x, u: [], late=0):
@@ -227,6 +229,7 @@ def test_a_controller_publishes_all_kinds(topic, role):
 
 COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "yaw_sp_move_rate", "level_sp", "ref_x")]
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
+COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
 
 
 @pytest.mark.parametrize(("column", "role"), COLUMNS)
@@ -265,8 +268,9 @@ def test_a_cascade_keeps_every_tank(tmp_path):
     [
         (POSE, lambda t, yaw: pose("/body/state", t, yaw=yaw), "unwrap(yaw(pose.orientation))"),
         (POSE_2D, lambda t, yaw: wrapped("/body/state", t, yaw), "unwrap(theta)"),
+        (POSE_2D, lambda t, yaw: wrapped("/body/state", t, yaw, 360.0), "unwrap(theta, 360)"),
     ],
-    ids=["a quaternion", "by its name"],
+    ids=["a quaternion", "by its name", "in degrees"],
 )
 def test_angles_are_unwrapped(tmp_path, kind, sent, field):
     """A yaw that turns round and round follows its rate; x, y, z, w are not offered beside it."""
@@ -280,8 +284,26 @@ def test_angles_are_unwrapped(tmp_path, kind, sent, field):
     path, proposal = proposed(tmp_path, messages, {"/body/state": kind})
     assert [c.path for c in proposal.states] == [field] and "orientation.w" not in proposal.text
     model = fitted([path], proposal)
-    assert model.fit_summary["mean_width_recorded"][0] < 0.1, "no jump by a turn inside the envelope"
+    assert model.fit_summary["mean_width_recorded"][0] < (6.0 if "360" in field else 0.1), (
+        "no jump by a turn inside the envelope"
+    )
     assert model.domain.anywhere == [True, False], "however many turns there were"
+
+
+def test_a_topic_of_unknown_name_is_taken_where_no_state_answers_and_its_bursts_count(tmp_path):
+    """A noisy sensor was the state, the clock in the command's message a control, and eight messages at once a rate."""
+    rng, late = np.random.default_rng(3), []
+    for k, m in enumerate(
+        driven(("/motor/listen", "/motor/cmd"), 1600, extra=lambda k, x, u: [f64("/imu_sensor", at(k), 0)])
+    ):
+        data = m.data if m.topic != "/imu_sensor" else cdr(FLOAT64, data=rng.normal())
+        data += struct.pack("<d", k) * (m.topic == "/motor/cmd")
+        late.append(Message(m.topic, at(k // 24 * 8 + 8) + 1000 * (k % 24), data))
+    topics = [Topic("/motor/listen"), Topic("/imu_sensor")]
+    topics.append(Topic("/motor/cmd", "my_msgs/msg/Cmd", schema="float64 data\nfloat64 t\n"))
+    proposal = propose([write(topics, late).save(tmp_path / "a.mcap")])
+    assert signals_of(proposal) == ([("/motor/listen", "data")], [("/motor/cmd", "data")]), proposal.text
+    assert "step: constant\nmax_gap: 0." in proposal.text
 
 
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
@@ -401,6 +423,23 @@ def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     assert "Pump_speed_cmd" not in model.state_names and "Valve_cmd" in model.state_names
 
 
+def test_millivolts_are_measured_and_entries_of_a_matrix_have_its_name(tmp_path):
+    """`Load_Cell_mV` was set by a controller, as `mv` is a manipulated variable; `data[2]` was called 2."""
+    rng = np.random.default_rng(0)
+    valve = np.repeat(rng.integers(0, 2, 40), 10)
+    columns = {
+        "Load_Cell_mV": answers(rng, 1.0 * valve[:, None], 0.01)[:, 0],
+        "Tank_mv": np.cumsum(rng.normal(size=400)),
+    }
+    path = table_of(tmp_path / "a.csv", columns | {"valve": valve}, 10.0 * np.arange(400))
+    assert [c.path for c in propose([path]).states] == ["Load_Cell_mV"]
+    u = np.repeat(rng.normal(size=40), 25)
+    data = np.vstack([0.01 * np.arange(1000), u, answers(rng, u[:, None])[:, 0]])
+    np.savez(tmp_path / "a.npz", data=data)
+    proposal = propose([tmp_path / "a.npz"])
+    assert [c.name for c in proposal.states] == ["data_1"] and [c.name for c in proposal.controls] == ["data_0"]
+
+
 @pytest.mark.parametrize("names", ["B1_Temp,B1_Press,B1_Valve1,B1_Valve2", "Temp1,Temp2,Temp3,Temp4"])
 def test_what_differs_in_its_numbers_alone_goes_together_and_some_state_is_left(tmp_path, names):
     """All of a unit, whose number the names begin with, went with its two valves: no state was left."""
@@ -446,11 +485,30 @@ def test_a_table_of_many_columns_takes_seconds(tmp_path):
     x += 0.005 * rng.normal(size=x.shape)
     x[:, 3], x[:, 7] = 2 * x[:, 4] + 3, x[:, 8] ** 2
     names = [f"cmd_{j}" for j in range(commands)] + [f"temp_{j}" for j in range(measured)]
+    names[commands + 7] = "head"
     columns = dict(zip(names, np.column_stack([u, x]).T, strict=True))
     table_of(tmp_path / "a.csv", columns, 0.1 * np.arange(rows), fmt="%.6g")
     with bounded(seconds=60):  # 400 columns took 442 s
         text = propose([tmp_path / "a.csv"]).text
-    assert "temp_4: moves with temp_3" in text and "temp_7: says what temp_8 says already" in text
+    assert "temp_4: moves with temp_3" in text and "head: says what temp_8 says already" in text
+
+
+def test_motors_that_follow_one_command_alike_are_all_states(tmp_path):
+    """Of four wheels one was proposed, and nothing saw the other three fail."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=40), 25)
+    speed = answers(rng, u[:, None])[:, 0]
+    columns = {f"m{i}": speed + 0.01 * rng.normal(size=len(u)) for i in (1, 2, 3)}
+    columns |= {"m4": np.round(2 * columns["m1"] + 1, 6), "rpm": columns["m2"] * 9.55, "speed_cmd": u}
+    columns |= {"imu_ts": 1.7e9 + 0.01 * np.arange(len(u)) - 0.05 * (np.arange(len(u)) % 97 == 5)}
+    columns |= {"referencia": u + 0.1 * rng.normal(size=len(u)), "row": np.arange(len(u)) % 300}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.01 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == ["m1", "m2", "m3"] and "m4: moves with m1" in proposal.text
+    assert "/table referencia: a reference for some controller" in proposal.text
+    assert "/table imu_ts, row: grows as a clock or a counter does" in proposal.text
+    rows = np.column_stack([0.01 * np.arange(len(u)), *columns.values()])[:, [0, 1, 2, 6]]
+    np.savetxt(tmp_path / "b.csv", rows, delimiter=",")
+    assert len(propose([tmp_path / "b.csv"]).states) == 1, "no names say that the columns are of parts that are alike"
 
 
 def follows(of, values):

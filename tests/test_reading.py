@@ -359,7 +359,7 @@ def test_a_name_or_an_index_that_comes_later_is_no_error(tmp_path: Path) -> None
         before = [NAN] * 3 * (field == "position[1]")  # where no wanted name stands, another publisher sent it
         np.testing.assert_array_equal(transient.x[:, 0], before + [7.0] * 6)
         assert transient.counters["missing"] == len(before) and transient.usable.sum() == 5
-        assert unused(transient) == ["3 missing"] * bool(before)
+        assert unused(transient) == ["3 missing x"] * bool(before)
 
 
 def test_values_that_are_nan_or_infinite_cost_the_transitions_that_need_them(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling import sampler as sampler_module
 from uncertain_lti.sampling.clock import Status, median_step_ns, resolve, to_ns
 from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, Sampler, Step
+from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 TICK = 10_000_000  # ns
@@ -534,6 +535,17 @@ def test_an_angle_that_needs_no_turn_loses_only_the_sign_of_its_zero() -> None:
     (_, x, _), _ = Sampler(signals).push_all(np.zeros(5, dtype=np.int64), arrival, arrival, [values])
     np.testing.assert_array_equal(x, values)
     assert not np.signbit(x[1, 0])
+
+
+@pytest.mark.parametrize("field", ["unwrap(data, 360)", "unwrap( data , 360.0 )"])
+def test_an_angle_in_degrees_is_unwrapped_by_its_turn(field: str) -> None:
+    """`fit` named jumps by 360 and advised `unwrap(heading)`, which took 6.28 degrees for a turn."""
+    signals = SignalMap((Signal("x", "/c", field),), clock="/c", max_gap=1.0, time={"/c": "log"})
+    arrival = np.arange(5) * TICK
+    values = np.array([[350.0], [358.0], [6.0], [14.0], [350.0]])
+    (_, x, _), _ = Sampler(signals).push_all(np.zeros(5, dtype=np.int64), arrival, arrival, [values])
+    np.testing.assert_array_equal(x[:, 0], [-10.0, -2.0, 6.0, 14.0, -10.0])
+    assert FieldPath(f"lag({field}, 2)").unwrap == FieldPath(f"rate({field})").unwrap == 360.0
 
 
 def test_a_recording_that_does_not_fit_its_topics_is_refused() -> None:

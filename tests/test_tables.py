@@ -340,7 +340,7 @@ def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
         ("{time: clok}", r"there is no column 'clok', which the signals file names for the time \(is clock meant\?\)"),
         ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
         ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
-        ("{unit: min}", r"s.yaml: table: unit is 'min'.*; write one of s, ms, us, ns"),
+        ("{unit: day}", r"s.yaml: table: unit is 'day'.*; write one of s, ms, us, ns, min, h"),
         ("{time: []}", r"s.yaml: table: time is \[\]; write the name of a column"),
         ("5", r"s.yaml: table: a mapping is wanted here, not a number"),
     ],
@@ -376,9 +376,13 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b'time,y\n"0,125","6,2"\n"0,250","7,3"\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-11-22T06:28:00,2\n2026-13-22T06:28:01,3\n", "'2026-13-22T06:28:01' is no day or"),
+        ("a.csv", b"time,y,z\n1,2,3\n2,3,4\ntime,z,y\n1,2,3\n2,3,4\n", "line 4 names other columns, or in another"),
         ("a.csv", b"time,y\n1e300,2\n2e300,3\n", "is past the year 2262"),
         *(("a.csv", b"time,x\n2026-11-22T06:28:01+%b,1\n" % zone, "time zone") for zone in (b"99:99", b"15:00")),
         *(("a.csv", b"time,x\n%b,1\n" % day, "after 2261") for day in (b"3026-11-22", b"1500-01-01")),
+        ("a.xlsx", b"PK\x03\x04nothing", "a spreadsheet; save its sheet as .csv"),
+        ("a.ulg", b"ULog\x01\x12\x35", "a log of PX4; write its messages as .csv"),
+        ("1.BIN", b"\xa3\x95\x80\x80", "a log of ArduPilot; write its messages as .csv"),
         ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "is damaged or no .mat file|holds no column"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(200), r"save\('a.mat', '-v7'\)"),
@@ -692,6 +696,88 @@ def test_a_cell_that_is_no_time_among_many_that_are_is_left_out_and_named(tmp_pa
     assert any(f"1 cell that is no time (such as '{odd}') left out" in text for text in bag.warnings) == bool(odd)
     half = (f"{'-' if k % 2 else cell},{k}" for k, cell in enumerate(every))
     refuses(BagError, "is neither a number nor", read_csv, tmp_path, "time,x", half)
+
+
+@pytest.mark.parametrize(
+    ("name", "unit"), [("Time (min)", 60.0), ("t [h]", 3600.0), ("tempo_ms", 1e-3), ("zeit_s", 1.0), ("TimeUS", 1e-6)]
+)
+def test_a_time_says_its_unit_behind_its_name_in_any_language(name, unit, tmp_path):
+    """`Time (min)` was read as seconds, and `tempo_ms` was found only where it came first and never fell."""
+    bag = read_csv(tmp_path, f"x,{name}", (f"{k % 7},{k % 20}" for k in range(40)))
+    assert np.median(np.diff(bag.times)) == round(unit * 1e9) and list(bag.columns_by_field) == ["x"]
+
+
+def test_a_day_above_twelve_says_the_order_where_the_clock_is_put_back(tmp_path):
+    days = [f"{31 - (k < 8)}/10/2021 {(k % 8) // 4 + 2:02}:{15 * (k % 4):02},{k}" for k in range(16)]
+    bag = read_csv(tmp_path, "time,x", [*days, *days[-4:]])
+    assert (
+        bag.times[0] == np.datetime64("2021-10-30T02:00", "ns").astype(np.int64) and (np.diff(bag.times) < 0).sum() == 1
+    )
+
+
+def test_names_that_are_repeated_between_the_rows_are_left_out_and_told(tmp_path):
+    bag = read_csv(tmp_path, "time,x", (f"{k},{k % 7}" if k % 20 else "time,x" for k in range(1, 50)))
+    assert (
+        bag.warnings == [f"{bag.path}: 2 lines left out that repeat the names of the columns"] and len(bag.times) == 47
+    )
+
+
+def test_signals_have_the_length_of_a_recording_and_not_that_of_its_parameters(tmp_path):
+    """Of a robot's file with 24 parameters of six joints each joint was a row, and there was no time."""
+    parameters = {f"p{i}": np.arange(6.0) + i for i in range(9)}
+    t, q = 0.004 * np.arange(250), np.random.default_rng(0).normal(size=(6, 250))
+    np.savez(tmp_path / "a.npz", **parameters, rec_time=t, q=q, v=q)
+    bag = open_recording(tmp_path / "a.npz")
+    assert bag.facts()[0].fields == ("q[0..5]", "v[0..5]") and len(bag.times) == 250
+    assert (
+        len(bag.warnings) == 2 and "'p0 (6)', 'p1 (6)'" in bag.warnings[0] and "not of 250 entries" in bag.warnings[0]
+    )
+
+
+def test_cells_of_several_numbers_are_told(tmp_path):
+    """Two pressures and a clock in one quoted cell were gone without a word."""
+    bag = read_csv(
+        tmp_path,
+        "time,x,raw,at,say",
+        (f'{k},{k % 7},"1.0{k % 9},2.54,59{k}",2026-11-22 06:28:00,3 ok' for k in range(9)),
+    )
+    (said,) = bag.warnings
+    assert "column 'raw' left out" in said and "several numbers, such as '1.00,2.54,590': write a column for" in said
+
+
+def test_names_that_fit_the_rows_are_theirs_and_not_older_ones_above(tmp_path):
+    """Of a logger whose columns were changed after four rows, all later rows had the first names, one to the left."""
+    rows = [f"{k}|{k % 3}|{k % 5}|7|" for k in range(40)]
+    bag = read_csv(tmp_path, "time|speed|level|", ["0|1|2|", "", "time|flow|speed|level|", *rows])
+    assert list(bag.columns_by_field) == ["flow", "speed", "level"] and len(bag.times) == 40
+
+
+@pytest.mark.parametrize("tall", [False, True])
+def test_a_matrix_whose_first_line_grows_has_its_time_there(tall, tmp_path):
+    """As `To File` of Simulink writes it; no file of it could be read."""
+    lines = np.vstack([0.002 * np.arange(50), np.sin(np.arange(50)), np.cos(np.arange(50))])
+    np.savez(tmp_path / "a.npz", data=lines.T if tall else lines)
+    bag = open_recording(tmp_path / "a.npz")
+    assert bag.facts()[0].fields == ("data[0..1]",) and bag.facts()[0].rate == pytest.approx(500.0)
+    np.savez(tmp_path / "b.npz", data=lines[1:])
+    refuses(BagError, "no column is called time", open_recording, tmp_path / "b.npz")
+
+
+def test_times_since_1970_are_found_without_a_name_though_some_step_back(tmp_path):
+    rows = [f"{1455208122.28 + k - 2.5 * (k % 40 == 9):.2f},{k % 7}" for k in range(100)]
+    bag = read_csv(tmp_path, "column,x", rows)
+    assert np.median(np.diff(bag.times)) == 10**9 and "taken for the time" in bag.warnings[0]
+    refuses(BagError, "no column is called time", read_csv, tmp_path, "column,x", [row[3:] for row in rows])
+
+
+def test_another_time_is_told_where_most_rows_share_one(tmp_path):
+    bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
+    assert bag.warnings[0].endswith(
+        "write times with more decimals, or take column 't [ms]', `table: {time: 't [ms]'}`"
+    )
+    bag = read_csv(tmp_path, "time,x", (f"{k - k // 4},{k}" for k in range(100)))
+    assert "only the first of such rows counts: write times" in bag.warnings[0]
+    assert not read_csv(tmp_path, "time_s,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9))).warnings
 
 
 def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):

@@ -40,6 +40,7 @@ from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.clock import longest_pause
 from uncertain_lti.sampling.steady_state import codes, too_small
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import Memory
@@ -75,6 +76,7 @@ _REMEDIES = (  # words of a message on the state, or on any signal; what narrows
     (_FEW, True, "look at the few samples that carry the width, named above"),
     (_BEFORE, True, "add the value of '{}' one sample earlier, as said above"),
     ("`delay:", False, "set the delay that the notes propose"),
+    ("come in bursts", False, "write `step: constant` and `max_gap`, as said above"),
     ("sampling is slow", False, "sample faster"),
     ("moves too little", False, "record the controls moving more"),
     ("not identifiable", False, "record the controls moving more"),
@@ -153,7 +155,7 @@ def describe(
     rank, messages = _rank(problem, sums, names)
     apart = not messages
     coded = [*_coded(problem, sums, signals), *_wrapped(problem, signals, transients)]
-    messages = [*coded, *messages, *regimes_said]
+    messages = [*coded, *_bursting(model, transients), *messages, *regimes_said]
     if not coded:  # the envelope is fitted to the jumps, and what follows would be about them
         part, past = _stretches(problem), lagged_states(signals, model.n)
         messages += _carried(few, discarded, problem, names, transients)
@@ -330,14 +332,14 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
             continue
         before, after = (values[:, 0] for values in ends([i]))
         step = np.abs(after - before)
-        for turn in (2 * np.pi, 360.0):
+        for turn, unit in ((2 * np.pi, ""), (360.0, ", 360")):
             jumps = np.abs(step - turn) < 0.1 * turn
             inside = np.abs(before).max() < 0.51 * turn or (before.min() >= 0 and before.max() < turn)
             if inside and 0 < jumps.sum() < 0.05 * problem.N and step[~jumps].max() < 0.3 * turn:
                 messages.append(
                     f"'{signal.name}' wraps around in {plural(int(jumps.sum()), 'step')} "
                     f"({_where(problem, np.flatnonzero(jumps).tolist(), transients)}), by {turn:.4g}: that jump is no "
-                    f"movement, and the envelope is fitted to it; use 'unwrap({signal.field or signal.name})'"
+                    f"movement, and the envelope is fitted to it; use 'unwrap({signal.field or signal.name}{unit})'"
                 )
     for those in groups.values():
         one, other = ends(those)
@@ -350,6 +352,16 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
                 f"movement, and the envelope is fitted to it; use roll, pitch or yaw instead, unwrap(yaw(...))"
             )
     return messages
+
+
+def _bursting(model: UncertainLTI, transients: Sequence[Transient]) -> list[str]:
+    """Messages that come in bursts, whose arrival says nothing of when they were sampled."""
+    if model.signals.step != "recorded" or not (pause := longest_pause([t.t_ns for t in transients])):
+        return []
+    return [
+        f"the messages of {model.signals.clock} come in bursts, though their samples are even, so most steps are too "
+        f"short and the rest are gaps: write `step: constant` and `max_gap: {pause:g}` in the signals file"
+    ]
 
 
 def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> list[str]:

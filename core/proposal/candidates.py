@@ -337,7 +337,9 @@ _LABELS = 30
 """Values that a label takes, at most."""
 
 
-_REFERENCE = re.compile(r"(setpoint|desired|target|goal|reference|demand|ref$|_des(_|\d|$)|(^|_)(sp|ref|des)_|_sp$)")
+_REFERENCE = re.compile(
+    r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)soll|demand|ref$|_des(_|\d|$)|(^|_)(sp|ref|des)_|_sp$)"
+)
 
 
 _STATE = re.compile(
@@ -541,6 +543,9 @@ def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]
         source.reason = "a reference for some controller, and there is a command"
     states = [s for s in moving if s.role == "state"]
     unknown = unnamed = [s for s in moving if s.role == ""]
+    if controls and states and unknown and not any(explained(s, controls) > SHOWS for s in states):
+        states += [s for s in unknown if explained(s, controls) > SHOWS]
+        unknown = [s for s in unknown if s not in states]
     if not states:
         states, unknown = unknown, []
     if not states and len(controls) > 1:  # commands everywhere by their names: the one that the others explain best

@@ -38,7 +38,7 @@ from uncertain_lti.proposal.candidates import (
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
-from uncertain_lti.recordings.table import TYPE
+from uncertain_lti.recordings.table import TOPIC, TYPE
 
 SHORT_DELAY = 3
 """Samples within which a control shows that keeps a state from being noise."""
@@ -54,6 +54,8 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
         return pool
     kept: list[int] = []
     function = functions(steps.X)
+    for i, j in np.argwhere(function).tolist():
+        function[i, j] = not _alike(pool[i], pool[j]) or _moves_with(pool[j], pool[i], exact=True)
 
     def drop(i: int, source: int) -> None:
         of = pool[source]
@@ -171,7 +173,14 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
     kept: list[Candidate] = []
     may = _may_move_with(pool)
     for candidate in pool:
-        if twin := next((c for c in kept if (id(c), id(candidate)) in may and _moves_with(candidate, c, exact)), None):
+        if twin := next(
+            (
+                c
+                for c in kept
+                if (id(c), id(candidate)) in may and _moves_with(candidate, c, exact or _alike(candidate, c))
+            ),
+            None,
+        ):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
@@ -204,6 +213,13 @@ def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
         together = (both * st - s * s.T) ** 2 >= _NEARLY**2 * own * own.T
         may |= {(id(group[i]), id(group[j])) for i, j in zip(*np.nonzero(np.triu(together, 1)), strict=True)}
     return may
+
+
+def _alike(one: Candidate, other: Candidate) -> bool:
+    """Whether names of columns differ in their digits alone, as of parts that do the same: each may fail alone."""
+    names = {re.sub(r"\d+", "#", c.path) for c in (one, other)}
+    given = "[" not in one.path and names != {"column_#"}  # by who wrote the file, and not by its reader
+    return one.topic == other.topic == TOPIC and len(names) == 1 and given
 
 
 def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
@@ -481,7 +497,8 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         source.reason = ""
     for candidate in free:
         set_own_scale(candidate)
-        candidate.name, candidate.scale = candidate.path, candidate.scale or 1.0
+        name = re.sub(r"^unwrap\((.*?)(, \d+)?\)$", r"\1", candidate.path)
+        candidate.name, candidate.scale = name, candidate.scale or 1.0
         candidate.steady = 0.0  # what returns to its median would alarm on every change of load
     return states, [c for c in free if c in controls]
 
@@ -489,7 +506,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
 def _is_set(candidate: Candidate, called: bool) -> bool:
     """Whether a column is a control by its values or its name, or is `called` one; says why."""
     values = np.unique(candidate.finite)
-    by_name = called or _TURNED.search(candidate.path.lower())
+    by_name = called or _TURNED.search(candidate.path.removesuffix("_mV").lower())  # no manipulated variable
     if len(values) == 1:
         candidate.why = (
             f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"

@@ -57,7 +57,7 @@ from uncertain_lti.proposal.signals_file import (
 from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
-from uncertain_lti.recordings.table import TYPE, Table
+from uncertain_lti.recordings.table import TYPE, Table, called_time
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
@@ -277,22 +277,29 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
     steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
-    clock = _CLOCK & {*words_of(candidate.path)} and np.mean(steps[steps != 0] > 0) > 0.9  # that of a day starts anew
-    if source.role != "control" and (clock or all(map(_counts, candidate.values, source.arrival))):
+    named = called_time(candidate.path.rpartition(".")[2]) or _CLOCK & {*words_of(candidate.path)}
+    clock = named and np.mean(steps[steps != 0] > 0) > 0.9  # that of a day starts anew
+    if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival))):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
 def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
-    """Never falls, and is a whole number or follows the time of arrival."""
+    """Never falls, and is a whole number or follows the time of arrival; or counts rows or is a stamp, if it falls."""
     good = np.isfinite(values)
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
-    if len(finite) < 3 or (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+    if len(finite) < 3 or np.ptp(t) == 0:
         return False
-    if (finite == np.rint(finite)).all():
+    rest, slope = (
+        residual(t[:, None], finite[:, None])[0],
+        float(np.polyfit(t - t.mean(), finite - finite.mean(), 1)[0]),
+    )
+    follows = bool(rest < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+    if np.mean(np.diff(finite) == 1) > 0.9 or (follows and any(abs(slope / 1000**k - 1) < 1e-3 for k in range(4))):
         return True
-    rest = residual(t[:, None], finite[:, None])[0]
-    return bool(rest < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+    if (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+        return False
+    return follows or bool((finite == np.rint(finite)).all())
 
 
 def _wrapped(source: Source) -> None:
@@ -300,17 +307,19 @@ def _wrapped(source: Source) -> None:
     for candidate in source.free:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         finite = [values[np.isfinite(values)] for values in candidate.values]
-        within = [values for values in finite if len(values) and np.ptp(values) <= 2.2 * np.pi]
-        jumps = any((np.abs(np.diff(values)) > 1.6 * np.pi).any() for values in within)
-        if angle or (jumps and re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)):
-            candidate.path = f"unwrap({candidate.path})"
-            candidate.values = [_unwrapped(v) for v in candidate.values]
+        steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
+        jumps = (t for t in (math.tau, 360.0) if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
+        turn = math.tau if angle else next(jumps, 0.0)
+        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)
+        if angle or (turn and named):
+            candidate.path = f"unwrap({candidate.path}{', 360' * (turn > 7)})"
+            candidate.values = [_unwrapped(v, turn) for v in candidate.values]
 
 
-def _unwrapped(values: Array) -> Array:
+def _unwrapped(values: Array, turn: float) -> Array:
     finite = np.isfinite(values)
     out = values.copy()
-    out[finite] = np.unwrap(values[finite])
+    out[finite] = np.unwrap(values[finite], period=turn)
     return out
 
 

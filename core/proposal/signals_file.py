@@ -24,10 +24,10 @@ from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, held
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.recordings.table import TOPIC
-from uncertain_lti.sampling.clock import coarse_ns
+from uncertain_lti.recordings.table import TOPIC, TYPE
+from uncertain_lti.sampling.clock import coarse_ns, longest_pause
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.signals.field_path import FUNCTIONS
+from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.signals.values import CHOICES_TEXT
 
@@ -69,10 +69,14 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
         words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
         return [*words, *words_of(candidate.kind)] if several_kinds else words
     inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
-    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|\)+$", "", inner)
+    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|(, \d+)?\)+$", "", inner)
     words = [w for w in words_of(inner) if w not in _DULL]
-    if candidate.topic != TOPIC and all(len(w) == 1 or w.isdigit() for w in words):  # that of a table says nothing
-        words = [*words_of(candidate.topic.rstrip("/").rpartition("/")[2]), *words]
+    if all(len(w) == 1 or w.isdigit() for w in words):
+        of_table = candidate.kind if "[" in candidate.path else ""  # whose topic says nothing
+        words = [
+            *words_of(of_table if candidate.topic == TOPIC else candidate.topic.rstrip("/").rpartition("/")[2]),
+            *words,
+        ]
     return words or ["signal"]
 
 
@@ -167,7 +171,10 @@ def signals_file(
         f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
-    if unit := coarse_ns([clock.instants(clock, number)[0] for number in range(len(clock.arrival))]):
+    instants = [clock.instants(clock, number)[0] for number in range(len(clock.arrival))]
+    if pause := longest_pause(instants):
+        lines += ["", "# They come in bursts, and their samples evenly.", "step: constant", f"max_gap: {pause:g}"]
+    elif unit := coarse_ns(instants):
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
@@ -217,7 +224,8 @@ def signals_file(
 def _turns(candidate: Candidate) -> bool:
     """Whether an angle went round by half a turn or more."""
     spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
-    return candidate.path.startswith("unwrap(") and max(spans, default=0.0) >= np.pi
+    turn = FieldPath(candidate.path).unwrap
+    return turn > 0 and max(spans, default=0.0) >= turn / 2
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
@@ -279,7 +287,7 @@ def _left_out(sources: Sequence[Source], chosen: set[Candidate]) -> list[str]:
             if candidate not in chosen and not candidate.ready:
                 groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
         of = {reason: f" {shortlist(paths, 6)}" for reason, paths in groups.items()}
-        if source.reason and set(groups) <= {source.reason}:
+        if source.reason and set(groups) <= {source.reason} and source.type != TYPE:  # whose roles have columns
             of = {source.reason: ""}
         lines += [f"#   {source.topic}{paths}: {' '.join(reason.split())}" for reason, paths in of.items()]
     return lines

@@ -42,7 +42,7 @@ _NAMES = (
 )  # fmt: skip
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
-    "ns": r"ns|nsecs?|nano(s|secs?|seconds?)",
+    "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
 _DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
@@ -108,8 +108,8 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
     elif layout.unit is None and _compact(values):
         times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
     else:
-        unit = layout.unit or _unit(column, values, table.units.get(column, ""))
-        doubt = "; write days of a spreadsheet as ISO times" * (not table.units.get(column) and _like_days(values))
+        stated = layout.unit or _unit(column, values, table.units.get(column, ""))
+        doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
         if unit == "s" and _coarse(values):
             doubt = ", a long way from row to row: for others name it time_us or time_ms, or give `table: {unit: us}`"
         if layout.unit is None and (unit != "s" or doubt):
@@ -128,7 +128,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     called = [name for name in called if name not in still]
     if likely := [name for name in called if _may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not _may_be(table.columns[called[0]])
-        return called[0] if words_first and not _goes_forward(table.columns[likely[0]]) else likely[0], ""
+        return called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0], ""
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and _may_be(table.columns[name])]
     if len(dated) == 1:
         return dated[0], ""
@@ -149,13 +149,22 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
 
 def _bare(name: str) -> str:
     """Name of a column without its unit, as `_NAMES` has it."""
-    return re.sub(r"[\s/]+", "_", re.sub(r"[\[(].*", "", name).strip(" /").lower())
+    low = re.sub(r"[\s/]+", "_", re.sub(r"[\[(].*", "", name).strip(" /").lower())
+    return re.sub(rf"(_|(?<=time))({'|'.join(_UNIT.values())})$", "", low)
+
+
+def called_time(name: str) -> bool:
+    """Whether a column is a time by its name."""
+    return any(re.fullmatch(pattern, _bare(name)) for pattern in _NAMES)
 
 
 def _grows(column: Column) -> bool:
-    """Whether numbers grow from each row to the next."""
-    numbers = column.ndim == 1 and column.dtype.kind in "iuf" and len(column) > 2
-    return numbers and bool((column[1:] > column[:-1]).all())
+    """Whether numbers grow from each row to the next, or nearly so and are times since 1970."""
+    if column.ndim != 1 or column.dtype.kind not in "iuf" or len(column) < 3:
+        return False
+    size = float(np.median(column))
+    since = any(0.9 < size / 10**digits < 4.1 for digits in (9, 12, 15, 18))  # from 1998 to 2099, s to ns
+    return bool((column[1:] > column[:-1]).all()) or (since and goes_forward(column))
 
 
 def _days_beside(table: RawTable, column: str) -> str:
@@ -176,7 +185,7 @@ def _may_be(column: Column) -> bool:
     return column.dtype.kind != "O" or bool(_ISO.match(text) or _CLOCK.match(text) or _DAY.fullmatch(text))
 
 
-def _goes_forward(column: Column) -> bool:
+def goes_forward(column: Column) -> bool:
     """Whether it may be a time beside another that cannot be read: a temperature is none."""
     return column.dtype.kind not in "iuf" or bool(abs(np.mean(np.sign(np.diff(column)))) > 0.8)
 
@@ -236,19 +245,19 @@ def _spelt(text: str) -> str:
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
-    """Unit below the names, or in the name, such as `t_ms` or `time [us]`, else by the size of times since 1970."""
+    """Unit below the names, or in the name, such as `t_ms` or `time [us]`, else by the size since 1970, or ""."""
     low = name.lower().replace("μ", "µ")
     for unit, pattern in _UNIT.items():
         if re.fullmatch(rf"[\[(]?\s*({pattern})\s*[\])]?", stated.lower().replace("μ", "µ")):
             return unit
     for unit, pattern in _UNIT.items():
-        if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"[_\s]({pattern})$", low):
+        if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"([_\s]|time)({pattern})$", low):
             return unit
         if unit != "s" and re.fullmatch(rf"({pattern})(_.*)?", low):
             return unit
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     size = float(np.median(np.abs(finite.astype(np.float64)))) if len(finite) else 0.0
-    return next((unit for least, unit in _EPOCHS if size > least), "s")
+    return next((unit for least, unit in _EPOCHS if size > least), "")
 
 
 def _compact(values: Column) -> bool:
@@ -367,7 +376,7 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
 
 
 def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
-    """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day and goes forward.
+    """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day, or goes forward.
 
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
     """
@@ -384,8 +393,10 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
             f"T{int(m[4] or 0):02}:{m[5] or '00'}:{m[6] or '00'}"
             for m in found
         ]
-        if all(1 <= int(text[5:7]) <= 12 for text in texts) and sorted(texts) in (texts, texts[::-1]):
+        if all(1 <= int(text[5:7]) <= 12 for text in texts):
             orders[order] = texts
+    if len(orders) > 1:
+        orders = {order: texts for order, texts in orders.items() if sorted(texts) in (texts, texts[::-1])}
     taken, note = list(orders), ""
     if len({tuple(texts) for texts in orders.values()}) == 2:
         even = [order for order, texts in orders.items() if _is_even(texts)]
@@ -413,6 +424,7 @@ TOPIC = "/table"
 TYPE = "table"
 """Its message type."""
 
+_PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
@@ -453,13 +465,21 @@ class Table(Recording):
             kept = kept[::-1]
             self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
         names = [name for name in raw.columns if name not in apart]
+        for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not _may_be(raw.columns[name])):
+            cell = next((str(cell) for cell in raw.columns[name] if cell), "")
+            if _PACKED.fullmatch(cell):
+                several = f"column '{name}' left out, as its cells hold several numbers, such as '{cell[:40]}'"
+                self._warnings.append(f"{file}: {several}: write a column for each")
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
             number, unit = _for_each_time(times[kept], {name: raw.columns[name][kept] for name in names})
-            runs = f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
+            each = f"are the {number} rows of a time one for each of {number} units? then "
+            each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
+            other = next((name for name in names if called_time(name) and goes_forward(raw.columns[name])), "")
             self._warnings.append(
                 f"{path}: {equal} of {len(kept)} rows have the time of a row before, and only the first of such rows "
-                f"counts: are the {number} rows of a time one for each of {number} units? then {runs}write a file for "
-                f"each; else write times with more decimals"
+                f"counts: {f'{each}write a file for each; else ' * (number > 1)}write times with more decimals"
+                + f", or take column '{other}', `table: {{time: '{other}'}}`"
+                * bool(other)
             )
         self.times = times[kept]
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept

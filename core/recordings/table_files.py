@@ -140,9 +140,18 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
 def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) -> RawTable:
     """Cell by cell: text, instants, missing numbers, decimal commas, lines with too few cells."""
     columns: list[list[str]] = [[] for _ in names]
-    wide = len(names)
-    first_odd = odd = line = 0
+    wide, header = len(names), [name.strip() for name in shape.names]
+    known = {*header} - {""}
+    first_odd = odd = line = again = 0
     for line, cells in _rows(path, encoding, shape):
+        if known.intersection(map(str.strip, cells[:2])):
+            plain = [cell.strip() for cell in cells]
+            if 2 * len(known.intersection(plain)) > wide:
+                if any(a != b and not _is_value(a) for a, b in zip(plain, header, strict=False)):
+                    rest = "write the rows from there on to a file of their own"
+                    raise BagError(f"{path}: line {line} names other columns, or in another order; {rest}")
+                again += 1
+                continue
         if len(cells) != wide and not (len(cells) == wide + 1 and not cells[-1].strip()):
             odd += 1
             first_odd = first_odd or line
@@ -155,7 +164,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
         raise BagError(f"{path}: {others}, the first is line {first_odd}; mend the file, or its header")
     if not rows:
         raise BagError(f"{path}: has a header and no line of data; record or copy it again")
-    notes = []
+    notes = [f"{plural(again, 'line')} left out that repeat{'s' * (again == 1)} the names of the columns"] * bool(again)
     if odd:
         cut = " (the file ends in it)" if odd == 1 and first_odd == line else ""
         notes.append(f"{plural(odd, 'line')} with another number of cells left out, the first is line {first_odd}{cut}")
@@ -255,14 +264,17 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     above = [_split(line.lstrip("#% "), delimiter) for line in lines[:-begin]]
     above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
     rows = [cells for line in lines[-begin:] if len(cells := _split(line, delimiter)) == wide]
-    if not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none at that of the names
+    named = any(len(cells) == wide and 2 * len(set(cells) - {""}) > wide for cells in above)
+    if not named and not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none of the names
         above = [[*cells, ""] if len(cells) == wide - 1 else cells for cells in above]
     above = [cells for cells in above if len(cells) == wide]
     kinds = [len(set(cells) - {""}) for cells in above]
-    named = [i for i, kind in enumerate(kinds) if kind > 1]
-    if not named:
+    lines_of_names = [i for i, kind in enumerate(kinds) if kind > 1]
+    if not lines_of_names:
         return _Shape(delimiter, -begin, tuple(f"column {i + 1}" for i in range(wide)))
-    chosen = next((i for i in named if 2 * kinds[i] > wide), named[0])  # above the names there may be groups of them
+    chosen = next(
+        (i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0]
+    )  # above the names there may be groups of them
     return _Shape(delimiter, -begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
 
 
@@ -425,11 +437,19 @@ def _is_text(array: NDArray[Any]) -> bool:
 
 def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, list[str]]) -> RawTable:
     """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
-    vectors = [len(column) for column in found.values() if column.ndim == 1]
-    lengths = Counter(vectors or map(len, found.values()))
+    vectors = [name for name, column in found.items() if column.ndim == 1]
+    lengths = Counter({len(column): 0 for column in found.values()})
+    for column in found.values():
+        lengths[max(column.shape) if vectors else len(column)] += min(column.shape) if column.ndim > 1 else 1
     if not lengths:
         there = "; ".join(_left_out(notes)[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
+    if not vectors and len(found) == 1:
+        ((name, matrix),) = found.items()
+        first, *rest = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
+        if rest and (np.diff(first) > 0).all():  # as Simulink writes to a file
+            said = f"the first line of '{name}' is taken for the time, as it grows"
+            return RawTable({"time": first, name: np.column_stack(rest)}, [*_left_out(notes), said])
     length = max(lengths, key=lambda number: (lengths[number], number))
     kept: dict[str, Column] = {}
     for name, column in found.items():

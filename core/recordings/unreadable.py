@@ -44,6 +44,14 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: a Git LFS pointer, not the recording itself; {lfs}")
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         return _compressed(path)
+    if path.suffix.lower() in (".xlsx", ".xls", ".ods"):
+        return BagError(f"{path}: a spreadsheet; save its sheet as .csv")
+    for magic, of, tool in (
+        (b"ULog", "PX4", "ulog2csv"),
+        (b"\xa3\x95", "ArduPilot", "mavlogdump.py --format csv --types ATT"),
+    ):
+        if head.startswith(magic):
+            return BagError(f"{path}: a log of {of}; write its messages as .csv, such as with `{tool}`")
     if head.startswith((b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04")):
         return BagError(f"{path}: compressed as a whole file or an archive; unpack it first")
     if head.startswith(MAGIC[:5]):

@@ -115,7 +115,8 @@ def alarm_text(model: UncertainLTI) -> str:
 def next_text(model: UncertainLTI, file: str) -> str:
     """What to look at after a fit: the first thing that a person can mend, and the commands that tell more."""
     facts = model.fit_summary
-    harmless = "schedules nothing", CONSTANT, "the bounds hold as they are", "the bounds hold, but", "stay valid"
+    harmless = ["schedules nothing", CONSTANT, "the bounds hold as they are", "the bounds hold, but", "stay valid"]
+    harmless += ["dc is 0", "keeps the steady state", "keeps them there"]  # what was chosen, and asks for nothing
     minded = [text for text in facts.get("messages", []) if not any(words in text for words in harmless)]
     blind = facts.get("alarm", {}).get("worth") in ("none", "some")
     remedy = remedies(facts.get("messages", []), facts["additive"], model.state_names[0]) if blind else ""

@@ -79,8 +79,9 @@ class Counters(Counter[str]):
         return {key[len(start) :]: count for key, count in self.items() if key.startswith(start) and count}
 
 
-_EVEN, _COARSE = 200, 8
-"""Steps over which an even clock is told from one that loses samples; most units in a step that is coarse."""
+_EVEN, _COARSE, _PAUSE = 200, 8, 10
+"""Steps over which an even clock is told from one that loses samples; most units in a step that is coarse; times that a
+pause between bursts is longer than most steps."""
 LONGEST_NS = 2**62
 """Longer than any recording; what is longer still counts as this."""
 
@@ -173,6 +174,21 @@ def coarse_ns(instants: Sequence[NDArray[np.int64]]) -> int | None:
             if np.diff(part).max() <= usual + 2 * unit:  # no break in it
                 line.append(np.ptp(part - np.polyval(np.polyfit(count, part, 1), count)) <= 1.6 * unit)
     return unit if line and np.mean(line) >= 0.8 else None
+
+
+def longest_pause(instants: Sequence[NDArray[np.int64]]) -> float | None:
+    """Longest step that is no gap of an even clock whose messages come in bursts, s; None if no such clock.
+
+    However they come, a hundred take about the same time.
+
+    `instants` (messages,): of each recording, ns.
+    """
+    steps = _pooled(instants, 0)
+    pauses = steps[steps > _PAUSE * np.median(steps)] if len(steps) >= _EVEN else steps[:0]
+    if len(pauses) < 0.02 * len(steps) or pauses.sum() <= 0.9 * steps.sum():
+        return None
+    short, long = np.percentile(np.concatenate([i[100:] - i[:-100] for i in instants]), [10, 90])
+    return round(1.5e-9 * float(np.percentile(pauses, 99)), 3) if 0 < long < 1.5 * short else None
 
 
 def resolve(

@@ -31,7 +31,7 @@ from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.recording import Columns, Progress, Recording
-from uncertain_lti.sampling.clock import INVALID, LATE, TOO_OLD, Status, resolve
+from uncertain_lti.sampling.clock import INVALID, LATE, MISSING, TOO_OLD, Status, resolve
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.sampling.transient import Transient
@@ -377,6 +377,10 @@ def unused(transient: Transient) -> list[str]:
     counts = Counter(status.value for status in transient.statuses()[1:] if status is not Status.OK)
     counters = transient.counters
     parts = [f"{count} {kind}" for kind, count in counts.items()]
+    lacking = counters.of(MISSING)
+    if counts[MISSING] > max(1.0, _FEW * len(transient)) and (most := max(lacking.values(), default=0)):
+        names = [name for name, count in lacking.items() if count > 0.5 * most]
+        parts[list(counts).index(MISSING)] += f" {' or '.join(names[:3])}{' or others' * (len(names) > 3)}"
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
     kinds = [(kind, *of) for kind in (LATE, TOO_OLD, INVALID) for of in sorted(counters.of(kind).items())]
     return parts + [f"{count} {kind} {name}" for kind, name, count in kinds]

@@ -42,7 +42,6 @@ cdef list _STATUS = [
 ]  # of each outcome; looking one of an enumeration up is slow
 cdef enum:
     _LAG, _DIFF, _RATE
-cdef double _TURN = 2.0 * math.pi
 
 ctypedef long long instant_t
 
@@ -142,7 +141,7 @@ cdef class Topic:
         self.max_age = np.array([max_age[i] for i in self.where], dtype=np.longlong)
         self.steady = np.array([signals.branch(i) for i in self.where], dtype=np.float64)
         self.previous = self.steady.copy()
-        self.unwrap = [i for i, signal in enumerate(here) if FieldPath(signal.field).unwrap]
+        self.unwrap = [(i, turn) for i, signal in enumerate(here) if (turn := FieldPath(signal.field).unwrap)]
         self.limited = [
             (i, *(signal.valid or (-math.inf, math.inf)), np.array(sorted(signal.ignored), dtype=np.float64))
             for i, signal in enumerate(here)
@@ -353,9 +352,10 @@ cdef class Topic:
     cdef void turn(self, double* values):
         """Angles, each on the branch nearest to the one before."""
         cdef Py_ssize_t i
-        for i in self.unwrap:
+        cdef double turn
+        for i, turn in self.unwrap:
             if isfinite(values[i]):
-                values[i] += _TURN * (rint((self.previous[i] - values[i]) / _TURN) + 0.0)
+                values[i] += turn * (rint((self.previous[i] - values[i]) / turn) + 0.0)
                 if isfinite(values[i]):
                     self.previous[i] = values[i]
 

@@ -194,19 +194,20 @@ class FieldPath:
 
     Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` array of the message that
     holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
-    pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
-    in rad, and, outermost, lag(field, k), diff(field) and rate(field) of earlier samples (the sampler does these two,
-    as it knows where a stream restarts).
+    pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle in rad
+    or of a stated turn (`unwrap(heading, 360)`), and, outermost, lag(field, k), diff(field) and rate(field) of earlier
+    samples (the sampler does these two, as it knows where a stream restarts).
 
-    `text`: the path as a signals file writes it; `unwrap`: the sampler is to unwrap it; `memory`: what the sampler is
-    to take from earlier samples; `inner`: the path without that: whose earlier samples they are.
+    `text`: the path as a signals file writes it; `unwrap`: the turn by which the sampler is to unwrap it, 0 for none;
+    `memory`: what the sampler is to take from earlier samples; `inner`: the path without that: whose earlier samples
+    they are.
     """
 
     __slots__ = ("text", "unwrap", "memory", "inner", "function", "steps")
 
     def __init__(self, text: str) -> None:
         self.text = text
-        self.unwrap = False
+        self.unwrap = 0.0
         self.function: FieldFunction | None = None
         self.memory, self.inner = parse_memory(text)
         inner = self.inner
@@ -218,8 +219,10 @@ class FieldPath:
                 raise SignalError(f"field '{text}': there is no function '{match[1]}'{near}; there are {there}")
             functions.append(match[1])
             inner = match[2].strip()
+            if match[1] == "unwrap" and (stated := re.fullmatch(r"(.*),\s*([1-9][\d.]*)", inner, re.DOTALL)):
+                inner, self.unwrap = stated[1].strip(), float(stated[2])
         if functions[:1] == ["unwrap"]:
-            self.unwrap = True
+            self.unwrap = self.unwrap or math.tau
             functions = functions[1:]
         if len(functions) > 1 or not set(functions) <= set(FUNCTIONS):
             only = "functions nest only as unwrap(roll|pitch|yaw(...)), and in lag, diff, rate"
