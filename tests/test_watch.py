@@ -104,9 +104,13 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
         assert shown.count('class="uplot') == 1 + model.n
         assert re.search(r"<title>ALARM (SILENT )?/envelope_monitor</title>", shown)
         assert re.search(r'<h1 class="bad">ALARM', shown) and not re.search(r'id="keys" hidden', shown)
+    until(lambda: drawn(address)["title"] == "ALARM SILENT /envelope_monitor", "the alarm that stands through silence")
+    world.change("deactivate")
+    until(lambda: drawn(address)["title"] == "SILENT /envelope_monitor", "the end of what the alarm is of")
     monitor.signal(2)
-    until(lambda: "Nothing has come" in (note := drawn(address)["note"]) and "; no such node" in note, "its end")
-    assert drawn(address)["title"] == "ALARM SILENT /envelope_monitor"
+    until(lambda: "; no such node" in drawn(address)["note"], "its end")
+    assert drawn(address)["note"].startswith("Nothing has come for ") and "; it said last: " in drawn(address)["note"]
+    assert drawn(address)["title"] == "SILENT /envelope_monitor"
     watch.signal(2)
     assert watch.wait() == 0
 

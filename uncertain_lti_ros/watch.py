@@ -137,12 +137,14 @@ class Watched:
         shown = t_ns > t_ns[-1:] - self._window * 1e9
         alarm, flags, utilisation, statistics = (row[shown] for row in rows)
         t = (t_ns[shown] - t_ns[-1:]) * 1e-9
-        quiet, raised = time.monotonic() - heard, bool(alarm[-1:].any())
-        silent, gone = quiet > _SILENT, ""
+        quiet, gone = time.monotonic() - heard, ""
+        silent = quiet > _SILENT
         if silent and not self._node.count_publishers(f"{self.name}/flags"):
             gone = f"; no such node is in ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}"
+        raised = bool(alarm[-1:].any()) and not gone and not reason.startswith("inactive")  # and nobody takes it back
         if len(t):
-            note = f"{plural(len(t), 'sample')}, 0 s is the newest" + (f"; {reason}." if reason else ".")
+            said_last = f"; it said last: {reason}." if gone else f"; {reason}."
+            note = f"{plural(len(t), 'sample')}, 0 s is the newest" + (said_last if reason else ".")
             note = f"Nothing has come for {quiet:.0f} s{gone}. {note}" if silent else note
         else:
             note = f"Waiting for {self.name}: nothing is heard on {self.name}/flags{gone}."
