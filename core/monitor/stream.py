@@ -182,6 +182,7 @@ class Stream:
         self._heard: dict[str, float] = {}
         self._began, self._judged, self._came = now, -math.inf, now
         self._behind: dict[str, deque[float]] = {}
+        self._looked = 0, -math.inf  # the newest stamp at the last look, and when its message came
         awaited = [self.sampler.clock, *self._stamped]
         self._catches_up = CatchUp(awaited, self._window, start=True) if math.isfinite(self._stall) else None
         self.reordered, self.caught_up = 0, ""
@@ -307,12 +308,18 @@ class Stream:
         return {topic: lag for topic, lag in lags.items() if lag > step}
 
     def _look_at_lags(self) -> None:
+        """Compare stamps; how fast they go by the steady clock, as where a recording is played, the last look tells."""
         latest, clock = self.sampler.latest(), self._heard.get(self.sampler.clock, 0.0)
+        if latest is None or clock <= self._looked[1]:
+            return
+        pace, self._looked = (latest[0] - self._looked[0]) / (clock - self._looked[1]), (latest[0], clock)
+        if pace <= 0.0:  # the first look, or time has stepped back
+            return
         for topic in self._stamped:
             kept = self.sampler.kept(topic)
-            if latest is not None and kept and kept[-1][0]:
+            if kept and kept[-1][0]:
                 behind = self._behind.setdefault(topic, deque(maxlen=_MOST_LOOKS))
-                behind.append((latest[0] - kept[-1][0]) * 1e-9 + self._heard[topic] - clock)
+                behind.append((latest[0] - kept[-1][0] + pace * (self._heard[topic] - clock)) * 1e-9)
 
     def accept(
         self, topic: str, arrival_ns: int, data: bytes, now: float, sent_ns: int = 0, late: float = 0.0
