@@ -318,6 +318,21 @@ def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     ]
 
 
+def test_a_recording_that_is_played_again_is_told_once_at_each_pass_and_nothing_of_it_is_late() -> None:
+    rig = Rig.at_work()
+    for _ in range(2):
+        rig.t_ns -= 10**10
+        rig.send(50)
+        assert rig.lines == [f"time steps back on {STATE}: a new segment begins"]
+        report = rig.session.report(rig.now, TIMEOUT)[0]
+        assert report.message == "1 samples without a verdict: time stepped back"
+        assert report.values["late messages"] == report.values["dropped"] == "0"
+    rig.session.reasons.rivals = "several publishers"  # then it is their stamps that step back
+    rig.t_ns -= 10**10
+    rig.send(50)
+    assert not rig.lines
+
+
 NO_NAME = f"{STATE}: there is no '{{}}' in the message's names"
 
 

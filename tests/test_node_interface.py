@@ -29,7 +29,7 @@ from lifecycle_msgs.msg import TransitionEvent
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import ERROR, World, until
+from ros_processes import ERROR, OK, STALE, World, until
 from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -263,6 +263,38 @@ while rclpy.ok():
 
 
 # --- simulated time -----------------------------------------------------------------------------------------
+
+
+def test_publishers_of_a_state_that_take_turns_are_named_but_not_those_of_other_names(bench: StartBench) -> None:
+    on = bench(state_timeout=2.0)
+    said = f"{STATE}: several publishers send by turns, and are taken for one; stop all but one"
+    other = on.world.publisher(JointState, STATE)
+    on.world.subscribed(other)
+
+    def send(seconds: float, *names: str) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            on.plant.send(1)
+            behind = JointState(name=names, position=[0.3] * len(names))  # by a minute
+            behind.header.stamp.sec = on.plant.t_ns // 10**9 - 60
+            other.publish(behind)
+
+    send(2.5, "wheel")
+    on.diagnostics.reaches(OK)
+    assert not on.world.status()["problems"]
+    on.world.change("deactivate")
+    on.world.change("activate")
+    count = on.diagnostics.count
+    send(6.5, "a", "b")
+    on.diagnostics.reaches(STALE, saying=said, since=count)
+    status = on.world.status()
+    assert status["problems"] == [said] and status["why"] == f"no verdict: {said}"
+    on.process.says(said)
+    on.world.node.destroy_publisher(other)
+    until(lambda: not on.world.status()["problems"], "one publisher")
+    on.plant.send(100)
+    on.diagnostics.reaches(OK)
+    assert on.world.status()["why"] == "no alarm"
 
 
 def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_path: Path) -> None:

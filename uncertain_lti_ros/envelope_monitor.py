@@ -378,6 +378,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._looked = now
         for subscription in self.inputs.values():
             subscription.look()
+        if self.session is not None:
+            self.session.know_rivals(topic for topic, s in self.inputs.items() if s.takes_turns())
         self.outputs.look()
         self._twin = self.count_publishers(f"~/{VIOLATION.name}") > 1
         self._find_enable_type()
@@ -441,7 +443,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _lasting_problems(self) -> list[str]:
         """Problems that last and concern no topic of the model."""
-        problems = [self._enable_problem] if self._enable_problem else []
+        rivals = self.session.reasons.rivals if self.session is not None else ""
+        problems = [problem for problem in (self._enable_problem, rivals) if problem]
         if self._twin:
             topic = f"{self.get_fully_qualified_name()}/{VIOLATION.name}"
             problems.append(f"another node publishes {topic} too; give one of them another name, -r __node:=NAME")

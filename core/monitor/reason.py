@@ -57,11 +57,13 @@ class Reasons:
     its bounds may change with every sample.
 
     `model`: names the signals; `rules`: of the alarm; `words`: of each rule, by what it is called; `text`: on the last
-    sample; `by`: what holds the alarm, or held it last: rules, horizons and states; empty before any.
+    sample; `by`: what holds the alarm, or held it last: rules, horizons and states; empty before any;
+    `rivals`: what is said of publishers that are taken for one; empty if there are none.
     """
 
     def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
         self._model = model
+        self.rivals = ""
         self.words = {label: rule.words for label, rule in zip(labels(rules), rules, strict=True)}
         self.reset()
 
@@ -89,13 +91,15 @@ class Reasons:
         self.by = self._held or self.by
         said = [f"alarm: {self._held}" if self._held else "alarm"] if alarm else []
         if not judged:
-            said.append(f"no verdict: {self._why(verdict)}")
+            said.append(f"no verdict: {self.rivals or self._why(verdict)}")
         elif not alarm:
             said.append(QUIET)
         if judged and verdict.withheld:
             said.append(f"no verdict on {', '.join(names[i] for i in verdict.withheld)}")
         if judged and verdict.unknown_regime:
             said.append("a regime that was not fitted")
+        if judged and self.rivals:
+            said.append(self.rivals)
         self.text = "; ".join(said)
         return self.text
 

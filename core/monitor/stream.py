@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
@@ -175,6 +175,7 @@ class Stream:
         self.unreadable: Counter[str] = Counter()
         self.why_unreadable: dict[str, str] = {}
         self.future: Counter[str] = Counter()
+        self._strange: set[str] = set()  # topics with messages that name no signal
         self.received: dict[str, int] = {}  # setting an item of a Counter is slow
         self.verdicts = self.alarms = 0
         self.violations = [0] * self.model.n
@@ -419,9 +420,17 @@ class Stream:
         if not self.arming.on:
             self.monitor.reset()
 
+    def know_rivals(self, topics: Iterable[str]) -> None:
+        """Have messages of several publishers on these topics come by turns; those of states should be of one."""
+        clock, strange = self.sampler.clock, self._strange
+        rivals = [t for t in topics if t in self.received and t not in strange and (t == clock or not self.held(t))]
+        said = "several publishers send by turns, and are taken for one; stop all but one"
+        self.reasons.rivals = f"{', '.join(rivals)}: {said}" if rivals else ""
+
     @cython.cfunc
     def _pass_over(self, topic: str, heard: cython.double) -> None:
         """A message of another publisher, which names no signal of the model: as in a recording it does not count."""
+        self._strange.add(topic)
         if self.verdicts and heard == heard:
             self._heard[topic] = heard
         else:  # there may be nobody who names them
@@ -444,7 +453,8 @@ class Stream:
             period.verdicts += 1
             if not verdict.withheld:
                 verdict.reach(period.largest)
-        if verdict.ordinary and not self.latched and self.reasons.text == QUIET:
+        reasons = self.reasons
+        if verdict.ordinary and not self.latched and reasons.text == QUIET and not reasons.rivals:
             self._quiet += 1
             return
         if verdict.status is not _OK:
@@ -459,7 +469,7 @@ class Stream:
         period.frozen.update({moved.state: moved for moved in verdict.frozen})
         period.repeating.update({moved.state: moved for moved in verdict.repeating})
         alarm: cython.bint = verdict.alarm or self.latched
-        self.reasons.take(verdict, alarm)
+        reasons.take(verdict, alarm)
         if alarm:
             period.alarm = True
             self.alarms += not alarm_before
