@@ -38,6 +38,8 @@ WHY = {
     Status.UNASKED: "outside the time asked for",
 }
 """Why a sample has no verdict, whatever the model."""
+TOO_LARGE = "a value is so large that its bounds are not finite"
+"""Why there is none where every signal is there."""
 QUIET = "no alarm"
 """What is said of a verdict without an alarm."""
 
@@ -124,8 +126,8 @@ class Reasons:
         if status is Status.MISSING:
             of = [*(signal.name for signal in self._model.signals), *self._model.state_names]
             values = zip(of, [*verdict.before, *verdict.numbers("state")], strict=True)
-            if lacking := dict.fromkeys(name for name, value in values if value != value):
-                return f"{', '.join(lacking)} missing, stale, not valid or not finite"
+            lacking = dict.fromkeys(name for name, value in values if not math.isfinite(value))
+            return f"{', '.join(lacking)} missing, stale, not valid or not finite" if lacking else TOO_LARGE
         return why_not(status, self._model)
 
 
