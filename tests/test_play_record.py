@@ -42,7 +42,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from processes import on_a_terminal
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_processes import PATIENCE, World, own_domain, until
+from ros_processes import COMMANDS, PATIENCE, World, own_domain, until
 from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -227,6 +227,19 @@ def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> N
     assert not output.exists()
     bag = Bag(part)
     assert bag.warnings and len(list(bag.messages(["/numbers"]))) > 1
+
+
+def test_a_disk_that_is_full_ends_recording_in_a_sentence(world: World, tmp_path: Path) -> None:
+    numbers, rng = world.publisher(JointState, "/numbers"), np.random.default_rng(0)
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (2**21, 2**21)); {COMMANDS}"
+    process = world.start("record", "-c", limited, "record", "/numbers", "--output", str(tmp_path / "out.mcap"))
+    world.subscribed(numbers)
+    while process.running:
+        numbers.publish(JointState(position=rng.normal(size=5000)))
+        time.sleep(0.005)
+    *_, sentence = process.output.splitlines()
+    assert process.wait() == 2 and "out.mcap.part: cannot be finished: File too large; what is in" in sentence
+    assert "callback" not in process.output and Bag(tmp_path / "out.mcap.part").topics["/numbers"].count
 
 
 @pytest.mark.parametrize(
