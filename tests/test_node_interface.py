@@ -297,6 +297,19 @@ def test_publishers_of_a_state_that_take_turns_are_named_but_not_those_of_other_
     assert on.world.status()["why"] == "no alarm"
 
 
+def test_deactivation_ends_a_latched_alarm(bench: StartBench) -> None:
+    on = bench(latch=True)
+    on.plant.send(5)
+    on.plant.send(3, off=2.0)
+    until(lambda: on.world.status()["latched"], "the alarm")
+    assert on.world.change("deactivate")
+    status = on.world.status()
+    assert (status["alarm"], status["latched"], status["why"]) == (False, False, "inactive: no verdicts are given")
+    on.process.says(" s, as the node is no longer active")
+    assert on.world.change("activate") and on.world.change("deactivate")
+    assert on.process.output.count("the alarm is over") == 1
+
+
 def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_path: Path) -> None:
     """By log time: a jump forward is a gap, one back a reset, neither is judged; a paused clock repeats itself."""
     model = by_hand("log")

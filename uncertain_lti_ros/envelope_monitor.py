@@ -212,6 +212,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         """The lifecycle state: unconfigured, inactive, active, finalized, or the transition that is under way."""
         return str(self._state_machine.current_state[1])
 
+    @property
+    def _idle(self) -> str:
+        """What is said while it is not active."""
+        return f"{self.state_name}: {self.reason or 'no verdicts are given'}"
+
     def start(self) -> None:
         """Configure and activate; if that fails the reason is logged and published on /diagnostics."""
         self._starts_itself = True
@@ -275,7 +280,10 @@ class EnvelopeMonitorNode(LifecycleNode):
     @_failures_noted
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; no heartbeat is published from now on."""
+        assert self.session is not None
         self._unsubscribe()
+        self.session.reset()
+        self._event_log.turned(self.session, (), time.monotonic(), ", as the node is no longer active")
         self.outputs.sender.send_reason("inactive: no verdicts are given")
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
@@ -467,12 +475,10 @@ class EnvelopeMonitorNode(LifecycleNode):
             extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.sender.held_back)}
             reports[0] = replace(reports[0], values={**reports[0].values, **extra})
         else:
-            state = self.state_name
-            message = f"{state}: {self.reason or 'no verdicts are given'}"
             level = ERROR if self.reason else STALE
-            reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
+            reports = [Report(level, "monitor", self._idle, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:
-                reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
+                reports += [Report(STALE, name, self._idle, {}) for name in self.session.model.state_names]
         self._mark_reported()
         self._diagnostics.publish(reports, self.clock.now().to_msg(), self.settings["model"])
 
@@ -515,8 +521,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_status(self) -> tuple[bool, str]:
         """Whether verdicts are given, and counters as JSON."""
-        session = self.session
-        return self.active, json.dumps(
+        session, active, now = self.session, self.active, time.monotonic()
+        return active, json.dumps(
             {
                 "state": self.state_name,
                 "reason": self.reason,
@@ -529,7 +535,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "verdicts": session.verdicts if session else 0,
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
-                "why": session.reason(time.monotonic(), self.settings["state_timeout"]) if session else "",
+                "why": session.reason(now, self.settings["state_timeout"]) if session and active else self._idle,
                 "looks_like": like.words if session and (like := session.explainer.likeness()) else "",
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,
