@@ -239,16 +239,20 @@ class EnvelopeMonitorNode(LifecycleNode):
     @_failures_noted
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check the model, and offer the outputs."""
-        path = self.settings["model"]
+        path, fixed = self.settings["model"], True
         try:
             self.settings.requested_qos()
             self._prefix = self.settings.topic_prefix()
+            fixed = False
             self.intake.session = session = self._make_session(path, self.settings.rule({}))
+            fixed = True
             self.snapshots.open()
         except Exception as error:
             self.intake.session = None
             self.reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
-            then = "; the node starts as soon as its parameters are set right" if self._starts_itself else ""
+            then = "; start the node again with another" if fixed else ""
+            if self._starts_itself and not fixed:
+                then = "; the node starts as soon as its parameters are set right"
             self.get_logger().error(f"not configured: {self.reason}{then}")
             self.report()
             return TransitionCallbackReturn.FAILURE
