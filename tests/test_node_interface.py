@@ -12,6 +12,7 @@
 import os
 import signal
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from conftest import ROOT
 from perturbed import CONTROL, STATE, STEP_NS
 
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Sampling
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -295,6 +297,22 @@ def test_publishers_of_a_state_that_take_turns_are_named_but_not_those_of_other_
     on.plant.send(100)
     on.diagnostics.reaches(OK)
     assert on.world.status()["why"] == "no alarm"
+
+
+def test_a_machine_sampled_more_slowly_than_the_timeout_is_not_silent_between_two_samples(bench: StartBench) -> None:
+    model = by_hand()
+    slow = model.replace(sampling=Sampling(0.4), signals=replace(model.signals, max_gap=1.0))
+    on = bench(slow, state_timeout=0.1)
+    on.plant.send(2)
+    count = on.diagnostics.count
+    for _ in range(4):
+        on.plant.t_ns += 400_000_000 - STEP_NS
+        time.sleep(0.4)
+        on.plant.send(1)
+    said = {s.level for array in on.diagnostics.topic.messages[count + 2 :] for s in array.status}
+    assert said and bytes([STALE]) not in said
+    assert "no verdict for" not in on.process.output and "no message on" not in on.process.output
+    on.diagnostics.reaches(STALE, saying=f"no message on {STATE} for")
 
 
 def test_deactivation_ends_a_latched_alarm(bench: StartBench) -> None:

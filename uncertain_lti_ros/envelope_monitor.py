@@ -136,6 +136,12 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     # --- parameters ---
 
+    @property
+    def _timeout(self) -> float:
+        """s without a verdict that are silence."""
+        least: float = self.settings["state_timeout"]
+        return max(least, self.session.between_verdicts) if self.session else least
+
     def _make_session(self, path: str, rule: Rule) -> Session:
         return make_session(path, rule, self.settings, self.session.arming if self.session else None)
 
@@ -424,7 +430,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _keep_reason(self) -> None:
         """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""
         if self.active and self.session is not None:
-            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self.settings["state_timeout"]))
+            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self._timeout))
 
     def _keep_reporting(self) -> None:
         now = time.monotonic()
@@ -445,7 +451,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems = [problem for subscription in self.inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self.inputs.items()}
-        self._event_log.look(self.session, now, self.settings["state_timeout"], publishers, problems)
+        self._event_log.look(self.session, now, self._timeout, publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
@@ -474,7 +480,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Publish diagnostics."""
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
-            reports = self.session.report(now, self.settings["state_timeout"], self._problems())
+            reports = self.session.report(now, self._timeout, self._problems())
             extra = input_values(self.inputs) | self.snapshots.values
             extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.sender.held_back)}
             reports[0] = replace(reports[0], values={**reports[0].values, **extra})
@@ -539,7 +545,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "verdicts": session.verdicts if session else 0,
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
-                "why": session.reason(now, self.settings["state_timeout"]) if session and active else self._idle,
+                "why": session.reason(now, self._timeout) if session and active else self._idle,
                 "looks_like": like.words if session and (like := session.explainer.likeness()) else "",
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,

@@ -542,6 +542,12 @@ class Stream:
         """Time since the last verdict, or since the start."""
         return now - max(self._judged, self._began)
 
+    @property
+    def between_verdicts(self) -> float:
+        """Time from one to the next at most, s: a longer step has none."""
+        sampling = self.model.sampling
+        return 2.0 * (sampling.dt_max or sampling.dt_median or 0.0)
+
     def silent_for(self, now: float) -> float:
         """Time since the last message of the clock topic."""
         return now - self._heard.get(self.sampler.clock, self._began)
