@@ -397,6 +397,7 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
         ([bag, "--topics", "good"], "there is no topic good (is /good meant?); topics there: /foreign, /good"),
         ([tmp_path / "none.mcap"], "none.mcap"),
         ([bag, "--lockstep", "nobody", "--wait", "0.2"], "/nobody/status: no such service after 0.2 s"),
+        ([bag, "--lockstep", "no body", "--wait", "0.2"], "'no body' is no topic name; write letters, digits"),
         ([bag, "--lockstep", "nobody", "--rate", "2"], "leave out --rate"),
     ):
         status, said = command("play", *arguments)
