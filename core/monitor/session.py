@@ -393,7 +393,9 @@ class EventLog:
         known, clock, lags = self._matters["problems"].logged or (), session.sampler.clock, session.lags
         condition = session.arming.condition or "there is no condition any more"
         lag = [f"stamps on {topic} lag those on {clock} by {s:.3g} s, more than a step" for topic, s in lags.items()]
-        resets = 0 if session.reasons.rivals else session.sampler.counters["resets"]
+        resets = session.sampler.counters["resets"]
+        if session.reasons.rivals:  # then it is their stamps that step back
+            self._matters["resets"].logged = resets
         for name, value, lines in (
             ("resets", resets, [f"time steps back on {clock}: a new segment begins"] * bool(resets)),
             ("problems", tuple(problems) or None, [problem for problem in problems if problem not in known][:SHOWN]),
