@@ -229,6 +229,18 @@ def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> N
     assert bag.warnings and len(list(bag.messages(["/numbers"]))) > 1
 
 
+def test_a_publisher_of_another_type_that_joins_is_told_and_its_messages_are_left_out(world: World, tmp_path: Path):
+    numbers = world.publisher(Float64, "/numbers")
+    process = recorder(world, ["/numbers"], tmp_path / "out.mcap")
+    world.subscribed(numbers)
+    numbers.publish(Float64(data=1.0))
+    joins = "import rclpy, time; from std_msgs.msg import Float32; rclpy.init(); node = rclpy.create_node('other')"
+    world.start("other", "-c", f"{joins}; p = node.create_publisher(Float32, '/numbers', 1); time.sleep(300)")
+    process.says("note: /numbers: a publisher sends std_msgs/msg/Float32, and std_msgs/msg/Float64 is wanted\n")
+    process.signal(signal.SIGINT)
+    assert "1 messages of 1 topics" in process.succeed() and process.output.count("a publisher sends") == 1
+
+
 def test_a_disk_that_is_full_ends_recording_in_a_sentence(world: World, tmp_path: Path) -> None:
     numbers, rng = world.publisher(JointState, "/numbers"), np.random.default_rng(0)
     limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (2**21, 2**21)); {COMMANDS}"

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> Result:
             )
             stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
             with stage as step:
-                _record(life, subscriptions, file, args.duration, step)
+                _record(life, subscriptions, file, args.duration, step, args.progress.note)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
@@ -122,11 +122,12 @@ def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSu
 
 def _record(
     life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None,
-    step: Callable[[str], None],
+    step: Callable[[str], None], note: Callable[..., None],
 ) -> None:  # fmt: skip
     def look() -> None:
         for subscription in subscriptions:
             subscription.look()
+            note(*subscription.problems)
 
     def poll() -> None:
         for subscription in subscriptions:
