@@ -267,6 +267,24 @@ while rclpy.ok():
 # --- simulated time -----------------------------------------------------------------------------------------
 
 
+def test_turns_are_told_from_a_publisher_that_is_started_again_and_from_losses(world: World) -> None:
+    many = range(1000, 1400)
+    cases = {
+        "turns": ([n for k in range(5) for n in (1000 + k, 5 + k)], True),
+        "turns at the same number": ([7, 7, 8, 8, 9, 9, 10, 10], True),
+        "a few between many": ([n for k in range(4) for n in (*many[100 * k : 100 * k + 100], 3 * k, 3 * k + 1)], True),
+        "starts again": ([n for _ in range(6) for n in range(1, 41)], False),
+        "losses": ([n for n in range(1, 200) if n % 3], False),
+    }
+    for case, (numbers, turns) in cases.items():
+        heard = MatchedSubscription(world.node, "/x", "std_msgs/msg/Float64", lambda *_: None)
+        heard.publishers = 2
+        for number in numbers:
+            heard._take(b"", {"publication_sequence_number": number, "source_timestamp": 0})
+        assert heard.takes_turns() is turns, case
+        heard.destroy()
+
+
 def test_publishers_of_a_state_that_take_turns_are_named_but_not_those_of_other_names(bench: StartBench) -> None:
     on = bench(state_timeout=2.0)
     said = f"{STATE}: several publishers send by turns, and are taken for one; stop all but one"

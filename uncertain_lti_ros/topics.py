@@ -265,7 +265,8 @@ class MatchedSubscription:
         self._reported_lost = self._skipped = 0  # as the middleware has it, and by the numbers of the messages
         self._number: int | None = None  # of the last message
         self._alone = False  # one publisher sends all messages since that one
-        self._turns = deque[float](maxlen=3)  # when a message of a lower number came
+        self._left = math.inf  # number of the last message of the publisher before the one that sends now
+        self._turns = deque[float](maxlen=3)  # when that publisher went on
         self.problems: list[str] = []
         self.look_soon = False
         self.published = math.inf  # since when there are publishers, steady time in s
@@ -340,9 +341,14 @@ class MatchedSubscription:
         if before is not None and number is not None:
             if number <= before:  # they come from several publishers
                 self._alone = False
-                self._turns.append(time.monotonic())
             elif self._alone:
                 self._skipped += number - before - 1
+            if number != before + 1:
+                goes_on = self._left < number and (number <= before or self._left > before)
+                if goes_on:
+                    self._turns.append(time.monotonic())
+                if goes_on or number <= before:
+                    self._left = before
         self._number = number
         self._callback(message, info["source_timestamp"])
 
