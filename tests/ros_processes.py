@@ -43,7 +43,7 @@ PATIENCE = 300.0  # s; costs nothing where all is well
 MONITOR = "/envelope_monitor"
 OK, WARN, ERROR, STALE = 0, 1, 2, 3  # of diagnostic_msgs
 _NODES = "import sys; from uncertain_lti_ros.nodes import {0}; sys.exit({0}())"
-_COMMANDS = "import sys; from uncertain_lti.cli.main import main; sys.exit(main())"
+COMMANDS = "import sys; from uncertain_lti.cli.main import main; sys.exit(main())"
 _SERVER = """
 import json, os, signal, sys
 import geometry_msgs.msg, sensor_msgs.msg, std_msgs.msg
@@ -270,7 +270,7 @@ class World:
 
     def command(self, name: str, *arguments: Any) -> Process:
         """`play`, `record`, `watch` or `demo`."""
-        return self.start(name, _COMMANDS, name, *(str(a) for a in arguments), forked=True)
+        return self.start(name, COMMANDS, name, *(str(a) for a in arguments), forked=True)
 
     def monitor(self, model: Path | str, *more: str, name: str = MONITOR, code: str = "", **parameters: Any) -> Process:
         """An envelope_monitor that is active."""

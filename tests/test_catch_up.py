@@ -282,3 +282,14 @@ def test_a_lag_of_more_than_a_step_is_said_live_and_when_a_recording_is_read(eng
         path = write([Topic(name, kind) for name, kind in kinds.items()], came).save(tmp_path / f"{said}.mcap")
         notes = read_as_fitted(Bag(path), model.signals).notes
         assert len([note for note in notes if f"stamps on {CONTROL_TOPIC} lag" in note and "2.4 steps" in note]) == said
+
+
+@pytest.mark.parametrize("rate", [0.2, 5.0])
+@pytest.mark.parametrize("lag", [0.0, 2.4])
+def test_a_lag_is_that_of_the_stamps_where_a_recording_is_played_at_another_speed(engine, rate: float, lag: float):
+    model, bag = engine
+    seldom = [m for i, m in enumerate(sent(bag)) if m[1] == STATE_TOPIC or i % 34 < 2]
+    played = [(at / rate, *rest) for at, *rest in lagging(seldom, lag * STEP)]
+    session = session_of(model, Rule())
+    run(session, played, until=played[-1][0])
+    assert session.lags == ({CONTROL_TOPIC: pytest.approx(lag * STEP, rel=0.2)} if lag else {})

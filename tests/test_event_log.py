@@ -318,6 +318,31 @@ def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     ]
 
 
+def test_of_many_stalls_those_that_are_told_have_their_length() -> None:
+    rig = Rig.at_work()
+    for _ in range(8):
+        rig.wait(2.0)
+        rig.send(100)
+    again = [line for line in rig.lines if line.startswith("judging again")]
+    assert len(again) > 2 and all(1.9 < float(line.split()[3]) < 2.1 for line in again), again
+
+
+def test_a_recording_that_is_played_again_is_told_once_at_each_pass_and_nothing_of_it_is_late() -> None:
+    rig = Rig.at_work()
+    for _ in range(2):
+        rig.t_ns -= 10**10
+        rig.send(50)
+        assert rig.lines == [f"time steps back on {STATE}: a new segment begins"]
+        report = rig.session.report(rig.now, TIMEOUT)[0]
+        assert report.message == "1 samples without a verdict: time stepped back"
+        assert report.values["late messages"] == report.values["dropped"] == "0"
+    for rivals in ("several publishers", ""):
+        rig.session.reasons.rivals = rivals
+        rig.t_ns -= 10**10 * bool(rivals)
+        rig.send(50)
+        assert not rig.lines
+
+
 NO_NAME = f"{STATE}: there is no '{{}}' in the message's names"
 
 
@@ -352,6 +377,23 @@ def test_messages_that_come_and_give_no_verdict_are_told_with_the_cause(what: st
     (line,) = rig.lines
     assert re.match(r"no verdict for 1\.\d s: ", line) and why in line
     assert why.partition("; ")[2] in rig.session.report(rig.now, TIMEOUT)[0].message
+
+
+@pytest.mark.parametrize(
+    ("value", "said", "reported"),
+    [
+        (np.inf, "a missing, stale, not valid or not finite", "a signal is missing, stale or not finite (a)"),
+        (1e308, *["a value is so large that its bounds are not finite"] * 2),
+    ],
+)
+def test_infinite_values_are_named_and_those_that_no_bounds_hold_are_told(value: float, said: str, reported: str):
+    rig = Rig.at_work()
+    for _ in range(5):
+        rig.send(1, state=False)
+        rig.take(STATE, joint_state(rig.t_ns, [value, 0.3]))
+        rig.t_ns += STEP_NS
+    assert rig.session.reasons.text.endswith(f"no verdict: {said}")
+    assert f"samples without a verdict: {reported}" in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
 def test_equal_times_of_receipt_tell_that_the_simulated_clock_is_coarse() -> None:

@@ -627,6 +627,13 @@ def test_a_rule_that_kept_the_node_from_starting_can_be_mended(world: World, tmp
     assert not world.manage("configure") and world.state() == "active", "a manager gives up on a node that started"
 
 
+@pytest.mark.parametrize(("name", "value"), [("topic_prefix", "a b"), ("snapshot.folder", "/dev/null/x")])
+def test_what_only_another_start_can_mend_is_said_so(world: World, tmp_path: Path, name: str, value: str) -> None:
+    process = world.run_node("envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), name: value})
+    process.says("; start the node again with another")
+    assert name in process.output and "as soon as" not in process.output
+
+
 def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_path: Path) -> None:
     model, signals = by_hand(), by_hand().signals
     unknown = tuple(replace(c, type="frost_interfaces/msg/UCommand") for c in signals.controls)

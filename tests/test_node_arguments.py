@@ -192,6 +192,19 @@ def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path:
             starts(world, file, nothing)
 
 
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_program_is_imported_ends_it_with_status_0(tmp_path: Path, end: int) -> None:
+    first = (
+        "import builtins, os, sys; from uncertain_lti_ros.nodes import envelope_monitor; real = builtins.__import__\n"
+        "def interrupted(name, *rest):\n"
+        f"    if name == 'rclpy.lifecycle': os.kill(os.getpid(), {int(end)})\n"
+        "    return real(name, *rest)\n"
+        "builtins.__import__ = interrupted; sys.exit(envelope_monitor())"
+    )
+    done = process(tmp_path, first)
+    assert (done.stdout, done.stderr, done.returncode) == ("", "", 0)
+
+
 _STUCK = """
 import ctypes, os, signal
 from rclpy.node import Node

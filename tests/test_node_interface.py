@@ -12,6 +12,7 @@
 import os
 import signal
 import time
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from conftest import ROOT
 from perturbed import CONTROL, STATE, STEP_NS
 
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.domain import Sampling
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -29,7 +31,7 @@ from lifecycle_msgs.msg import TransitionEvent
 from rcl_interfaces.srv import DescribeParameters
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from ros_processes import ERROR, World, until
+from ros_processes import ERROR, OK, STALE, World, until
 from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -263,6 +265,85 @@ while rclpy.ok():
 
 
 # --- simulated time -----------------------------------------------------------------------------------------
+
+
+def test_turns_are_told_from_a_publisher_that_is_started_again_and_from_losses(world: World) -> None:
+    many = range(1000, 1400)
+    cases = {
+        "turns": ([n for k in range(5) for n in (1000 + k, 5 + k)], True),
+        "turns at the same number": ([7, 7, 8, 8, 9, 9, 10, 10], True),
+        "a few between many": ([n for k in range(4) for n in (*many[100 * k : 100 * k + 100], 3 * k, 3 * k + 1)], True),
+        "starts again": ([n for _ in range(6) for n in range(1, 41)], False),
+        "losses": ([n for n in range(1, 200) if n % 3], False),
+    }
+    for case, (numbers, turns) in cases.items():
+        heard = MatchedSubscription(world.node, "/x", "std_msgs/msg/Float64", lambda *_: None)
+        heard.publishers = 2
+        for number in numbers:
+            heard._take(b"", {"publication_sequence_number": number, "source_timestamp": 0})
+        assert heard.takes_turns() is turns, case
+        heard.destroy()
+
+
+def test_publishers_of_a_state_that_take_turns_are_named_but_not_those_of_other_names(bench: StartBench) -> None:
+    on = bench(state_timeout=2.0)
+    said = f"{STATE}: several publishers send by turns, and are taken for one; stop all but one"
+    other = on.world.publisher(JointState, STATE)
+    on.world.subscribed(other)
+
+    def send(seconds: float, *names: str) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            on.plant.send(1)
+            behind = JointState(name=names, position=[0.3] * len(names))  # by a minute
+            behind.header.stamp.sec = on.plant.t_ns // 10**9 - 60
+            other.publish(behind)
+
+    send(2.5, "wheel")
+    on.diagnostics.reaches(OK)
+    assert not on.world.status()["problems"]
+    on.world.change("deactivate")
+    on.world.change("activate")
+    count = on.diagnostics.count
+    send(6.5, "a", "b")
+    on.diagnostics.reaches(STALE, saying=said, since=count)
+    status = on.world.status()
+    assert status["problems"] == [said] and status["why"] == f"no verdict: {said}"
+    on.process.says(said)
+    on.world.node.destroy_publisher(other)
+    until(lambda: not on.world.status()["problems"], "one publisher")
+    on.plant.send(100)
+    on.diagnostics.reaches(OK)
+    assert on.world.status()["why"] == "no alarm"
+
+
+def test_a_machine_sampled_more_slowly_than_the_timeout_is_not_silent_between_two_samples(bench: StartBench) -> None:
+    model = by_hand()
+    slow = model.replace(sampling=Sampling(0.4), signals=replace(model.signals, max_gap=1.0))
+    on = bench(slow, state_timeout=0.1)
+    on.plant.send(2)
+    count = on.diagnostics.count
+    for _ in range(4):
+        on.plant.t_ns += 400_000_000 - STEP_NS
+        time.sleep(0.4)
+        on.plant.send(1)
+    said = {s.level for array in on.diagnostics.topic.messages[count + 2 :] for s in array.status}
+    assert said and bytes([STALE]) not in said
+    assert "no verdict for" not in on.process.output and "no message on" not in on.process.output
+    on.diagnostics.reaches(STALE, saying=f"no message on {STATE} for")
+
+
+def test_deactivation_ends_a_latched_alarm(bench: StartBench) -> None:
+    on = bench(latch=True)
+    on.plant.send(5)
+    on.plant.send(3, off=2.0)
+    until(lambda: on.world.status()["latched"], "the alarm")
+    assert on.world.change("deactivate")
+    status = on.world.status()
+    assert (status["alarm"], status["latched"], status["why"]) == (False, False, "inactive: no verdicts are given")
+    on.process.says(" s, as the node is no longer active")
+    assert on.world.change("activate") and on.world.change("deactivate")
+    assert on.process.output.count("the alarm is over") == 1
 
 
 def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_path: Path) -> None:

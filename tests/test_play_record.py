@@ -42,7 +42,7 @@ from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
 from processes import on_a_terminal
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
-from ros_processes import PATIENCE, World, own_domain, until
+from ros_processes import COMMANDS, PATIENCE, World, own_domain, until
 from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
@@ -229,6 +229,31 @@ def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> N
     assert bag.warnings and len(list(bag.messages(["/numbers"]))) > 1
 
 
+def test_a_publisher_of_another_type_that_joins_is_told_and_its_messages_are_left_out(world: World, tmp_path: Path):
+    numbers = world.publisher(Float64, "/numbers")
+    process = recorder(world, ["/numbers"], tmp_path / "out.mcap")
+    world.subscribed(numbers)
+    numbers.publish(Float64(data=1.0))
+    joins = "import rclpy, time; from std_msgs.msg import Float32; rclpy.init(); node = rclpy.create_node('other')"
+    world.start("other", "-c", f"{joins}; p = node.create_publisher(Float32, '/numbers', 1); time.sleep(300)")
+    process.says("note: /numbers: a publisher sends std_msgs/msg/Float32, and std_msgs/msg/Float64 is wanted\n")
+    process.signal(signal.SIGINT)
+    assert "1 messages of 1 topics" in process.succeed() and process.output.count("a publisher sends") == 1
+
+
+def test_a_disk_that_is_full_ends_recording_in_a_sentence(world: World, tmp_path: Path) -> None:
+    numbers, rng = world.publisher(JointState, "/numbers"), np.random.default_rng(0)
+    limited = f"import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (2**21, 2**21)); {COMMANDS}"
+    process = world.start("record", "-c", limited, "record", "/numbers", "--output", str(tmp_path / "out.mcap"))
+    world.subscribed(numbers)
+    while process.running:
+        numbers.publish(JointState(position=rng.normal(size=5000)))
+        time.sleep(0.005)
+    *_, sentence = process.output.splitlines()
+    assert process.wait() == 2 and "out.mcap.part: cannot be finished: File too large; what is in" in sentence
+    assert "callback" not in process.output and Bag(tmp_path / "out.mcap.part").topics["/numbers"].count
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -384,6 +409,7 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
         ([bag, "--topics", "good"], "there is no topic good (is /good meant?); topics there: /foreign, /good"),
         ([tmp_path / "none.mcap"], "none.mcap"),
         ([bag, "--lockstep", "nobody", "--wait", "0.2"], "/nobody/status: no such service after 0.2 s"),
+        ([bag, "--lockstep", "no body", "--wait", "0.2"], "'no body' is no topic name; write letters, digits"),
         ([bag, "--lockstep", "nobody", "--rate", "2"], "leave out --rate"),
     ):
         status, said = command("play", *arguments)

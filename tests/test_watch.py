@@ -104,9 +104,13 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
         assert shown.count('class="uplot') == 1 + model.n
         assert re.search(r"<title>ALARM (SILENT )?/envelope_monitor</title>", shown)
         assert re.search(r'<h1 class="bad">ALARM', shown) and not re.search(r'id="keys" hidden', shown)
+    until(lambda: drawn(address)["title"] == "ALARM SILENT /envelope_monitor", "the alarm that stands through silence")
+    world.change("deactivate")
+    until(lambda: drawn(address)["title"] == "SILENT /envelope_monitor", "the end of what the alarm is of")
     monitor.signal(2)
-    until(lambda: "Nothing has come" in (note := drawn(address)["note"]) and "; no such node" in note, "its end")
-    assert drawn(address)["title"] == "ALARM SILENT /envelope_monitor"
+    until(lambda: "; no such node" in drawn(address)["note"], "its end")
+    assert drawn(address)["note"].startswith("Nothing has come for ") and "; it said last: " in drawn(address)["note"]
+    assert drawn(address)["title"] == "SILENT /envelope_monitor"
     watch.signal(2)
     assert watch.wait() == 0
 
@@ -127,6 +131,10 @@ def test_numbers_that_come_before_the_flags_of_their_sample_are_drawn(world):
     say(flags, 2, "speed", 0.0)
     until(lambda: drawn(address)["note"].startswith("2 samples,"), "the next sample")
     np.testing.assert_array_equal(numbers(drawn(address)["top"][0]["values"]["least"]), [0.25, 0.5])
+    for k in range(9, 15):
+        say(flags, k, "speed", 0.0)
+    say(flags, 5, "speed", 0.0)  # a recording that is played again
+    until(lambda: drawn(address)["note"].startswith("1 sample,"), "what came since")
 
 
 def test_a_name_that_no_node_has_and_a_port_that_is_taken_are_refused(tmp_path, monkeypatch, capfd):

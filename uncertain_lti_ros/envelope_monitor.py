@@ -136,6 +136,12 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     # --- parameters ---
 
+    @property
+    def _timeout(self) -> float:
+        """s without a verdict that are silence."""
+        least: float = self.settings["state_timeout"]
+        return max(least, self.session.between_verdicts) if self.session else least
+
     def _make_session(self, path: str, rule: Rule) -> Session:
         return make_session(path, rule, self.settings, self.session.arming if self.session else None)
 
@@ -212,6 +218,11 @@ class EnvelopeMonitorNode(LifecycleNode):
         """The lifecycle state: unconfigured, inactive, active, finalized, or the transition that is under way."""
         return str(self._state_machine.current_state[1])
 
+    @property
+    def _idle(self) -> str:
+        """What is said while it is not active."""
+        return f"{self.state_name}: {self.reason or 'no verdicts are given'}"
+
     def start(self) -> None:
         """Configure and activate; if that fails the reason is logged and published on /diagnostics."""
         self._starts_itself = True
@@ -234,16 +245,20 @@ class EnvelopeMonitorNode(LifecycleNode):
     @_failures_noted
     def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Load and check the model, and offer the outputs."""
-        path = self.settings["model"]
+        path, fixed = self.settings["model"], True
         try:
             self.settings.requested_qos()
             self._prefix = self.settings.topic_prefix()
+            fixed = False
             self.intake.session = session = self._make_session(path, self.settings.rule({}))
+            fixed = True
             self.snapshots.open()
         except Exception as error:
             self.intake.session = None
             self.reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
-            then = "; the node starts as soon as its parameters are set right" if self._starts_itself else ""
+            then = "; start the node again with another" if fixed else ""
+            if self._starts_itself and not fixed:
+                then = "; the node starts as soon as its parameters are set right"
             self.get_logger().error(f"not configured: {self.reason}{then}")
             self.report()
             return TransitionCallbackReturn.FAILURE
@@ -275,7 +290,10 @@ class EnvelopeMonitorNode(LifecycleNode):
     @_failures_noted
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop listening; no heartbeat is published from now on."""
+        assert self.session is not None
         self._unsubscribe()
+        self.session.reset()
+        self._event_log.turned(self.session, (), time.monotonic(), ", as the node is no longer active")
         self.outputs.sender.send_reason("inactive: no verdicts are given")
         self.get_logger().info("no longer active: no verdicts are given")
         return super().on_deactivate(state)
@@ -378,6 +396,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._looked = now
         for subscription in self.inputs.values():
             subscription.look()
+        if self.session is not None:
+            self.session.know_rivals(topic for topic, s in self.inputs.items() if s.takes_turns())
         self.outputs.look()
         self._twin = self.count_publishers(f"~/{VIOLATION.name}") > 1
         self._find_enable_type()
@@ -410,7 +430,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _keep_reason(self) -> None:
         """Publish ~/reason also while nobody subscribes, for whoever will, and where nothing comes any more."""
         if self.active and self.session is not None:
-            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self.settings["state_timeout"]))
+            self.outputs.sender.send_reason(self.session.reason(time.monotonic(), self._timeout))
 
     def _keep_reporting(self) -> None:
         now = time.monotonic()
@@ -431,7 +451,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         problems = [problem for subscription in self.inputs.values() for problem in subscription.problems]
         problems += self._lasting_problems()
         publishers = {topic: subscription.publishers for topic, subscription in self.inputs.items()}
-        self._event_log.look(self.session, now, self.settings["state_timeout"], publishers, problems)
+        self._event_log.look(self.session, now, self._timeout, publishers, problems)
 
     def _log(self, level: int, line: str) -> None:
         if level == WARN:
@@ -441,7 +461,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _lasting_problems(self) -> list[str]:
         """Problems that last and concern no topic of the model."""
-        problems = [self._enable_problem] if self._enable_problem else []
+        rivals = self.session.reasons.rivals if self.session is not None else ""
+        problems = [problem for problem in (self._enable_problem, rivals) if problem]
         if self._twin:
             topic = f"{self.get_fully_qualified_name()}/{VIOLATION.name}"
             problems.append(f"another node publishes {topic} too; give one of them another name, -r __node:=NAME")
@@ -459,17 +480,15 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Publish diagnostics."""
         now = self._reported = time.monotonic()
         if self.session is not None and self.active:
-            reports = self.session.report(now, self.settings["state_timeout"], self._problems())
+            reports = self.session.report(now, self._timeout, self._problems())
             extra = input_values(self.inputs) | self.snapshots.values
             extra |= {"unexpected errors": str(self.failures.count), "held back": str(self.outputs.sender.held_back)}
             reports[0] = replace(reports[0], values={**reports[0].values, **extra})
         else:
-            state = self.state_name
-            message = f"{state}: {self.reason or 'no verdicts are given'}"
             level = ERROR if self.reason else STALE
-            reports = [Report(level, "monitor", message, {"unexpected errors": str(self.failures.count)})]
+            reports = [Report(level, "monitor", self._idle, {"unexpected errors": str(self.failures.count)})]
             if self.session is not None:
-                reports += [Report(STALE, name, message, {}) for name in self.session.model.state_names]
+                reports += [Report(STALE, name, self._idle, {}) for name in self.session.model.state_names]
         self._mark_reported()
         self._diagnostics.publish(reports, self.clock.now().to_msg(), self.settings["model"])
 
@@ -512,8 +531,8 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _on_status(self) -> tuple[bool, str]:
         """Whether verdicts are given, and counters as JSON."""
-        session = self.session
-        return self.active, json.dumps(
+        session, active, now = self.session, self.active, time.monotonic()
+        return active, json.dumps(
             {
                 "state": self.state_name,
                 "reason": self.reason,
@@ -526,7 +545,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "verdicts": session.verdicts if session else 0,
                 "violations": dict(zip(session.model.state_names, session.violations, strict=True)) if session else {},
                 "alarm": session.alarm if session else False,
-                "why": session.reason(time.monotonic(), self.settings["state_timeout"]) if session else "",
+                "why": session.reason(now, self._timeout) if session and active else self._idle,
                 "looks_like": like.words if session and (like := session.explainer.likeness()) else "",
                 "latched": session.latched if session else False,
                 "armed": session.arming.on if session else None,

@@ -11,6 +11,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import traceback
 from importlib import import_module
@@ -18,7 +20,7 @@ from importlib import import_module
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti_ros import hold_middleware
 
-_BAD_USAGE, _FAULT, _INTERRUPTED = 2, 70, 130
+_BAD_USAGE, _FAULT = 2, 70
 
 
 def envelope_monitor() -> int:
@@ -38,6 +40,8 @@ def turbofan() -> int:
 
 def _run(module: str, function: str) -> int:
     name = module if function == "main" else function
+    for number in (signal.SIGINT, signal.SIGTERM):  # until `living` takes them over, a second later
+        signal.signal(number, lambda *_: os._exit(0))
     try:
         hold_middleware()
         main = getattr(import_module(f"uncertain_lti_ros.{module}"), function)
@@ -51,8 +55,6 @@ def _run(module: str, function: str) -> int:
         remedy = "source a ROS 2 Jazzy installation, or in the checkout: pip install '.[ros]'"
         print(f"{name}: {what}; {remedy}", file=sys.stderr)
         return _BAD_USAGE
-    except KeyboardInterrupt:
-        return _INTERRUPTED
     except Exception:
         return _fault(name)
     try:

@@ -90,7 +90,7 @@ PARAMETERS = (
     ),
     Declared(
         "state_timeout", 1.0,
-        "Without a verdict for this long, s of wall time, states are reported STALE.",
+        "Without a verdict for this long, s of wall time, and for two steps, states are reported STALE.",
         low=0.01, high=86400.0,
     ),
     Declared(

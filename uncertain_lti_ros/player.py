@@ -39,6 +39,7 @@ from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import TypeFields
 from uncertain_lti_ros.process import Life, living, seconds, speed
+from uncertain_lti_ros.recorder import resolved_name
 from uncertain_lti_ros.topics import live_fields, message_class
 
 CLOCK = "/clock"
@@ -273,7 +274,7 @@ def _lockstep(
     life: Life, played: dict[str, _Played], clock: Publisher | None, node: str, messages: Iterator[RawMessage],
     wait: float,
 ) -> None:  # fmt: skip
-    follower = _Follower(life, f"{node if node.startswith('/') else '/' + node}/status", wait)
+    follower = _Follower(life, f"{resolved_name(life.node, node)}/status", wait)
     if clock is not None and not follower.status.get("use_sim_time", True):
         remedy = "start it with -p use_sim_time:=true, or leave out --clock"
         raise UncertainLTIError(f"{node}: does not follow /clock; {remedy}")

@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> Result:
             )
             stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
             with stage as step:
-                _record(life, subscriptions, file, args.duration, step)
+                _record(life, subscriptions, file, args.duration, step, args.progress.note)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
@@ -122,11 +122,12 @@ def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSu
 
 def _record(
     life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None,
-    step: Callable[[str], None],
+    step: Callable[[str], None], note: Callable[..., None],
 ) -> None:  # fmt: skip
     def look() -> None:
         for subscription in subscriptions:
             subscription.look()
+            note(*subscription.problems)
 
     def poll() -> None:
         for subscription in subscriptions:
@@ -135,6 +136,7 @@ def _record(
             look()
 
     def over() -> bool:
+        file.hold()
         step(f"{file.count} messages, {file.span:.1f} s")
         return duration is not None and file.began is not None and time.monotonic() - file.began >= duration
 
@@ -153,6 +155,7 @@ class _File:
         self.counts: dict[str, int] = {}
         self.began: float | None = None
         self._first = self._last = 0
+        self._full: BagError | None = None
 
     def __enter__(self) -> _File:
         for path in (self.path, self._part):
@@ -205,10 +208,17 @@ class _File:
         self._to_disk(self._writer.flush)
 
     def _to_disk(self, write: Callable[..., None], *arguments: Any) -> None:
+        """Write, unless an error was met: rclpy prints what is raised in a callback, so `hold` raises it elsewhere."""
         try:
-            write(*arguments)
+            if self._full is None:
+                write(*arguments)
         except OSError as error:
-            raise BagError(f"{self._part}: cannot be written: {error.strerror}; make room") from None
+            self._full = BagError(f"{self._part}: cannot be written: {error.strerror}; make room")
+
+    def hold(self) -> None:
+        """Raise BagError where something could not be written."""
+        if self._full is not None:
+            raise self._full
 
 
 _QOS = (

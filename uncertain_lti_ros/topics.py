@@ -20,6 +20,7 @@ import importlib
 import math
 import re
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -264,6 +265,8 @@ class MatchedSubscription:
         self._reported_lost = self._skipped = 0  # as the middleware has it, and by the numbers of the messages
         self._number: int | None = None  # of the last message
         self._alone = False  # one publisher sends all messages since that one
+        self._left = math.inf  # number of the last message of the publisher before the one that sends now
+        self._turns = deque[float](maxlen=3)  # when that publisher went on
         self.problems: list[str] = []
         self.look_soon = False
         self.published = math.inf  # since when there are publishers, steady time in s
@@ -281,7 +284,7 @@ class MatchedSubscription:
         infos = self._node.get_publishers_info_by_topic(self._asked_topic)
         offers = [i.qos_profile for i in infos if i.topic_type == self.type_name]
         self.publishers = len(offers)
-        if not self._alone:
+        if len(offers) == 1 and not self._alone:
             self._number = None
         self._alone = len(offers) == 1
         self.published = min(self.published, time.monotonic()) if offers else math.inf
@@ -297,6 +300,13 @@ class MatchedSubscription:
         others = {info.topic_type for info in infos} - {self.type_name}
         why |= {f"sends {other}, and {self.type_name} is wanted" for other in others}
         self.problems = [f"{self.topic}: a publisher {what}" for what in sorted(why)]
+
+    def takes_turns(self) -> bool:
+        """Whether messages of several publishers come by turns, at the usual pace of these turns."""
+        if self.publishers < 2 or len(self._turns) < 3:
+            return False
+        first, *_, last = self._turns
+        return time.monotonic() - last <= last - first + 1.0
 
     def destroy(self) -> None:
         """Stop receiving."""
@@ -333,6 +343,12 @@ class MatchedSubscription:
                 self._alone = False
             elif self._alone:
                 self._skipped += number - before - 1
+            if number != before + 1:
+                goes_on = self._left < number and (number <= before or self._left > before)
+                if goes_on:
+                    self._turns.append(time.monotonic())
+                if goes_on or number <= before:
+                    self._left = before
         self._number = number
         self._callback(message, info["source_timestamp"])
 

@@ -45,6 +45,7 @@ from uncertain_lti_ros.topics import stamp_ns
 _EVERY = 1000  # ms between two looks of the page
 _MOST = 100_000  # samples kept
 _SILENT = 2.0  # s without a message from which on the page says so
+_PASS = 10**9  # ns that stamps step back at least where a recording is played again
 _BEHIND = 200  # samples back at most to that of which a number is
 
 
@@ -135,14 +136,17 @@ class Watched:
             said, heard, reason = self._said, self._heard, self._reason
             statistic_names, (t_ns, *rows) = said.statistic_names, said.rows()
         shown = t_ns > t_ns[-1:] - self._window * 1e9
+        shown[: max(np.flatnonzero(np.diff(t_ns) < -_PASS), default=-1) + 1] = False  # of the pass before, in a loop
         alarm, flags, utilisation, statistics = (row[shown] for row in rows)
         t = (t_ns[shown] - t_ns[-1:]) * 1e-9
-        quiet, raised = time.monotonic() - heard, bool(alarm[-1:].any())
-        silent, gone = quiet > _SILENT, ""
+        quiet, gone = time.monotonic() - heard, ""
+        silent = quiet > max(_SILENT, 3.0 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0)
         if silent and not self._node.count_publishers(f"{self.name}/flags"):
             gone = f"; no such node is in ROS domain {os.environ.get('ROS_DOMAIN_ID', '0')}"
+        raised = bool(alarm[-1:].any()) and not gone and not reason.startswith("inactive")  # and nobody takes it back
         if len(t):
-            note = f"{plural(len(t), 'sample')}, 0 s is the newest" + (f"; {reason}." if reason else ".")
+            said_last = f"; it said last: {reason}." if gone else f"; {reason}."
+            note = f"{plural(len(t), 'sample')}, 0 s is the newest" + (said_last if reason else ".")
             note = f"Nothing has come for {quiet:.0f} s{gone}. {note}" if silent else note
         else:
             note = f"Waiting for {self.name}: nothing is heard on {self.name}/flags{gone}."

@@ -38,6 +38,8 @@ WHY = {
     Status.UNASKED: "outside the time asked for",
 }
 """Why a sample has no verdict, whatever the model."""
+TOO_LARGE = "a value is so large that its bounds are not finite"
+"""Why there is none where every signal is there."""
 QUIET = "no alarm"
 """What is said of a verdict without an alarm."""
 
@@ -57,11 +59,13 @@ class Reasons:
     its bounds may change with every sample.
 
     `model`: names the signals; `rules`: of the alarm; `words`: of each rule, by what it is called; `text`: on the last
-    sample; `by`: what holds the alarm, or held it last: rules, horizons and states; empty before any.
+    sample; `by`: what holds the alarm, or held it last: rules, horizons and states; empty before any;
+    `rivals`: what is said of publishers that are taken for one; empty if there are none.
     """
 
     def __init__(self, model: UncertainLTI, rules: Sequence[Rule]) -> None:
         self._model = model
+        self.rivals = ""
         self.words = {label: rule.words for label, rule in zip(labels(rules), rules, strict=True)}
         self.reset()
 
@@ -89,13 +93,15 @@ class Reasons:
         self.by = self._held or self.by
         said = [f"alarm: {self._held}" if self._held else "alarm"] if alarm else []
         if not judged:
-            said.append(f"no verdict: {self._why(verdict)}")
+            said.append(f"no verdict: {self.rivals or self._why(verdict)}")
         elif not alarm:
             said.append(QUIET)
         if judged and verdict.withheld:
             said.append(f"no verdict on {', '.join(names[i] for i in verdict.withheld)}")
         if judged and verdict.unknown_regime:
             said.append("a regime that was not fitted")
+        if judged and self.rivals:
+            said.append(self.rivals)
         self.text = "; ".join(said)
         return self.text
 
@@ -120,8 +126,8 @@ class Reasons:
         if status is Status.MISSING:
             of = [*(signal.name for signal in self._model.signals), *self._model.state_names]
             values = zip(of, [*verdict.before, *verdict.numbers("state")], strict=True)
-            if lacking := dict.fromkeys(name for name, value in values if value != value):
-                return f"{', '.join(lacking)} missing, stale, not valid or not finite"
+            lacking = dict.fromkeys(name for name, value in values if not math.isfinite(value))
+            return f"{', '.join(lacking)} missing, stale, not valid or not finite" if lacking else TOO_LARGE
         return why_not(status, self._model)
 
 

@@ -28,7 +28,7 @@ from uncertain_lti.monitor.deployed import Days, conditions_in_words
 from uncertain_lti.monitor.deployed import Rule as Rule
 from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.outputs import JUDGED
-from uncertain_lti.monitor.reason import why_not
+from uncertain_lti.monitor.reason import TOO_LARGE, why_not
 from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
 from uncertain_lti.monitor.stream import topic_types as topic_types
 from uncertain_lti.monitor.verdict import Verdict
@@ -93,7 +93,8 @@ class Session(Stream):
                 if status is Status.MODE and period.last_unlisted is not None:
                     why = self.model.why_unlisted(period.last_unlisted.before)
                 if status is Status.MISSING:
-                    why += f" ({shortlist([signal.name for signal in lacking], SHOWN)})"
+                    names = shortlist([signal.name for signal in lacking], SHOWN)
+                    why = f"{why} ({names})" if names else TOO_LARGE
                 complaints.append(f"{count} samples without a verdict: {why}")
         complaints += self.absent(lacking)
         complaints += self.ceased(now, timeout).values()
@@ -332,7 +333,7 @@ class EventLog:
         self._alarm = self._named = session.alarm  # the latter: whether the start of this alarm was logged
         self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
         self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
-        self._ceased, self._judged = now, False
+        self._lasted, self._judged = 0.0, False
         self._cause = ("", now)  # why there are no verdicts, and since when
         self._matters = defaultdict[str, _Matter](_Matter, arming=_Matter(True))
 
@@ -392,7 +393,11 @@ class EventLog:
         known, clock, lags = self._matters["problems"].logged or (), session.sampler.clock, session.lags
         condition = session.arming.condition or "there is no condition any more"
         lag = [f"stamps on {topic} lag those on {clock} by {s:.3g} s, more than a step" for topic, s in lags.items()]
+        resets = session.sampler.counters["resets"]
+        if session.reasons.rivals:  # then it is their stamps that step back
+            self._matters["resets"].logged = resets
         for name, value, lines in (
+            ("resets", resets, [f"time steps back on {clock}: a new segment begins"] * bool(resets)),
             ("problems", tuple(problems) or None, [problem for problem in problems if problem not in known][:SHOWN]),
             ("arming", session.arming.on, [session.arming.why_off() or f"alarms count from now on: {condition}"]),
             ("drift", session.days.words, session.days.words),
@@ -429,12 +434,12 @@ class EventLog:
             if matter.becomes("", now):
                 masked = f"; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else ""
                 first = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}{masked}"
-                again = f"judging again, after {now - without - self._ceased:.1f} s without a verdict"
+                again = f"judging again, after {self._lasted:.1f} s without a verdict"
                 self._log(OK, again if self._judged else first)
                 self._judged = True
             self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
-            self._ceased = now - without
         elif without > timeout:
+            self._lasted = without
             why = self._why(session, now, timeout) or matter.logged or "no two samples have come one after the other"
             if why != self._cause[0]:
                 self._cause = (why, now)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from array import array
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from statistics import median
 from typing import Any
@@ -175,6 +175,7 @@ class Stream:
         self.unreadable: Counter[str] = Counter()
         self.why_unreadable: dict[str, str] = {}
         self.future: Counter[str] = Counter()
+        self._strange: set[str] = set()  # topics with messages that name no signal
         self.received: dict[str, int] = {}  # setting an item of a Counter is slow
         self.verdicts = self.alarms = 0
         self.violations = [0] * self.model.n
@@ -182,6 +183,7 @@ class Stream:
         self._heard: dict[str, float] = {}
         self._began, self._judged, self._came = now, -math.inf, now
         self._behind: dict[str, deque[float]] = {}
+        self._looked = 0, -math.inf  # the newest stamp at the last look, and when its message came
         awaited = [self.sampler.clock, *self._stamped]
         self._catches_up = CatchUp(awaited, self._window, start=True) if math.isfinite(self._stall) else None
         self.reordered, self.caught_up = 0, ""
@@ -307,12 +309,18 @@ class Stream:
         return {topic: lag for topic, lag in lags.items() if lag > step}
 
     def _look_at_lags(self) -> None:
+        """Compare stamps; how fast they go by the steady clock, as where a recording is played, the last look tells."""
         latest, clock = self.sampler.latest(), self._heard.get(self.sampler.clock, 0.0)
+        if latest is None or clock <= self._looked[1]:
+            return
+        pace, self._looked = (latest[0] - self._looked[0]) / (clock - self._looked[1]), (latest[0], clock)
+        if pace <= 0.0:  # the first look, or time has stepped back
+            return
         for topic in self._stamped:
             kept = self.sampler.kept(topic)
-            if latest is not None and kept and kept[-1][0]:
+            if kept and kept[-1][0]:
                 behind = self._behind.setdefault(topic, deque(maxlen=_MOST_LOOKS))
-                behind.append((latest[0] - kept[-1][0]) * 1e-9 + self._heard[topic] - clock)
+                behind.append((latest[0] - kept[-1][0] + pace * (self._heard[topic] - clock)) * 1e-9)
 
     def accept(
         self, topic: str, arrival_ns: int, data: bytes, now: float, sent_ns: int = 0, late: float = 0.0
@@ -412,9 +420,17 @@ class Stream:
         if not self.arming.on:
             self.monitor.reset()
 
+    def know_rivals(self, topics: Iterable[str]) -> None:
+        """Have messages of several publishers on these topics come by turns; those of states should be of one."""
+        clock, strange = self.sampler.clock, self._strange
+        rivals = [t for t in topics if t in self.received and t not in strange and (t == clock or not self.held(t))]
+        said = "several publishers send by turns, and are taken for one; stop all but one"
+        self.reasons.rivals = f"{', '.join(rivals)}: {said}" if rivals else ""
+
     @cython.cfunc
     def _pass_over(self, topic: str, heard: cython.double) -> None:
         """A message of another publisher, which names no signal of the model: as in a recording it does not count."""
+        self._strange.add(topic)
         if self.verdicts and heard == heard:
             self._heard[topic] = heard
         else:  # there may be nobody who names them
@@ -437,7 +453,8 @@ class Stream:
             period.verdicts += 1
             if not verdict.withheld:
                 verdict.reach(period.largest)
-        if verdict.ordinary and not self.latched and self.reasons.text == QUIET:
+        reasons = self.reasons
+        if verdict.ordinary and not self.latched and reasons.text == QUIET and not reasons.rivals:
             self._quiet += 1
             return
         if verdict.status is not _OK:
@@ -452,7 +469,7 @@ class Stream:
         period.frozen.update({moved.state: moved for moved in verdict.frozen})
         period.repeating.update({moved.state: moved for moved in verdict.repeating})
         alarm: cython.bint = verdict.alarm or self.latched
-        self.reasons.take(verdict, alarm)
+        reasons.take(verdict, alarm)
         if alarm:
             period.alarm = True
             self.alarms += not alarm_before
@@ -524,6 +541,12 @@ class Stream:
     def without_verdict(self, now: float) -> float:
         """Time since the last verdict, or since the start."""
         return now - max(self._judged, self._began)
+
+    @property
+    def between_verdicts(self) -> float:
+        """Time from one to the next at most, s: a longer step has none."""
+        sampling = self.model.sampling
+        return 2.0 * (sampling.dt_max or sampling.dt_median or 0.0)
 
     def silent_for(self, now: float) -> float:
         """Time since the last message of the clock topic."""
