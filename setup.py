@@ -144,7 +144,7 @@ setup(
     extras_require=extras,
     entry_points={
         "console_scripts": [
-            "uncertain-lti = uncertain_lti.cli.program:main",
+            "uncertain-lti = uncertain_lti.cli:begin",
             "envelope_monitor = uncertain_lti_ros.nodes:envelope_monitor",
             "plant = uncertain_lti_ros.nodes:plant",
             "turbofan = uncertain_lti_ros.nodes:turbofan",

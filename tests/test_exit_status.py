@@ -70,15 +70,15 @@ def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package
 
 @pytest.mark.parametrize(("module", "status"), [("uncertain_lti.cli.judge", 70), ("argparse", 70), ("nothing", 0)])
 def test_a_damaged_installation_is_no_alarm(module, status):
-    broken = f"import sys; from uncertain_lti.cli.program import main; sys.modules[{module!r}] = None; sys.exit(main())"
+    broken = f"import sys; from uncertain_lti.cli import begin; sys.modules[{module!r}] = None; sys.exit(begin())"
     done = run(["--help"], [sys.executable, "-c", broken], capture_output=True)
     assert done.returncode == status and ("the installation is damaged" in done.stderr) == (status == 70)
-    assert "uncertain-lti = uncertain_lti.cli.program:main" in (ROOT / "setup.py").read_text()
+    assert "uncertain-lti = uncertain_lti.cli:begin" in (ROOT / "setup.py").read_text()
 
 
 def test_an_interrupt_before_there_is_a_program_is_said():
     first = (
-        "import builtins, sys; from uncertain_lti.cli.program import main; real = builtins.__import__\n"
+        "import builtins, sys; from uncertain_lti.cli import begin as main; real = builtins.__import__\n"
         "def interrupted(name, *rest):\n"
         "    if name == 'uncertain_lti.base.errors': raise KeyboardInterrupt\n"
         "    return real(name, *rest)\n"

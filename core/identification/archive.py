@@ -25,7 +25,6 @@ from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.assembly import assemble, is_constant
-from uncertain_lti.identification.diagnosis import check_solvable
 from uncertain_lti.identification.fitting import contradiction_named, fit_fleet, structure_of, with_repeats
 from uncertain_lti.identification.fleet import DaskFleet, Fleet
 from uncertain_lti.identification.problem import Columns, DiskPartition, Problem, Regimes
@@ -205,7 +204,7 @@ def fit_archive(
         which = int(np.searchsorted(starts, index, side="right")) - 1
         return f"transition {index - starts[which]} of {named[which][0]}"
 
-    check_solvable(fleet, where, [s.name for s in signals.states])
+    fleet.check_solvable(where, [s.name for s in signals.states])
     with contradiction_named(where, signals):
         model = fit_fleet(
             fleet,

@@ -12,14 +12,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
@@ -35,7 +34,6 @@ from uncertain_lti.identification.evidence import (
     successive,
     unexplained,
 )
-from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import recorded
@@ -81,26 +79,6 @@ _REMEDIES = (  # words of a message on the state, or on any signal; what narrows
     ("moves too little", False, "record the controls moving more"),
     ("not identifiable", False, "record the controls moving more"),
 )
-
-
-def check_solvable(fleet: Fleet, where: Callable[[int], str], names: Sequence[str]) -> None:
-    """Refuse data to which no envelope can be fitted; `where`: what a transition is called."""
-    unknowns = fleet.columns.unknowns(fleet.p)
-    if fleet.N < unknowns:
-        raise FitError(
-            f"{plural(fleet.N, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
-            f"half-widths); record at least {unknowns}, better a hundred times as many, or use fewer signals"
-        )
-    if fleet.columns.half:
-        return
-    count, first, state, step = fleet.moving_from_rest()
-    if count:
-        also = f" (so {'does' if count == 2 else 'do'} {plural(count - 1, 'other sample')})" if count > 1 else ""
-        raise FitError(
-            f"{where(first)} begins at rest, x = u = 0, and '{names[state]}' moves by {step:.3g} in it, which no "
-            f"interval matrices can contain{also}; use an additive term: --additive noise for measurement noise, "
-            f"--additive disturbance for unmodelled inputs"
-        )
 
 
 def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:

@@ -25,7 +25,7 @@ from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_c
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification.assembly import assemble, median_step
-from uncertain_lti.identification.diagnosis import check_solvable, describe
+from uncertain_lti.identification.diagnosis import describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
@@ -132,7 +132,7 @@ def fit(
         of, k = transients[problem.source[index]], int(problem.k[index])
         return f"the step from sample {k} of {of.name} (t = {of.t[k]:.6g} s)"
 
-    check_solvable(Fleet([problem]), where, [s.name for s in signals.states])
+    Fleet([problem]).check_solvable(where, [s.name for s in signals.states])
 
     discarded: list[dict[str, Any]] = []
     if budget := _budget(discard, problem.N):

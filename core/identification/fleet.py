@@ -20,6 +20,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import LARGEST, Array, core_count
 from uncertain_lti.base.errors import FitError, UncertainLTIError
+from uncertain_lti.base.text import plural
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.passes import Candidate, Envelope, Judged, Moments, Samples
 from uncertain_lti.identification.problem import Columns, Partition, Problem
@@ -124,6 +125,25 @@ class Fleet:
             return found
         pairs = self.map(passes.in_a_row, self._same(min(1.0, _TAKEN / self.N)))
         return found.beside(law_of(np.sum([total for total, _ in pairs], axis=0), sum(n for _, n in pairs), self.n))
+
+    def check_solvable(self, where: Callable[[int], str], names: Sequence[str]) -> None:
+        """Refuse data to which no envelope can be fitted; `where`: what a transition is called."""
+        unknowns = self.columns.unknowns(self.p)
+        if self.N < unknowns:
+            raise FitError(
+                f"{plural(self.N, 'usable transition')} for {unknowns} unknowns per row (nominal elements and "
+                f"half-widths); record at least {unknowns}, better a hundred times as many, or use fewer signals"
+            )
+        if self.columns.half:
+            return
+        count, first, state, step = self.moving_from_rest()
+        if count:
+            also = f" (so {'does' if count == 2 else 'do'} {plural(count - 1, 'other sample')})" if count > 1 else ""
+            raise FitError(
+                f"{where(first)} begins at rest, x = u = 0, and '{names[state]}' moves by {step:.3g} in it, which no "
+                f"interval matrices can contain{also}; use an additive term: --additive noise for measurement noise, "
+                f"--additive disturbance for unmodelled inputs"
+            )
 
     def moving_from_rest(self) -> tuple[int, int, int, float]:
         """Samples with x = u = 0 and a successor that is not 0; see `passes.moving_from_rest`."""

@@ -13,10 +13,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
@@ -26,6 +25,7 @@ from uncertain_lti.identification.solvers import (
     MANY,
     VERY_MANY,
     Answer,
+    Face,
     Programme,
     Sense,
     Simplex,
@@ -65,22 +65,7 @@ _POSITIVE = 1e-9
 _HELD = 12
 """Rows per unknown that the simplex method keeps from one working set to the next; its steps take longer with more."""
 GOOD = 1e-7
-"""Relative distance from the optimum, what the repair will add included, above which a row is solved once more, in
-coordinates of its residual."""
-
-
-@dataclass(frozen=True)
-class Face:
-    """Where the optima of (11) are: what is met with equality in all of them, and one of them.
-
-    `xi` (r + q,): that one; `bounds` (r + q,): which bounds of ξ; `samples` (3, K): which rows of the first K samples
-    of the pool, as of `Programmes.rows`; `asked`: which rows of what the structure asks.
-    """
-
-    xi: Array
-    bounds: NDArray[np.bool_]
-    samples: NDArray[np.bool_]
-    asked: NDArray[np.bool_]
+"""Relative distance from the optimum, repair included, above which a row is solved again, in refined coordinates."""
 
 
 class Programmes:

@@ -49,6 +49,20 @@ _INDEPENDENT = 1e-10
 
 
 @dataclass(frozen=True)
+class Face:
+    """Where the optima of (11) are: what is met with equality in all of them, and one of them.
+
+    `xi` (r + q,): that one; `bounds` (r + q,): which bounds of ξ; `samples` (3, K): which rows of the first K samples
+    of the pool, as of `Programmes.rows`; `asked`: which rows of what the structure asks.
+    """
+
+    xi: Array
+    bounds: NDArray[np.bool_]
+    samples: NDArray[np.bool_]
+    asked: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
 class Answer:
     """Minimiser ξ of a programme.
 

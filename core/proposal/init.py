@@ -57,7 +57,8 @@ from uncertain_lti.proposal.signals_file import (
 from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
-from uncertain_lti.recordings.table import TYPE, Table, called_time
+from uncertain_lti.recordings.table import TYPE, Table
+from uncertain_lti.recordings.table_times import called_time
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory

@@ -1,0 +1,411 @@
+# Copyright 2026 uncertain-lti maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License"); you may not use this file except in compliance with
+# the License. You may obtain a copy of the License at http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software distributed under the License is distributed on an
+# "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
+# specific language governing permissions and limitations under the License.
+
+"""Times of tables: which column has them, in which unit and form, as integer nanoseconds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from decimal import Decimal, InvalidOperation
+
+import numpy as np
+from numpy.typing import NDArray
+
+from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import meant, shortlist
+from uncertain_lti.recordings.mcap_records import LATEST
+from uncertain_lti.recordings.table_files import ODD_SHARE, YEARS, Column, RawTable, left_out
+from uncertain_lti.signals.values import UNITS, TableLayout
+
+NO_TIME = -(2**63)
+"""Instant of a row without one."""
+
+_NAMES = (
+    r"(__|%)?time(_?stamp)?", r"t", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
+    r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
+    r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
+)  # fmt: skip
+_UNIT = {
+    "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
+    "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?",
+}  # fmt: skip
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
+_DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
+_CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
+_DOTTED = re.compile(r"([01]?\d|2[0-3])\.([0-5]\d)\.([0-5]\d)")  # 18.00.00
+_MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)")  # as Excel writes times with decimals
+_HALF = re.compile(r"(|.*[T\s])(\d{1,2})(?:[:.](\d\d))?(?:[:.](\d\d(?:[.,:]\d+)?))?\s*([AaPp])\.?\s?[Mm]\.?")  # 1:05 PM
+_NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
+    re.compile(
+        r"(?:[A-Z][a-z]+,?\s+)?(?P<d>\d{1,2})[-\s/](?P<m>[A-Za-z]{3})[a-z]*\.?[-\s/,]+(?P<y>\d{4}|\d\d)\b(?P<t>.*)"
+    ),
+    re.compile(r"(?:[A-Z][a-z]+,?\s+)?(?P<m>[A-Za-z]{3})[a-z]*\.?\s+(?P<d>\d{1,2}),?\s+(?P<y>\d{4})\b(?P<t>.*)"),
+    re.compile(r"(?:[A-Z][a-z]+\s+)?(?P<m>[A-Z][a-z]{2})\s+(?P<d>\d{1,2})(?P<t>\s[\d:.]+)\s(?P<y>\d{4})"),
+)
+_MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
+_YEAR_FIRST = re.compile(r"(\d{4})([-/.])(\d{1,2})\2(\d{1,2})(?:[T,\s]+(\d{1,2}))?((?::\d\d)*)(.*)")
+_DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
+_COMPACT = re.compile(r"((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
+_EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
+_LARGEST_ZONE = 14  # hours
+_LARGE = 10**15  # ns, above which a float of seconds does not keep each
+
+
+def field_name(column: str) -> str:
+    """Name of a column as a field path takes it: `Speed [rpm]` is `Speed_rpm`."""
+    name = re.sub(r"\W+", "_", column).strip("_") or "column"
+    return name if re.match(r"[A-Za-z_]", name) else f"c_{name}"
+
+
+def find_column(path: object, wanted: str, columns: Sequence[str], what: str) -> str:
+    """Find a column by its name in the file or as a field."""
+    for name in columns:
+        if wanted in (name, field_name(name)):
+            return name
+    near, there = meant(wanted, columns), shortlist(list(columns), 50)
+    none = f"there is no column '{wanted}', which the signals file names for {what}{near}"
+    raise BagError(f"{path}: {none}; columns there: {there}")
+
+
+def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, NDArray[np.int64], str]:
+    """Column of the time, instants of the rows, and what was taken for granted.
+
+    Returns (rows,): ns; `NO_TIME` where a row has none.
+    """
+    if layout.time is not None:
+        column, words = find_column(path, layout.time, list(table.columns), "the time"), ""
+    else:
+        column, words = _likely(path, table)
+    said = [words]
+    values = table.columns[column]
+    where = f"{path}: column '{column}'"
+    if values.ndim != 1:
+        raise BagError(f"{where}: has several numbers a row, so it is no time; name another, `table: {{time: COLUMN}}`")
+    if values.dtype.kind == "M":
+        times = values.astype("datetime64[ns]").astype(np.int64)
+    elif values.dtype.kind == "O":
+        cells = _with_colons(values.tolist())
+        if layout.time is None and (days := _days_beside(table, column)):
+            cells = [f"{day} {cell}".strip() for day, cell in zip(table.columns[days].tolist(), cells, strict=True)]
+            said.append(f"its days are those of column '{days}'")
+        times, order = _of_text(where, cells)
+        said.append(order)
+    elif layout.unit is None and _compact(values):
+        times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
+    else:
+        stated = layout.unit or _unit(column, values, table.units.get(column, ""))
+        doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
+        if unit == "s" and _coarse(values):
+            doubt = ", a long way from row to row: for others name it time_us or time_ms, or give `table: {unit: us}`"
+        if layout.unit is None and (unit != "s" or doubt):
+            said.append(f"its numbers are taken for {unit}{doubt}")
+        times = _of_numbers(where, table, column, UNITS[unit])
+    words = " and ".join(filter(None, said))
+    return column, times, f"column '{column}': {words}" if words else ""
+
+
+def _likely(path: object, table: RawTable) -> tuple[str, str]:
+    """The column that is a time by its name, or by what is in it."""
+    names = list(table.columns)
+    plain = [name for name in names if table.columns[name].ndim == 1]
+    called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
+    still = [name for name in called if _stands_still(table.columns[name])]
+    called = [name for name in called if name not in still]
+    if likely := [name for name in called if may_be(table.columns[name])] or called:
+        words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
+        return called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0], ""
+    dated = [name for name in names if table.columns[name].dtype.kind in "MO" and may_be(table.columns[name])]
+    if len(dated) == 1:
+        return dated[0], ""
+    first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
+    for name in [*(n for n in names if re.fullmatch(r"\w+_time", _bare(n))), *first]:
+        if _grows(table.columns[name]):
+            return name, "it is taken for the time, as it grows from row to row"
+    none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
+    texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
+    if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
+        none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
+    raise BagError(
+        f"{path}: {none} is called time or looks like it; rename the one that is, or name it in a signals file, "
+        f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
+        f"{shortlist(names, 50)}"
+    )
+
+
+def _bare(name: str) -> str:
+    """Name of a column without its unit, as `_NAMES` has it."""
+    low = re.sub(r"[\s/]+", "_", re.sub(r"[\[(].*", "", name).strip(" /").lower())
+    return re.sub(rf"(_|(?<=time))({'|'.join(_UNIT.values())})$", "", low)
+
+
+def called_time(name: str) -> bool:
+    """Whether a column is a time by its name."""
+    return any(re.fullmatch(pattern, _bare(name)) for pattern in _NAMES)
+
+
+def _grows(column: Column) -> bool:
+    """Whether numbers grow from each row to the next, or nearly so and are times since 1970."""
+    if column.ndim != 1 or column.dtype.kind not in "iuf" or len(column) < 3:
+        return False
+    size = float(np.median(column))
+    since = any(0.9 < size / 10**digits < 4.1 for digits in (9, 12, 15, 18))  # from 1998 to 2099, s to ns
+    return bool((column[1:] > column[:-1]).all()) or (since and goes_forward(column))
+
+
+def _days_beside(table: RawTable, column: str) -> str:
+    """The one column of days alone, where this one has times of day alone; else nothing."""
+    texts = [(name, cells.tolist()) for name, cells in table.columns.items() if cells.dtype.kind == "O"]
+    first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts}
+    days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
+    return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
+
+
+def _stands_still(column: Column) -> bool:
+    return column.dtype.kind in "iuf" and len(column) > 2 and bool((column == column[0]).all())
+
+
+def may_be(column: Column) -> bool:
+    """Numbers, instants, or text that reads as one."""
+    text = _spelt(next((str(cell) for cell in column if cell), "")) if column.dtype.kind == "O" else ""
+    return column.dtype.kind != "O" or bool(_ISO.match(text) or _CLOCK.match(text) or _DAY.fullmatch(text))
+
+
+def goes_forward(column: Column) -> bool:
+    """Whether it may be a time beside another that cannot be read: a temperature is none."""
+    return column.dtype.kind not in "iuf" or bool(abs(np.mean(np.sign(np.diff(column)))) > 0.8)
+
+
+def _with_colons(cells: Sequence[object]) -> Sequence[object]:
+    """Times of day such as 18.00.00, and minutes and seconds such as 14:11.6, as others are written."""
+    texts = [str(cell).strip() for cell in cells]
+    if any(map(_dotted, texts)):
+        return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
+    if sum(map(bool, map(_MINUTES.fullmatch, texts))) < (1 - ODD_SHARE) * sum(map(bool, texts)):
+        return cells
+    minutes = {
+        row: int(text.partition(":")[0])
+        for row, text in enumerate(texts)
+        if re.fullmatch(r"\d\d?:[0-5]\d([.,]\d+)?", text)
+    }
+    hours = np.cumsum(np.diff([*minutes.values()], prepend=[*minutes.values()][:1]) < -30).tolist()
+    for row, hour in zip(minutes, hours, strict=True):
+        texts[row] = f"{hour}:{texts[row]}"
+    return texts
+
+
+def _dotted(text: str) -> bool:
+    """Whether it is a time of day with points, and no date."""
+    match = _DOTTED.fullmatch(text)
+    low, high = sorted((int(match[1]), int(match[2]))) if match else (1, 1)
+    return not (1 <= low <= 12 and high <= 31)
+
+
+def _spelt(text: str) -> str:
+    """An instant as people and controllers write it, such as 13-Mar-24 1:05:03 PM, as ISO does; else as it is."""
+    text = text.strip()
+    if _MINUTES.fullmatch(text):
+        return f"0:{text}"
+    if _dotted(text):
+        return text.replace(".", ":")
+    if _ISO.match(text) or _CLOCK.match(text):
+        return text
+    if half := _HALF.fullmatch(text):
+        day, hour, minutes, seconds, letter = half.groups("00")
+        of = int(hour) % 12 + 12 * (letter in "Pp") if int(hour) <= 12 else int(hour)
+        text = f"{day}{of:02}:{minutes}:{seconds}"
+    if named := next((m for m in (pattern.fullmatch(text) for pattern in _NAMED) if m), None):
+        if (month := named["m"].lower()) in _MONTHS:
+            year = named["y"] if len(named["y"]) == 4 else f"20{named['y']}"
+            text = f"{year}-{_MONTHS.index(month) + 1:02}-{int(named['d']):02} {named['t'].lstrip(', T')}".strip()
+    text = re.sub(r"(:\d\d):(\d{3,6})$", r"\1.\2", text)  # milliseconds of a controller
+    if dashed := _DASHED.fullmatch(text):
+        text = "/".join(dashed.groups())
+    if compact := _COMPACT.fullmatch(text):
+        text = "{}-{}-{} {}:{}:{}{}".format(*compact.groups())
+    if dated := _YEAR_FIRST.fullmatch(text):
+        year, _, month, day, hour, minutes, rest = dated.groups()
+        clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
+        text = f"{year}-{int(month):02}-{int(day):02}{clock}"
+    return re.sub(r"\s+(GMT)$", "Z", text)
+
+
+def _unit(name: str, values: Column, stated: str = "") -> str:
+    """Unit below the names, or in the name, such as `t_ms` or `time [us]`, else by the size since 1970, or ""."""
+    low = name.lower().replace("μ", "µ")
+    for unit, pattern in _UNIT.items():
+        if re.fullmatch(rf"[\[(]?\s*({pattern})\s*[\])]?", stated.lower().replace("μ", "µ")):
+            return unit
+    for unit, pattern in _UNIT.items():
+        if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"([_\s]|time)({pattern})$", low):
+            return unit
+        if unit != "s" and re.fullmatch(rf"({pattern})(_.*)?", low):
+            return unit
+    finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
+    size = float(np.median(np.abs(finite.astype(np.float64)))) if len(finite) else 0.0
+    return next((unit for least, unit in _EPOCHS if size > least), "")
+
+
+def _compact(values: Column) -> bool:
+    """Whether numbers are days and times such as 20240313115503."""
+    known = values[np.isfinite(values)]
+    if not len(known) or known.min() < 19e12 or known.max() > 21e12:
+        return False
+    return all(_COMPACT.fullmatch(f"{value:.0f}") for value in known[:1000].tolist())
+
+
+def _like_days(values: Column) -> bool:
+    """Whether numbers with more than three decimals are such as Excel and MATLAB write for days of these decades."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    fine = bool((np.abs(1e3 * known - np.rint(1e3 * known)) > 1e-3).any())
+    return fine and any(least < low and high < most for least, most in ((20_000, 80_000), (690_000, 800_000)))
+
+
+def _coarse(values: Column) -> bool:
+    """Whether whole numbers rise by hundreds from row to row, and not by whole minutes, as of a clock of ms or us."""
+    steps = np.diff(values[np.isfinite(values)].astype(np.float64))
+    return len(steps) > 2 and bool(
+        np.median(steps) >= 100 and (steps % 1 == 0).all() and (steps % 60 != 0).mean() > 0.5
+    )
+
+
+def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:
+    values = table.columns[name]
+    if values.dtype.kind in "iu":
+        if len(values) and max(abs(int(values.max())), abs(int(values.min()))) * factor > LATEST:
+            raise _too_late(where)
+        return values.astype(np.int64) * factor
+    known = np.isfinite(values)
+    if not known.any():
+        raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
+    sizes = np.abs(np.where(known, values, 0.0)) * factor
+    if np.median(sizes[known]) > LATEST:
+        raise _too_late(where)
+    known &= sizes <= LATEST  # the unit is right, and a row beyond is damaged
+    largest = float(sizes[known].max())
+    times = np.full(len(values), NO_TIME, dtype=np.int64)
+    times[known] = np.rint(values[known] * factor).astype(np.int64)
+    cells = table.exact(name) if largest > _LARGE and table.exact is not None else ()
+    if len(cells) == len(values):
+        times[known] = [_exactly(cells[i], factor, float(values[i])) for i in np.flatnonzero(known).tolist()]
+    return times
+
+
+def _exactly(cell: str, factor: int, value: float) -> int:
+    try:
+        return int((Decimal(cell) * factor).to_integral_value())
+    except (InvalidOperation, ValueError, OverflowError):
+        return round(value * factor)
+
+
+def _too_late(where: str) -> BagError:
+    remedy = "say what unit it has in the signals file, `table: {unit: ms}`"
+    return BagError(f"{where}: is past the year 2262 in ns; {remedy}")
+
+
+def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
+    """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted.
+
+    A cell that is neither has no time, if few are.
+    """
+    times = np.full(len(cells), NO_TIME, dtype=np.int64)
+    spelt, order = _as_iso(where, [_spelt(str(cell)) for cell in cells], cells)
+    plain: dict[int, str] = {}  # by row
+    shifts: list[int] = []
+    odd: list[int] = []
+    for row, text in enumerate(spelt):
+        if match := _ISO.match(text):
+            plain[row], shift = _of_iso(where, *match.groups())
+            shifts.append(shift)
+        elif match := _CLOCK.match(text):
+            hours, minutes, seconds = match.groups()
+            fraction = Decimal((seconds or "0").replace(",", ".")) * 10**9
+            times[row] = (int(hours) * 60 + int(minutes)) * 60 * 10**9 + int(fraction)
+        elif text:
+            odd.append(row)
+    if odd:
+        given = str(cells[odd[0]]).strip()[:40]
+        if len(odd) > ODD_SHARE * sum(map(bool, spelt)):
+            neither = "is neither a number nor an ISO time such as 2026-11-22T06:28:01.25Z"
+            remedy = "write all of them as one or the other"
+            remedy += ", with a point before decimals" * bool(re.fullmatch(r"-?\d+,\d+", given))
+            raise BagError(f"{where}: '{given}' in row {odd[0] + 1} {neither}; {remedy}")
+        order = " and ".join(filter(None, (order, left_out(len(odd), "time", given))))
+    if plain:
+        times[list(plain)] = _parsed(where, list(plain.values())) - np.array(shifts)
+    if (times == NO_TIME).all():
+        raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
+    return times, order
+
+
+def _parsed(where: str, texts: Sequence[str]) -> NDArray[np.int64]:
+    try:
+        return np.array(texts, dtype="datetime64[ns]").astype(np.int64)
+    except ValueError:
+        if len(texts) == 1:
+            raise BagError(f"{where}: '{texts[0][:40]}' is no day or time that there is; mend it") from None
+        return np.concatenate([_parsed(where, [text]) for text in texts])  # one by one, to find the one that is wrong
+
+
+def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[str, int]:
+    """An instant without its zone, and how far that is before UTC, ns."""
+    text = f"{day}T{(clock or '00:00').replace(',', '.')}"
+    if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
+        raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
+    if not zone or zone in ("Z", "UTC"):
+        return text, 0
+    hours, minutes = int(zone[1:3]), int(zone[-2:])
+    if hours > _LARGEST_ZONE or minutes > 59:
+        raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
+    return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1)
+
+
+def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
+    """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day, or goes forward.
+
+    Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
+    """
+    found = [match for cell in cells if cell if (match := _DAY.fullmatch(cell))]
+    if not found or len(found) < (1 - ODD_SHARE) * sum(map(bool, cells)):
+        return cells, ""
+    orders = {}
+    tried = [("day, month, year", 1, 2, 3), ("month, day, year", 2, 1, 3)]
+    if len({m[3] for m in found}) > len({m[1] for m in found}):  # years that change more often than days are days
+        tried = [("year, month, day", 3, 2, 1)]
+    for order, day, month, year in tried:
+        texts = [
+            f"{m[year] if len(m[year]) == 4 else f'20{m[year]:0>2}'}-{int(m[month]):02}-{int(m[day]):02}"
+            f"T{int(m[4] or 0):02}:{m[5] or '00'}:{m[6] or '00'}"
+            for m in found
+        ]
+        if all(1 <= int(text[5:7]) <= 12 for text in texts):
+            orders[order] = texts
+    if len(orders) > 1:
+        orders = {order: texts for order, texts in orders.items() if sorted(texts) in (texts, texts[::-1])}
+    taken, note = list(orders), ""
+    if len({tuple(texts) for texts in orders.values()}) == 2:
+        even = [order for order, texts in orders.items() if _is_even(texts)]
+        taken = even if len(even) == 1 else taken * (len({m.group(1, 2, 3) for m in found}) == 1)
+        first = next(str(cell).strip() for cell in given if str(cell).strip())
+        note = f"'{first[:40]}' is taken for {(taken or even or [''])[0]}"
+    if not taken:
+        which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
+        raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
+    iso = iter(orders[taken[0]])
+    return [next(iso) if _DAY.fullmatch(cell) else cell for cell in cells], note
+
+
+def _is_even(texts: Sequence[str]) -> bool:
+    """Whether no step between these instants is much longer than the usual one."""
+    try:
+        steps = np.diff(np.array(texts, dtype="datetime64[ms]").astype(np.int64))
+    except ValueError:
+        return False
+    return len(steps) > 1 and bool(steps.max() <= 2 * np.median(steps))
