@@ -325,7 +325,7 @@ def lbnl(folder: Path) -> Iterator[list[str]]:
         days = np.array([line[1:] for line in lines], dtype=float).reshape(-1, len(t), len(names) + 1)
         healthy, faulty = ([day[:, :-1] for day in days if (day[:, -1] == kind).all()] for kind in (0, 1))
         moving = np.ptp(np.concatenate(healthy), axis=0) > 0
-        state = np.array([n.endswith(("Temperature", "Static Pressure")) for n in names])
+        state = np.array([n.endswith(("Temperature", "Static Pressure")) and "Outdoor" not in n for n in names])
         signals = Signals(np.flatnonzero(moving & state), np.flatnonzero(moving & ~state))
         for fold in range(3):
             kept = [day for i, day in enumerate(healthy) if i % 3 != fold]

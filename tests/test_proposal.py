@@ -423,6 +423,21 @@ def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     assert "Pump_speed_cmd" not in model.state_names and "Valve_cmd" in model.state_names
 
 
+def test_the_weather_is_an_input_and_a_flow_of_outdoor_air_is_measured(tmp_path):
+    """As a state the outdoor temperature of an air handler was most of its false alarms."""
+    rng, room, rows = np.random.default_rng(0), 20.0, []
+    outdoor, flow = 10.0 + np.cumsum(rng.normal(size=(2, 600)), axis=1) * 0.2
+    for k in range(600):
+        heat = k // 50 % 2
+        rows.append((k, heat, f"{outdoor[k]:.2f}", f"{flow[k]:.2f}", f"{room + 0.05 * rng.normal():.2f}"))
+        room += 0.1 * (20.0 * heat + outdoor[k] - room) + 0.02 * flow[k]
+    columns = ["time", "Heating", "AHU: Outdoor Air Temp", "AHU: Outdoor Air Flow", "Room"]
+    proposal = propose([csv(tmp_path / "a.csv", columns, rows)])
+    assert [c.path for c in proposal.controls] == ["Heating", "AHU_Outdoor_Air_Temp"]
+    assert [c.path for c in proposal.states] == ["AHU_Outdoor_Air_Flow", "Room"]
+    assert "the weather, by its name" in proposal.text and not any(c.judged for c in proposal.controls)
+
+
 def test_millivolts_are_measured_and_entries_of_a_matrix_have_its_name(tmp_path):
     """`Load_Cell_mV` was set by a controller, as `mv` is a manipulated variable; `data[2]` was called 2."""
     rng = np.random.default_rng(0)

@@ -443,6 +443,7 @@ HELD = 0.8
 """Share of an analyser's changes that come after the same number of rows, two or more."""
 GATED = 0.99
 """Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
+_WEATHER = re.compile(r"(^|_)(outdoor|outside|ambient|weather)(?!.*(coil|damper|fan|flow|pump|unit|valve))")
 _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
 
 
@@ -513,6 +514,8 @@ def _is_set(candidate: Candidate, called: bool) -> bool:
         )
     elif len(values) <= 2 or (len(values) <= MOST_VALUES and (values == np.rint(values)).all()):
         candidate.why = f"switched between {', '.join(f'{v + 0.0:.6g}' for v in values)}"
+    elif _WEATHER.search(candidate.path.lower()):
+        candidate.why = "the weather, by its name, which is no fault of the machine"
     elif by_name:
         candidate.why, candidate.judged = f"{_BY_NAME}judged as well", True
     else:
