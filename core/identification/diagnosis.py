@@ -342,6 +342,12 @@ def _bursting(model: UncertainLTI, transients: Sequence[Transient]) -> list[str]
     ]
 
 
+def uneven_steps(dt: Array) -> NDArray[np.bool_]:
+    """Which steps (K,), s, are far from the usual one; none of them where only a few are."""
+    uneven = np.abs(np.log(dt / np.median(dt))) > UNEVEN
+    return np.asarray(uneven & (uneven.sum() >= max(20, 0.01 * len(dt))))
+
+
 def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> list[str]:
     """Stamps that are unevenly spaced where the samples are not.
 
@@ -350,10 +356,10 @@ def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> li
     """
     dt, x = problem.dt, problem.z[:, : problem.n]
     usual = float(np.median(dt))
-    uneven = np.abs(np.log(dt / usual)) > UNEVEN
+    uneven = uneven_steps(dt)
     speed = max((abs(v) for block in model.blocks for v in block.eigenvalues()), default=0.0) * usual
     moving = np.flatnonzero(np.ptp(x, axis=0) > 0)
-    if uneven.sum() < max(20, 0.01 * problem.N) or not speed < SLOW_STEP or not len(moving):
+    if not uneven.any() or not speed < SLOW_STEP or not len(moving):
         return []
     left = []
     for length in (dt, np.full(len(dt), usual)):

@@ -132,8 +132,11 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
 def _jitter(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
     """What a fit to this recording would say of its stamps."""
     from uncertain_lti.identification.assembly import assemble
-    from uncertain_lti.identification.diagnosis import jittering
+    from uncertain_lti.identification.diagnosis import jittering, uneven_steps
 
+    dt = verdicts.transient.transitions().dt
+    if not len(dt) or not uneven_steps(dt).any():
+        return []
     with suppress(FitError):
         problem = assemble([verdicts.transient], model.operating_point, None, "none")
         return jittering(model, problem, [*model.state_names, *model.control_names])
