@@ -37,7 +37,6 @@ from uncertain_lti.proposal.candidates import (
     at_rest,
     bare,
     earlier,
-    residual,
     role_by_name,
     role_of_column,
     set_aside_labels,
@@ -277,9 +276,10 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
-    named = called_time(candidate.path.rpartition(".")[2]) or _CLOCK & {*words_of(candidate.path)}
-    clock = named and np.mean(steps[steps != 0] > 0) > 0.9  # that of a day starts anew
+    clock = called_time(candidate.path.rpartition(".")[2]) or not _CLOCK.isdisjoint(words_of(candidate.path))
+    if clock:
+        steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
+        clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
     if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival))):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
@@ -291,11 +291,9 @@ def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
     if len(finite) < 3 or np.ptp(t) == 0:
         return False
-    rest, slope = (
-        residual(t[:, None], finite[:, None])[0],
-        float(np.polyfit(t - t.mean(), finite - finite.mean(), 1)[0]),
-    )
-    follows = bool(rest < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+    x, y = t - t.mean(), finite - finite.mean()
+    slope = float(x @ y / (x @ x))
+    follows = bool(((y - slope * x) ** 2).sum() < (0.002 * np.ptp(finite)) ** 2 * len(finite))
     if np.mean(np.diff(finite) == 1) > 0.9 or (follows and any(abs(slope / 1000**k - 1) < 1e-3 for k in range(4))):
         return True
     if (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):

@@ -442,14 +442,14 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, lis
     for column in found.values():
         lengths[max(column.shape) if vectors else len(column)] += min(column.shape) if column.ndim > 1 else 1
     if not lengths:
-        there = "; ".join(_left_out(notes)[:3]) or "nothing"
+        there = "; ".join(_by_reason(notes)[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
     if not vectors and len(found) == 1:
         ((name, matrix),) = found.items()
         first, *rest = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
         if rest and (np.diff(first) > 0).all():  # as Simulink writes to a file
             said = f"the first line of '{name}' is taken for the time, as it grows"
-            return RawTable({"time": first, name: np.column_stack(rest)}, [*_left_out(notes), said])
+            return RawTable({"time": first, name: np.column_stack(rest)}, [*_by_reason(notes), said])
     length = max(lengths, key=lambda number: (lengths[number], number))
     kept: dict[str, Column] = {}
     for name, column in found.items():
@@ -459,10 +459,10 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, lis
             kept[name] = column.T
         else:
             notes.setdefault(f"not of {length} entries as the others", []).append(f"{name} ({len(column)})")
-    return RawTable(kept, _left_out(notes))
+    return RawTable(kept, _by_reason(notes))
 
 
-def _left_out(notes: Mapping[str, Sequence[str]]) -> list[str]:
+def _by_reason(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """A sentence for each reason why variables are left out."""
     return [f"{shortlist([repr(name) for name in names], 4)} left out, {why}" for why, names in notes.items()]
 
