@@ -403,10 +403,16 @@ def test_a_combination_that_the_others_lack_is_far_though_each_signal_is_in_its_
 
 def test_recordings_that_do_not_repeat_one_another_are_named(runs):
     apart = [runs[0], runs[1].replace(x=runs[1].x + 5.0), runs[2].replace(x=runs[2].x - 5.0)]
-    alarm = fit(apart, "lp", additive="both").fit_summary["alarm"]
-    assert alarm["worth"] in ("some", "none") and len(alarm["unlike"]) >= 2
-    if alarm["worth"] == "some":
-        assert "do not repeat what the others show" in alarm["headline"]
+    model = fit(apart, "lp", additive="both")
+    alarm = model.fit_summary["alarm"]
+    assert alarm["worth"] == "unproven" and len(alarm["unlike"]) >= 2
+    assert alarm["headline"].startswith("unproven: 2 recordings of 3 do not repeat what the others show")
+    quiet, loud = (
+        check_data(model, EnvelopeMonitor(model).check(runs[0].replace(x=x)))
+        for x in (runs[0].x, np.roll(runs[0].x, 1, axis=1))
+    )
+    assert (quiet["outcome"], quiet["reason"]) == ("quiet", "")
+    assert loud["outcome"] == "alarm" and loud["reason"] == f"the model is {alarm['headline']}"
 
 
 def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smaller_jumps():

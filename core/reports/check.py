@@ -345,7 +345,7 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
         remedy = f"{ask}fit recordings that reach as far{': ' * bool(why)}{why}"
         return f"{beyond_fit}, where nothing vouches for the bounds; {remedy}"
     alarm = model.fit_summary.get("alarm")
-    if isinstance(alarm, dict) and alarm.get("worth") == "none":
+    if isinstance(alarm, dict) and (alarm.get("worth") == "none" or data["alarm"] and alarm.get("worth") == "unproven"):
         return f"the model is {alarm['headline']}"
     fitted = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
     fitted[np.isinf(fitted)] = 0.0  # of a model that was given

@@ -227,7 +227,7 @@ def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]
 def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | None) -> Reasons:
     alarm = _alarm(model)
     if alarm.get("headline"):
-        weight = {"good": YES, "some": CARE}.get(str(alarm.get("worth")), NO)
+        weight = {"good": YES, "some": CARE, "unproven": UNKNOWN}.get(str(alarm.get("worth")), NO)
         yield weight, "alarm", "; ".join([str(alarm["headline"]), *_promises(model, False)])
     elif validation is None or validation["inside"] is None:
         how = "run `uncertain-lti validate MODEL --output MODEL` where its recordings are"

@@ -433,7 +433,7 @@ def _limit(evidence: Evidence, rules: int) -> float:
 
 
 def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
-    """What the model is worth, in a word (`good`, `some` or `none`), and in one line that begins with it."""
+    """What the model is worth: `good`, `some`, `unproven` or `none`, and one line that says so."""
     span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
     names = model.state_names
     still = [name for name, s in zip(names, span.tolist(), strict=True) if not s > 0]
@@ -448,6 +448,14 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"not worth having: the smallest jump that it sees is {of_range} the recorded range of a state; "
             f"what moves the states may be missing among the controls, or record more"
         )
+    count = len(panel.unlike)
+    verb = "does" if count == 1 else "do"
+    unlike = f"{plural(count, panel.what)} of {panel.units} {verb} not repeat what the others show"
+    if 2 * count > panel.units:
+        return "unproven", (
+            f"unproven: {unlike}, so nothing shows how it does on what comes next, and an alarm may be operation that "
+            f"was not recorded; record the same work again"
+        )
     if still or blind:
         seen = [name for name in names if name not in (*still, *blind)]
         why = [f"{', '.join(still)} never moved"] if still else []
@@ -459,11 +467,9 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     if len(coarse) == model.n:
         missing = "what moves the states may be missing among the controls"
         return "some", f"worth little: it sees jumps of {ranges} only, which a plot shows as well; {missing}"
-    if count := len(panel.unlike):
-        verb = "does" if count == 1 else "do"
+    if count:
         return "some", (
-            f"worth having within what was recorded: {plural(count, panel.what)} of {panel.units} {verb} not repeat "
-            f"what the others show, so nothing vouches for operation that none of them shows"
+            f"worth having within what was recorded: {unlike}, so nothing vouches for operation that none of them shows"
         )
     sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
     if panel.what == "block":
