@@ -452,6 +452,18 @@ def test_large_problems_are_armed_by_what_was_fitted(runs, monkeypatch):
     assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in runs)
 
 
+def test_as_many_recordings_are_counted_as_alarm_by_what_the_others_show(runs):
+    """Against fits of the others with their own panels, each checked on the one that they lack."""
+    named = [
+        run.replace(x=run.x + (k == 2) * 0.3 * np.sin(np.arange(len(run)))[:, None]) for k, run in enumerate(runs[:6])
+    ]
+    alarm = fit(named, "lp", additive="both").fit_summary["alarm"]
+    others = [fit(named[:k] + named[k + 1 :], "lp", additive="both") for k in range(len(named))]
+    loud = [EnvelopeMonitor(m).check(run).alarm.any() for m, run in zip(others, named, strict=True)]
+    assert loud[2] and alarm["units_alarming"] == sum(loud) == 1
+    assert f" {alarm['units_alarming']} of 6 recordings would alarm" in alarm["promises"][1]
+
+
 def test_states_that_are_blind_are_named(learnt):
     """Worth and promises follow from the sizes alone."""
     full, _, panel = learnt
@@ -465,10 +477,10 @@ def test_states_that_are_blind_are_named(learnt):
     assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0))[0]
     quiet = replace(panel.evidence, hours=0.008, counts=np.zeros(3), dt=0.5)
     assert "none in 28.8 s left out (8 rec" in promises(full, replace(panel, evidence=quiet))[0]
-    far = promises(full, replace(panel, evidence=quiet, biases=np.array([0.25, 11.0]) * span))[1]
+    far = promises(full, replace(panel, evidence=quiet, biases=np.array([0.25, 11.0]) * span))[2]
     assert far.startswith("sees within 0.5 s a jump of x1 ")
     assert far.endswith("; of x2 not even a jump of ten times the recorded range")
-    said = promises(full, replace(panel, biases=11.0 * span))[1]
+    said = promises(full, replace(panel, biases=11.0 * span))[2]
     assert said.endswith(" s of x1, x2 not even a jump of ten times the recorded range")
 
 

@@ -224,6 +224,18 @@ class Panel:
         return len(self.evidence.peaks)
 
     @property
+    def alarming(self) -> int:
+        """How many recordings, groups or blocks would alarm at the thresholds that all the others give."""
+        evidence, rules = self.evidence, [rule for rule in self.rules if isinstance(rule, StatisticRule)]
+        peaks, found = evidence.peaks, 0
+        for unit in np.unique(peaks.argmax(axis=0)):
+            others = np.delete(peaks, unit, axis=0)
+            top = np.where(evidence.top > peaks.max(axis=0), evidence.top, others.max(axis=0, initial=0.0))
+            given = replace(evidence, peaks=others, top=top).thresholds(rules, evidence.widths.shape[1], self.what)
+            found += bool((peaks[unit] > evidence.factor * np.concatenate(given)).any())
+        return found
+
+    @property
     def vouched(self) -> bool:
         """Whether what was left out shows that one way to fit holds better than another."""
         return len(self.unlike) <= ALONE * self.units
@@ -248,6 +260,7 @@ class Panel:
             "alarms": int(self.evidence.counts.sum()),
             "hours": self.evidence.hours,
             "units": self.units,
+            "units_alarming": self.alarming,
             "what": self.what,
             "biases": self.biases.tolist(),
             "within": self.evidence.dt,
@@ -492,13 +505,18 @@ def promises(model: UncertainLTI, panel: Panel) -> list[str]:
     if math.isfinite(panel.limit):
         count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
         shown = f"{count or 'none'} in {lasting(evidence.hours)} left out ({plural(panel.units, panel.what)})"
-        first = (
+        found = [
             f"false alarms: {shown}, which shows at most {most:.7g} per hour with {CONFIDENCE:.0%} confidence, while "
             f"the machine is run as in the recordings"
-        )
+        ]
+        if panel.what != "block":
+            alarming = f"{panel.alarming or 'none'} of {plural(panel.units, panel.what)}"
+            found.append(
+                f"at thresholds of the others alone {alarming} would alarm: expect about as many of further ones"
+            )
     else:
-        first = "false alarms: one stretch says nothing of their rate; record more"
-    found = [first, f"sees within {evidence.dt:.3g} s {'; '.join(sees)}"]
+        found = ["false alarms: one stretch says nothing of their rate; record more"]
+    found.append(f"sees within {evidence.dt:.3g} s {'; '.join(sees)}")
     if panel.asked is not None and not panel.limit <= panel.asked:
         more = panel.needed_hours - evidence.hours
         remedy = f"{lasting(more)} more without an alarm would" if more > 0 else "record more"
