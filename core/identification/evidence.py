@@ -41,6 +41,7 @@ LONGEST_DELAY = 10
 """Delays of a control that are tried, samples."""
 SURE_DELAY = 0.1
 """Share by which a delay leaves less unexplained, below which it must show in either half of the samples."""
+_ENOUGH, _STRETCH = 5_000_000, 128  # elements of the regressors from which on stretches of samples do
 _STRETCHES = 10  # of the samples, dealt out to the halves in turn
 _CLIP = 5.0
 """Standard deviations at which a residual is cut before it is correlated: one event is no rule."""
@@ -201,6 +202,8 @@ def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tup
     usable = np.flatnonzero(run >= LONGEST_DELAY)
     if len(usable) < 20 * p:
         return {}
+    share = 1 + usable.size * (p + LONGEST_DELAY * (p - n)) // _ENOUGH
+    usable = usable[np.arange(usable.size) // _STRETCH % share == 0]
     lagged = np.stack([problem.z_columns[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
     now = problem.z_columns[:n, usable]
     found = lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable])
