@@ -563,12 +563,12 @@ def test_effects_that_are_found_at_once_are_those_one_by_one(seed):
     X, U = (rng.normal(size=(80, 5)) + 3) * 10.0 ** rng.integers(-4, 5, 5), rng.normal(size=(80, 3))
     dX = X @ rng.normal(size=(5, 5)) * 0.1 + U @ rng.normal(size=(3, 5)) + rng.normal(size=(80, 5))
     steps, kept, rest = Steps(X, U, dX), [1, 3], [4, 0, 2]
-    each = [Steps(np.hstack([X, np.delete(U, j, 1)]), U[:, [j]], dX).effect() for j in range(3)]
-    np.testing.assert_allclose(steps.effect_of_each(), each, rtol=1e-6, atol=1e-6)
+    each = [Steps(np.hstack([X, np.delete(U, j, 1)]), U[:, [j]], dX).effects()[0] for j in range(3)]
+    np.testing.assert_allclose(steps.effects()[1:], each, rtol=1e-6, atol=1e-6)
 
     def effect(of, on):
         """Of these states in the next step of those, given those and the controls."""
-        return Steps(np.hstack([X[:, on], U]), X[:, of], dX[:, on]).effect()
+        return Steps(np.hstack([X[:, on], U]), X[:, of], dX[:, on]).effects()[0]
 
     coupled = [max(*effect([j], kept), *effect(kept, [j])) for j in rest]
     np.testing.assert_allclose(steps.coupling(kept, rest), coupled, rtol=1e-6, atol=1e-6)

@@ -17,6 +17,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -170,24 +171,31 @@ class Steps:
     U: Array
     dX: Array
 
-    def effect(self) -> Array:
-        """F statistic of the controls together, given the states, in the next step of each state (n,)."""
+    def effects(self) -> Array:
+        """F statistics, in the next step of each state, of the controls together, and of each given the others.
+
+        All from the triangle of [1 X U dX]: what a regressor explains is its coefficient squared over its entry of the
+        inverse Gram matrix. Returns (1 + m, n).
+        """
         (N, n), m = self.X.shape, self.U.shape[1]
         freedom = N - n - m - 1
         if freedom < 5 or not m:
-            return np.zeros(n)
-        without, full = residual(self.X, self.dX), residual(np.hstack([self.X, self.U]), self.dX)
-        return _statistic(without, full, self.dX, m, freedom)
+            return np.zeros((1 + m, n))
+        from scipy.linalg import solve_triangular
 
-    def effect_of_each(self) -> Array:
-        """F statistic of each control, given the others, in the next step of each state (m, n)."""
-        n, m = self.X.shape[1], self.U.shape[1]
-        freedom = len(self.X) - n - m - 1
-        if freedom < 5:
-            return np.zeros((m, n))
-        U, Y = left(self.X, self.U, self.dX)  # given the states once, not for each control
-        without, full = [residual(np.delete(U, j, 1), Y) for j in range(m)], residual(U, Y)
-        return np.array([_statistic(one, full, self.dX, 1, freedom) for one in without]).reshape(m, n)
+        scaled = [values / size_of(values) for values in (self.X, self.U)]
+        R: Array = np.asarray(np.linalg.qr(np.hstack([np.ones((N, 1)), *scaled, self.dX]), mode="r"))
+        own, explained = R[1 + n : 1 + n + m, 1 + n : 1 + n + m], R[1 + n : 1 + n + m, 1 + n + m :]
+        full = (R[1 + n + m :, 1 + n + m :] ** 2).sum(axis=0)
+        own[np.diag_indices(m)] += 1e-300 * (np.diagonal(own) == 0.0)
+        inverse = solve_triangular(own, np.eye(m))
+        gains = (inverse @ explained) ** 2 / (inverse**2).sum(axis=1)[:, None]
+        return np.vstack(
+            [
+                _statistic(full + (explained**2).sum(axis=0), full, self.dX, m, freedom),
+                _statistic(full + gains, full, self.dX, 1, freedom),
+            ]
+        )
 
     def coupling(self, kept: Sequence[int], rest: Sequence[int]) -> Array:
         """Larger F statistic of each other state in the next step of those kept, and of these in that of the other.
@@ -235,12 +243,7 @@ def left(Z: Array, *of: Array) -> tuple[Array, ...]:
     return tuple(Y - Q @ (Q.T @ Y) for Y in of)
 
 
-def residual(Z: Array, Y: Array) -> Array:
-    """Sum of squares that a least-squares fit on [1, Z] leaves.
-
-    `Z` (N, j): regressors; `Y` (N, k): targets; Returns (k,): units of Y squared.
-    """
-    return np.asarray((left(Z, Y)[0] ** 2).sum(axis=0))
+ENOUGH, _STRETCH = 50_000, 500  # samples that tell what shows in what, in stretches of a long recording
 
 
 def steps_of(
@@ -250,9 +253,13 @@ def steps_of(
     lags = lags or [0] * len(controls)
     longest = max(lags, default=0)
     clock = min((c.topic for c in state), key=lambda topic: of[topic].rate)
+    share = 1 + of[clock].count // ENOUGH
     found = [tuple(np.empty((0, len(columns))) for columns in (state, controls, state))]
-    for number, arrival in enumerate(of[clock].arrival):
-        columns = [held(c, of[c.topic], number, of[clock]) for c in [*state, *controls]]
+    for number, every in enumerate(of[clock].arrival):
+        rows = np.arange(len(every))
+        rows = rows[rows // _STRETCH % share == 0]
+        arrival = every[rows]
+        columns = [held(c, of[c.topic], number, of[clock], rows=rows) for c in [*state, *controls]]
         x, u = np.hsplit(np.column_stack(columns), [len(state)])
         step = np.diff(arrival)
         if len(step) < 2 + longest:
@@ -260,9 +267,8 @@ def steps_of(
         limit = 2.5 * float(np.median(step[step > 0])) if (step > 0).any() else 0.0
         for j, lag in enumerate(lags):
             u[:, j] = earlier(u[:, j], lag)
-        good = (step > 0) & (step <= limit)
+        good = (step > 0) & (step <= limit) & ((share == 1) | (rows[:-1] % _STRETCH >= longest))
         good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
-        good[200_000:] = False  # enough to tell
         found.append((x[:-1][good], u[:-1][good], np.diff(x, axis=0)[good]))
     return Steps(*map(np.concatenate, zip(*found, strict=True)))
 
@@ -296,14 +302,22 @@ def earlier(values: Array, samples: int) -> Array:
     return np.concatenate([np.full(min(samples, len(values)), np.nan), values[: max(len(values) - samples, 0)]])
 
 
-def held(candidate: Candidate, source: Source, number: int, clock: Source, oldest: float | None = None) -> Array:
-    """Latest value at each message of the clock.
+def held(
+    candidate: Candidate,
+    source: Source,
+    number: int,
+    clock: Source,
+    oldest: float | None = None,
+    rows: Any = slice(None),
+) -> Array:
+    """Latest value at each message of the clock, or at some of them, its `rows`.
 
-    Returns (messages of the clock,): naN before the first value, and where it is too old.
+    Returns (messages,): naN before the first value, and where it is too old.
     """
     if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
-        return np.full(len(clock.arrival[number]), np.nan)
+        return np.full(len(clock.arrival[number][rows]), np.nan)
     mine, at = source.instants(clock, number)
+    at = at[rows]
     position = np.searchsorted(mine, at, side="right") - 1
     values = candidate.values[number][np.maximum(position, 0)]
     age = (at - mine[np.maximum(position, 0)]) * 1e-9
@@ -320,7 +334,7 @@ def explained(state: Source, controls: Sequence[Source]) -> float:
 def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: Sequence[Candidate]) -> float:
     """How clearly some numbers show in the next step of the best of others."""
     steps = steps_of(states, every, controls)
-    return float(np.max(steps.effect(), initial=0.0)) if len(steps.X) >= FEWEST else 0.0
+    return float(np.max(steps.effects()[0], initial=0.0)) if len(steps.X) >= FEWEST else 0.0
 
 
 # Words in the name of a topic or of its type; the last word of a name counts most.

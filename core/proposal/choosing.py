@@ -62,7 +62,7 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
         place = of.path if of.topic == pool[i].topic else f"{of.topic} {of.path}"
         pool[i].reason = f"says what {place} says already"
 
-    for i in np.argsort(-np.log(np.maximum(steps.effect(), 1.0)).round(1), kind="stable").tolist():
+    for i in np.argsort(-np.log(np.maximum(steps.effects()[0], 1.0)).round(1), kind="stable").tolist():
         source = next((j for j in kept if function[j, i]), None)
         if source is not None:
             drop(i, source)
@@ -113,7 +113,7 @@ def drop_noise(
             "nothing here is more than noise from one sample to the next: record the machine at work before you "
             "fit a model"
         )
-    shown = steps_of(pool, every, used).effect() > SHOWS
+    shown = steps_of(pool, every, used).effects()[0] > SHOWS
     families = {c.family for c, known in zip(pool, share, strict=True) if known >= NOISE}
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
@@ -308,7 +308,7 @@ def _driven(
     def most(steps: Steps) -> Array:
         if not m or len(steps.X) < FEWEST:
             return found
-        return np.maximum(found, np.vstack([steps.effect(), steps.effect_of_each()]))
+        return np.maximum(found, steps.effects())
 
     for lag in range(latest + 1):
         found = most(steps_of(pool, every, used, [lag] * m))
@@ -552,11 +552,11 @@ def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> li
     rest, found = [c for c in measured if c not in held and np.ptp(c.finite) > 0], []
     for rows in dict.fromkeys(held.values()) if rest else ():
         group = [c for c in held if held[c] == rows]
-        leads = steps_of(rest, of, group).effect_of_each().max(axis=1, initial=0.0) > SHOWS
+        leads = steps_of(rest, of, group).effects()[1:].max(axis=1, initial=0.0) > SHOWS
         for j, candidate in enumerate(group):
             before = steps_of([candidate], of, rest)
             set_at = before.dX[:, 0] != 0
-            leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effect()[0] <= SHOWS
+            leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effects()[0, 0] <= SHOWS
         found += group if 2 * leads.sum() > len(group) else []
     for candidate, rows in held.items():
         candidate.why = f"set, for {rows} rows each: the others follow it"
