@@ -241,16 +241,17 @@ STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
-MOST = 8  # states, and controls
+MOST, EACH = 8, 1000  # states, and controls; or as many as there are so many transitions for each
 
 
 class _Room:
     """How many signals of a kind are proposed at most, and the reason for leaving out more."""
 
-    def __init__(self, carried: int, what: str) -> None:
-        self.most = min(max(1, carried), MOST)
-        many = f"others show more, and at most {MOST} {what} are tried together; exchange one if this matters"
-        self.reason = many if carried >= MOST else f"the recording is too short for more than {self.most} {what}"
+    def __init__(self, N: int, carried: int, what: str) -> None:
+        most = max(MOST, N // EACH)
+        self.most = min(max(1, carried), most)
+        many = f"others show more, and at most {most} {what} are tried together; exchange one if this matters"
+        self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
 
 
 def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
@@ -279,9 +280,9 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     pool, doubt = drop_noise(drop_functions(steps_of(pool, every, used), pool), every, used)
     N = len(steps_of(pool, every, used).X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(_driven(pool, every, used, 0), used, _Room(room // 2, "controls"))
+    used = _strongest(_driven(pool, every, used, 0), used, _Room(N, room // 2, "controls"))
     steps = steps_of(pool, every, used)
-    states_room, driven = _Room(room - len(used), "states"), _driven(pool, every, used)
+    states_room, driven = _Room(N, room - len(used), "states"), _driven(pool, every, used)
     if N < FEWEST:
         keep = pool[:MOST]
     elif all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool):  # place and attitude of a body

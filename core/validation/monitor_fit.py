@@ -33,8 +33,8 @@ CLEARLY = 0.9
 """Largest size of the jumps that a better way to fit sees, over those that a simpler one sees."""
 FOLDS = 5
 """Fits without a part of the recordings, groups or, of a single recording, blocks, for an alarm or any other choice."""
-LIMIT = 1e9
-"""Elements of all left-out problems together up to which parts are left out: some minutes."""
+LIMIT, _MOST = 4e9, 2e7
+"""Elements of all left-out problems together up to which parts are left out: some minutes; utilisations kept."""
 _SHOWN, _COMPARED = 1_000_000, 200_000  # transitions that a panel is learnt from, and ways to fit are compared on
 
 
@@ -85,11 +85,12 @@ def fit_monitored(
     units = len(set(names)) if names else len(transients)
     of_the_fit_alone = ("schedule", "transient_weights", "describe_data", "seek_carriers")
     left = {name: value for name, value in options.items() if name not in of_the_fit_alone}
-    size = float(model.fit_summary["transitions"]) * model.n * (model.n + model.m)
+    kept = float(model.fit_summary["transitions"]) * model.n
+    size = kept * (model.n + model.m)
     if options.get("transient_weights") is not None:
         why = "transient_weights are for all recordings, so none can be left out"
         return Monitored(model, None, None, why, centred)
-    if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT:
+    if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT or kept > _MOST:
         why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
         seen = _seen(model, transients, _SHOWN)
         return Monitored(*_armed(seen, seen.parts, false_alarms), None, why, centred)

@@ -485,7 +485,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"worth having within what was recorded: {unlike}, so nothing vouches for operation that none of them shows"
         )
     sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
-    if panel.what == "block":
+    if panel.what == "block" or panel.units == 1:
         return "some", (
             f"worth having while the machine runs as in the one recording, which says nothing of another day: check it "
             f"on one that was not fitted; {sees}"
