@@ -449,6 +449,7 @@ def test_large_problems_are_armed_by_what_was_fitted(runs, monkeypatch):
     model = fit(runs, "lp", additive="noise")
     alarm = model.fit_summary["alarm"]
     assert "learnt on fitted data" in alarm["note"] and len(model.alarm) == 3
+    assert " fitted (8 recordings)" in alarm["promises"][0] and "left out" not in alarm["promises"][0]
     assert not any(EnvelopeMonitor(model).check(run).alarm.any() for run in runs)
 
 

@@ -60,6 +60,8 @@ class Monitored:
                 model = model.replace(memory={**model.memory, "evidence": panel.evidence.to_dict()})
             if self.why:
                 alarm["note"] = self.why
+            if self.validation is None:
+                alarm["promises"] = [text.replace(" left out (", " fitted (") for text in alarm["promises"]]
         alarm |= {"centred": True} if self.centred else {}
         left = {"not_done": self.why} if self.validation is None else self.validation.judged_as(model).to_dict()
         return model.replace(fit_summary={**model.fit_summary, "alarm": alarm}, validation=left)
