@@ -752,6 +752,11 @@ def test_a_table_in_which_nothing_is_a_state_is_refused_with_what_was_left_out(t
         propose([str(tmp_path / "a.csv")])
 
 
+def test_rows_out_of_order_are_told(tmp_path):
+    bag = read_csv(tmp_path, "time,x", (f"{k * 7 % 20},{k % 3}" for k in range(20)))
+    assert "6 of 20 rows are older than the row before: sort the rows by 'time', or name" in bag.warnings[0]
+
+
 def test_runs_in_a_table_may_step_back_before_the_first(tmp_path):
     """The newer half came first, so that no time passed from the first row to the last, and nothing was proposed."""
     rng, x, rows = np.random.default_rng(0), 0.0, []

@@ -85,6 +85,9 @@ class Table(Recording):
         if (steps < 0).any() and (steps <= 0).all():
             kept = kept[::-1]
             self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
+        elif (older := np.count_nonzero(steps < 0)) > 0.1 * len(kept):
+            remedy = f"sort the rows by '{time}', or name a column of runs in a signals file, `table: {{runs: COLUMN}}`"
+            self._warnings.append(f"{path}: {older} of {len(kept)} rows are older than the row before: {remedy}")
         names = [name for name in raw.columns if name not in apart]
         for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
             cells = [str(cell).strip() for cell in raw.columns[name] if cell][:100]
