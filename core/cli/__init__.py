@@ -14,7 +14,6 @@ May import every room.
 
 from __future__ import annotations
 
-import signal
 import sys
 from typing import Any
 
@@ -26,9 +25,11 @@ interrupts: list[int] = []
 
 def begin() -> int:
     """Import the program and run it: one that cannot be imported never ends with the exit status of an alarm."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, _interrupt)
     try:
+        import signal
+
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         from uncertain_lti.cli.main import main as run
     except (Exception, KeyboardInterrupt) as error:
         if interrupts or isinstance(error, KeyboardInterrupt):
