@@ -76,16 +76,27 @@ def test_a_damaged_installation_is_no_alarm(module, status):
     assert "uncertain-lti = uncertain_lti.cli:begin" in (ROOT / "setup.py").read_text()
 
 
-def test_an_interrupt_before_there_is_a_program_is_said():
+@pytest.mark.parametrize("error", ["KeyboardInterrupt", "ImportError('umath failed to import')"])
+@pytest.mark.parametrize(
+    ("module", "said"),
+    [
+        ("uncertain_lti.base.errors", ": interrupted before anything was begun\n"),
+        ("uncertain_lti.recordings.bag", " topics: interrupted; no half-written file is left\n"),
+    ],
+)
+def test_an_interrupt_is_said_whatever_an_import_makes_of_it(module, said, error):
+    """As numpy and rclpy do."""
     first = (
-        "import builtins, sys; from uncertain_lti.cli import begin as main; real = builtins.__import__\n"
+        "import builtins, signal, sys; from uncertain_lti.cli import begin as main; real = builtins.__import__\n"
         "def interrupted(name, *rest):\n"
-        "    if name == 'uncertain_lti.base.errors': raise KeyboardInterrupt\n"
+        f"    if name == {module!r}:\n"
+        "        try: signal.raise_signal(signal.SIGINT)\n"
+        f"        except KeyboardInterrupt: raise {error} from None\n"
         "    return real(name, *rest)\n"
         "builtins.__import__ = interrupted; sys.exit(main())"
     )
-    done = run(["play", "x.mcap"], [sys.executable, "-c", first], capture_output=True)
-    assert (done.returncode, done.stderr) == (130, "uncertain-lti: interrupted before anything was begun\n")
+    done = run(["topics", "x.mcap"], [sys.executable, "-c", first], capture_output=True)
+    assert (done.returncode, done.stderr) == (130, f"uncertain-lti{said}")
 
 
 def test_nobody_reads_what_is_said(folder):

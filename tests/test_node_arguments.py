@@ -168,6 +168,11 @@ def test_a_process_ends_with_the_sentence_too(tmp_path: Path, node: str) -> None
     assert f"parameter {name} is " in refusal(process(tmp_path, code, "--ros-args", "-p", f"{name}:=[a]"), node)
 
 
+def test_where_no_log_can_be_written_another_folder_is_asked_for(start: Start) -> None:
+    """As in a container that is read only, or where HOME is not set."""
+    assert refusal(start(ROS_LOG_DIR="/dev/null/log")).endswith("; set ROS_LOG_DIR to a folder that can be written")
+
+
 def test_the_turbofan_refuses_a_manoeuvre_that_there_is_not(start: Start) -> None:
     assert "loop" in refusal(start("--ros-args", "-p", "manoeuvre:=loop", node="turbofan"), "turbofan")
 

@@ -25,7 +25,7 @@ from refusals import refuses
 from uncertain_lti import SignalMap, UncertainLTI, read_transients
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cli.main import main
-from uncertain_lti.proposal.init import run_column
+from uncertain_lti.proposal.init import propose, run_column
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
 from uncertain_lti.recordings.table_files import _of_arrays, read_table
@@ -735,14 +735,36 @@ def test_signals_have_the_length_of_a_recording_and_not_that_of_its_parameters(t
 
 
 def test_cells_of_several_numbers_are_told(tmp_path):
-    """Two pressures and a clock in one quoted cell were gone without a word."""
+    """Two pressures and a clock in one quoted cell were gone without a word, and a temperature with its unit."""
     bag = read_csv(
         tmp_path,
-        "time,x,raw,at,say",
-        (f'{k},{k % 7},"1.0{k % 9},2.54,59{k}",2026-11-22 06:28:00,3 ok' for k in range(9)),
+        "time,x,raw,at,say,inlet",
+        (f'{k},{k % 7},"1.0{k % 9},2.54,59{k}",2026-11-22 06:28:00,3 ok,2{k}.5 °C' for k in range(9)),
     )
-    (said,) = bag.warnings
-    assert "column 'raw' left out" in said and "several numbers, such as '1.00,2.54,590': write a column for" in said
+    said, of_unit = bag.warnings
+    assert "column 'raw' left out" in said and "number alone, such as '1.00,2.54,590': write one in each" in said
+    assert "column 'inlet' left out, as no cell is a number alone, such as '20.5 °C'" in of_unit
+
+
+def test_a_table_in_which_nothing_is_a_state_is_refused_with_what_was_left_out(tmp_path):
+    (tmp_path / "a.csv").write_text("t,speed\n" + "".join(f'{k},"1,0{k % 90 + 10}.5"\n' for k in range(200)))
+    with pytest.raises(BagError, match=r"nothing in it looks like .*column 'speed' left out.* such as '1,010.5'"):
+        propose([str(tmp_path / "a.csv")])
+
+
+def test_rows_out_of_order_are_told(tmp_path):
+    bag = read_csv(tmp_path, "time,x", (f"{k * 7 % 20},{k % 3}" for k in range(20)))
+    assert "6 of 20 rows are older than the row before: sort the rows by 'time', or name" in bag.warnings[0]
+
+
+def test_runs_in_a_table_may_step_back_before_the_first(tmp_path):
+    """The newer half came first, so that no time passed from the first row to the last, and nothing was proposed."""
+    rng, x, rows = np.random.default_rng(0), 0.0, []
+    for k in range(800):
+        rows.append(f"{0.02 * (k + 800 * (k < 400)):.2f},{x},{(u := k // 37 % 2)}")
+        x += 0.1 * (u - x) + 0.001 * rng.normal()
+    (tmp_path / "a.csv").write_text("\n".join(["t,speed,command", *rows, ""]))
+    assert [c.name for c in propose([str(tmp_path / "a.csv")]).states] == ["speed"]
 
 
 def test_names_that_fit_the_rows_are_theirs_and_not_older_ones_above(tmp_path):

@@ -107,8 +107,9 @@ def publish(life: Life, node: Plant, make: Callable[[], Transient]) -> int:
     """Publish a transient once both topics have subscribers, and wait until it has been received."""
     wait = node.given["wait"]
     if not life.until(lambda: all(publisher.get_subscription_count() for publisher in node.outputs), wait):
-        if life.alive:
-            node.get_logger().error(f"no subscriber of both topics within {wait:g} s; start one first")
+        if not life.alive:
+            return 0
+        node.get_logger().error(f"no subscriber of both topics within {wait:g} s; start one first")
         return 2
     life.until(lambda: False, _SETTLE)
     run = make()

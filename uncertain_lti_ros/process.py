@@ -228,7 +228,9 @@ def in_words(error: Exception) -> str:
     text = text.replace("error not set", "rcl gives no reason")
     quoted = re.search(r"'(-\S+) ([^']*)'\W*(?:Error: )?(.*)", text)
     if quoted is None or quoted[1] not in _FORMS:
-        return f"rclpy cannot start: {text}; check the ROS arguments and the environment variables of ROS"
+        logs = "failed to initialize logging" in text
+        remedy = "set ROS_LOG_DIR to a folder that can be written" if logs else "check the ROS arguments and variables"
+        return f"rclpy cannot start: {text}; {remedy}"
     flag, value, why = quoted.groups()
     form = _FORMS[flag]
     if form == _FILE:

@@ -15,22 +15,34 @@ May import every room.
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 FAULT, INTERRUPTED = 70, 130
 """Exit statuses: of a fault of the program itself, and of an interrupt; here, as nothing need be imported for them."""
+interrupts: list[int] = []
+"""Those that came: what is being imported may turn one into an error of its own."""
 
 
 def begin() -> int:
     """Import the program and run it: one that cannot be imported never ends with the exit status of an alarm."""
     try:
+        import signal
+
+        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+            signal.signal(signal.SIGINT, _interrupt)
         from uncertain_lti.cli.main import main as run
-    except KeyboardInterrupt:
-        print("uncertain-lti: interrupted before anything was begun", file=sys.stderr)
-        return INTERRUPTED
-    except Exception:
+    except (Exception, KeyboardInterrupt) as error:
+        if interrupts or isinstance(error, KeyboardInterrupt):
+            print("uncertain-lti: interrupted before anything was begun", file=sys.stderr)
+            return INTERRUPTED
         import traceback
 
         traceback.print_exc()
         print("uncertain-lti: the installation is damaged; install uncertain-lti-ros again", file=sys.stderr)
         return FAULT
     return run()
+
+
+def _interrupt(number: int, frame: Any) -> None:
+    interrupts.append(number)
+    raise KeyboardInterrupt

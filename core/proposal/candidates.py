@@ -125,7 +125,7 @@ class Source:
         """Messages per second, by the usual step (`usual_step`), 1/s."""
         runs = [a for a in self.arrival if len(a) > 1]
         steps = np.concatenate([np.diff(a) for a in runs]) if runs else np.empty(0)
-        span = sum(float(a[-1] - a[0]) for a in runs)
+        span = float(steps[steps > 0].sum())  # of a table, time may step back to another run
         step, _ = usual_step(float(np.median(steps)), span, len(steps)) if span > 0 else (0.0, False)
         return 1e9 / step if step > 0 else 0.0
 

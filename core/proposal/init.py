@@ -404,7 +404,8 @@ def propose(
     sources += [s for s in commands if s not in sources]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
-        reasons = "; ".join(dict.fromkeys(f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]))
+        why = [f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]]
+        reasons = "; ".join(dict.fromkeys([*why, *warnings[:3]]))
         nothing = f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})"
         if any(s.reason == _APART for s in sources):
             raise BagError(f"{nothing}; give recordings of one machine, with the same topics")

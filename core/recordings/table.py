@@ -45,6 +45,7 @@ TYPE = "table"
 """Its message type."""
 
 _PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*")
+_QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*([^\d\s]\S{0,7})")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
@@ -84,12 +85,16 @@ class Table(Recording):
         if (steps < 0).any() and (steps <= 0).all():
             kept = kept[::-1]
             self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
+        elif (older := np.count_nonzero(steps < 0)) > 0.1 * len(kept):
+            remedy = f"sort the rows by '{time}', or name a column of runs in a signals file, `table: {{runs: COLUMN}}`"
+            self._warnings.append(f"{path}: {older} of {len(kept)} rows are older than the row before: {remedy}")
         names = [name for name in raw.columns if name not in apart]
         for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
-            cell = next((str(cell) for cell in raw.columns[name] if cell), "")
-            if _PACKED.fullmatch(cell):
-                several = f"column '{name}' left out, as its cells hold several numbers, such as '{cell[:40]}'"
-                self._warnings.append(f"{file}: {several}: write a column for each")
+            cells = [str(cell).strip() for cell in raw.columns[name] if cell][:100]
+            units = {found and found[1] for found in map(_QUANTITY.fullmatch, cells)}
+            if cells and (_PACKED.fullmatch(cells[0]) or len(units) == 1 < len(set(cells)) and None not in units):
+                unread = f"column '{name}' left out, as no cell is a number alone, such as '{cells[0][:40]}'"
+                self._warnings.append(f"{file}: {unread}: write one in each, without unit or separator of thousands")
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
             number, unit = _for_each_time(times[kept], {name: raw.columns[name][kept] for name in names})
             each = f"are the {number} rows of a time one for each of {number} units? then "
