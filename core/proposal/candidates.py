@@ -181,14 +181,12 @@ class Steps:
         freedom = N - n - m - 1
         if freedom < 5 or not m:
             return np.zeros((1 + m, n))
-        from scipy.linalg import solve_triangular
-
         scaled = [values / size_of(values) for values in (self.X, self.U)]
         R: Array = np.asarray(np.linalg.qr(np.hstack([np.ones((N, 1)), *scaled, self.dX]), mode="r"))
         own, explained = R[1 + n : 1 + n + m, 1 + n : 1 + n + m], R[1 + n : 1 + n + m, 1 + n + m :]
         full = (R[1 + n + m :, 1 + n + m :] ** 2).sum(axis=0)
-        own[np.diag_indices(m)] += 1e-300 * (np.diagonal(own) == 0.0)
-        inverse = solve_triangular(own, np.eye(m))
+        own[np.diag_indices(m)] += 1e-100 * (np.diagonal(own) == 0.0)
+        inverse = np.linalg.inv(own)
         gains = (inverse @ explained) ** 2 / (inverse**2).sum(axis=1)[:, None]
         return np.vstack(
             [
