@@ -1026,6 +1026,19 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])
 
 
+def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
+    """Another drive is elsewhere, and a mode is set: what it does not do again would be an alarm."""
+    rng = np.random.default_rng(3)
+    u, mode = np.repeat(rng.normal(size=60), 25), np.repeat(rng.choice([0.0, 9.0, 10.0], size=30), 50)
+    speed, lat_g = answers(rng, np.column_stack([u + 0.1 * mode, u])).T
+    way = np.round(np.cumsum(np.abs(speed)), 1)
+    columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "gps_lon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
+    columns |= {"speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == ["speed", "lat_g"], proposal.text
+    assert [c.path for c in proposal.controls] == ["throttle", "c1_mode"], proposal.text
+
+
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
     """A row number begins again in the next file, and a gain has another value there."""
     files = []

@@ -452,11 +452,20 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     return warnings
 
 
+_CODE = re.compile(r"(^|_)(mode|status|state|flag|gear)(_?\d+)?$")
+"""Name of a column that, with whole numbers up to `_LABELS` of them, says what a machine was switched to."""
+
+
+def _is_code(candidate: Candidate) -> bool:
+    values = np.unique(candidate.finite) if _CODE.search(candidate.path.lower()) else np.empty(0)
+    return 0 < len(values) <= _LABELS and bool((values == np.rint(values)).all())
+
+
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls."""
     found = []
     for table in (s for s in sources if s.type == TYPE and s.role == "state"):
-        if switches := [c for c in table.candidates if c.reason == TWO_VALUES]:
+        if switches := [c for c in table.candidates if c.reason == TWO_VALUES or (not c.reason and _is_code(c))]:
             found.append(table.parted(switches, "switch"))
         for candidate in switches:
             candidate.reason = ""

@@ -78,6 +78,8 @@ _RUN = re.compile(
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch"}  # words in the name of one
+_CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
+_PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
 
 
@@ -276,6 +278,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
+    if source.type == TYPE and _PLACE.search(candidate.path.lower()):
+        return "a place on the map, and another run may be elsewhere"
     clock = called_time(candidate.path.rpartition(".")[2]) or not _CLOCK.isdisjoint(words_of(candidate.path))
     if clock:
         steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
