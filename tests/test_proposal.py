@@ -1039,6 +1039,26 @@ def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     assert [c.path for c in proposal.controls] == ["throttle", "c1_mode"], proposal.text
 
 
+@pytest.mark.parametrize(("name", "step"), [("q{}", 0.05), ("pose.orientation.{}", 0.05), ("Q_{}", 2.0)])
+def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
+    """q and -q are one attitude: what jumps in each column is no movement, and in the next run an alarm."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    yaw = np.cumsum(answers(rng, u[:, None])[:, 0]) / 10
+    sign = rng.choice([-1.0, 1.0], size=len(u))
+    parts = {"x": 0 * u, "y": 0 * u, "z": sign * np.sin(yaw / 2), "w": sign * np.cos(yaw / 2)}
+    letters = str.upper if "Q" in name else str
+    columns = {name.format(letters(axis)): part for axis, part in parts.items()} | {"rudder_cmd": u}
+    path = table_of(tmp_path / "a.csv", columns, step * np.arange(len(u)))
+    proposal = propose([path])
+    (field,) = [c.path for c in proposal.states]
+    assert field in ("unwrap(yaw(q))", "unwrap(yaw(Q))", "unwrap(yaw(pose_orientation))")
+    assert "rudder_cmd" in [c.path for c in proposal.controls]
+    (tmp_path / "s.yaml").write_text(proposal.text)
+    (run,) = read_transients(path, tmp_path / "s.yaml")
+    assert np.abs(np.diff(run.x[:, 0]) - np.diff(yaw)).max() < 1e-9
+
+
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
     """A row number begins again in the next file, and a gain has another value there."""
     files = []

@@ -26,12 +26,13 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.recording import Recording, usual_step
 from uncertain_lti.recordings.table import TYPE, Table
-from uncertain_lti.signals.field_path import FUNCTIONS, QUATERNION
+from uncertain_lti.signals import field_path
+from uncertain_lti.signals.field_path import FUNCTIONS
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
 
-OF_QUATERNION = "|".join(name for name, function in FUNCTIONS.items() if function.takes is QUATERNION)
+OF_QUATERNION = "|".join(field_path.OF_QUATERNION)
 """Functions of a quaternion, as part of a regular expression."""
 WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wraps)
 """Functions that give an angle which jumps by a turn, likewise."""
