@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -200,8 +201,14 @@ class Table(Recording):
 
 
 def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:
-    """Every run of some files; those that hold one signal each of the same time get a warning."""
+    """Every run of some files; those with one signal each of the same time, or in another unit, get a warning."""
     tables = [run for path in paths for run in _every_run(path, layout or TableLayout())]
+    steps = [(float(np.median(np.diff(t.times))), t) for t in tables if len(t.times) > 2]
+    least, fastest = min(steps, key=lambda one: one[0], default=(0.0, None))
+    for (step, table), (unit, times) in product(steps, (("ms", 1e3), ("us", 1e6))):
+        if fastest is not None and 0.8 * step < least * times < 1.25 * step:
+            words = f"its steps are {step / least:.4g} times those of {fastest.path}: if its times are in {unit}"
+            table._warnings.append(f"{table.path}: {words} and those in s, call its column time_{unit}")
     alone = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED and _is_alone(t)]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
