@@ -1060,19 +1060,22 @@ def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
 
 
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
-    """A row number begins again in the next file, and a gain has another value there."""
+    """A row number begins again in the next file, cycles on the next day, and a gain has another value there."""
     files = []
     for run, gain in enumerate((0.1, 0.4, 0.2)):
         level = np.cumsum(np.random.default_rng(run).normal(size=300))
         columns = {
             "sno": np.arange(1, 301),
             "ki": np.full(300, gain),
+            "Cycle": np.arange(300) % 170 // 4,
+            "Robot_ProtectiveStop": (np.arange(300) > 296) * 1.0,
             "level": level,
             "flow": np.diff(level, prepend=0),
         }
         files.append(table_of(tmp_path / f"{run}.csv", columns))
     found = propose(files)
-    assert {"sno", "ki"}.isdisjoint(candidate.path for candidate in (*found.states, *found.controls))
+    assert {c.path for c in (*found.states, *found.controls)} <= {"level", "flow"}
+    assert any(w.startswith("Robot_ProtectiveStop looks like a label, and is not 0 in 9 rows") for w in found.warnings)
     assert "grows as a clock or a counter does" in found.text and "a setting, and no measurement" in found.text
 
 

@@ -333,7 +333,10 @@ _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in 
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
 
 
-_LABEL = re.compile(r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal)")
+_LABEL = re.compile(
+    r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
+    r"alarm|emergency|(^|_)e_?stop|protective_?stop)"
+)
 _LABELS = 30
 """Values that a label takes, at most."""
 
