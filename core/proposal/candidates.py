@@ -467,9 +467,11 @@ def _is_code(candidate: Candidate) -> bool:
 
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls."""
-    found = []
+    found, commanded = [], any(s.role == "control" and s.free for s in sources)
     for table in (s for s in sources if s.type == TYPE and s.role == "state"):
-        if switches := [c for c in table.candidates if c.reason == TWO_VALUES or (not c.reason and _is_code(c))]:
+        for candidate in filter(_is_code, table.free if commanded else ()):  # else it may be the only one
+            candidate.reason, candidate.ready = "a code by its name, and its numbers are no amounts", "control"
+        if switches := [c for c in table.candidates if c.reason == TWO_VALUES]:
             found.append(table.parted(switches, "switch"))
         for candidate in switches:
             candidate.reason = ""
