@@ -273,6 +273,13 @@ def test_the_run_of_a_row_that_grows_by_itself_is_its_sum() -> None:
     assert found.largest_run[0] == pytest.approx(found.largest_sum[0]) == pytest.approx(99e-4 / 0.5)
 
 
+def test_the_run_of_a_row_that_overshoots_goes_to_its_rest_in_a_step() -> None:
+    """Followed freely, an own element below -2 a step would multiply the least step beyond all numbers, too."""
+    t, u = 0.1 * np.arange(100), np.full((100, 1), 1e-3)
+    model = UncertainLTI([[-50.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5])
+    assert repeats_of(model, [Transient(t, np.zeros((100, 1)), u)]).largest_run[0] == pytest.approx(1e-4 / 0.5)
+
+
 @pytest.mark.parametrize("beyond", [0.09, 0.11])
 def test_outside_the_fitted_ranges_nothing_is_called_frozen(beyond: float) -> None:
     domain = Domain(np.zeros(1), np.ones(1), np.zeros(1), np.ones(1))

@@ -1054,20 +1054,57 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])
 
 
+def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
+    """Another drive is elsewhere, and the numbers of a mode are names: neither tells what comes next."""
+    rng = np.random.default_rng(3)
+    u, mode = np.repeat(rng.normal(size=60), 25), np.repeat(rng.choice([0.0, 9.0, 10.0], size=30), 50)
+    speed, lat_g = answers(rng, np.column_stack([u + 0.1 * mode, u])).T
+    way = np.round(np.cumsum(np.abs(speed)), 1)
+    columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "gps_lon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
+    columns |= {"speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == ["speed", "lat_g"], proposal.text
+    assert [c.path for c in proposal.controls] == ["throttle"], proposal.text
+    assert "c1_mode" in proposal.text and "a code by its name, and its numbers are no amounts" in proposal.text
+
+
+@pytest.mark.parametrize(("name", "step"), [("q{}", 0.05), ("pose.orientation.{}", 0.05), ("Q_{}", 2.0)])
+def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
+    """q and -q are one attitude: what jumps in each column is no movement, and in the next run an alarm."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    yaw = np.cumsum(answers(rng, u[:, None])[:, 0]) / 10
+    sign = rng.choice([-1.0, 1.0], size=len(u))
+    parts = {"x": 0 * u, "y": 0 * u, "z": sign * np.sin(yaw / 2), "w": sign * np.cos(yaw / 2)}
+    letters = str.upper if "Q" in name else str
+    columns = {name.format(letters(axis)): part for axis, part in parts.items()} | {"rudder_cmd": u}
+    path = table_of(tmp_path / "a.csv", columns, step * np.arange(len(u)))
+    proposal = propose([path])
+    (field,) = [c.path for c in proposal.states]
+    assert field in ("unwrap(yaw(q))", "unwrap(yaw(Q))", "unwrap(yaw(pose_orientation))")
+    assert "rudder_cmd" in [c.path for c in proposal.controls]
+    (tmp_path / "s.yaml").write_text(proposal.text)
+    (run,) = read_transients(path, tmp_path / "s.yaml")
+    assert np.abs(np.diff(run.x[:, 0]) - np.diff(yaw)).max() < 1e-9
+
+
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
-    """A row number begins again in the next file, and a gain has another value there."""
+    """A row number begins again in the next file, cycles on the next day, and a gain has another value there."""
     files = []
     for run, gain in enumerate((0.1, 0.4, 0.2)):
         level = np.cumsum(np.random.default_rng(run).normal(size=300))
         columns = {
             "sno": np.arange(1, 301),
             "ki": np.full(300, gain),
+            "Cycle": np.arange(300) % 170 // 4,
+            "Robot_ProtectiveStop": (np.arange(300) > 296) * 1.0,
             "level": level,
             "flow": np.diff(level, prepend=0),
         }
         files.append(table_of(tmp_path / f"{run}.csv", columns))
     found = propose(files)
-    assert {"sno", "ki"}.isdisjoint(candidate.path for candidate in (*found.states, *found.controls))
+    assert {c.path for c in (*found.states, *found.controls)} <= {"level", "flow"}
+    assert any(w.startswith("Robot_ProtectiveStop looks like a label, and is not 0 in 9 rows") for w in found.warnings)
     assert "grows as a clock or a counter does" in found.text and "a setting, and no measurement" in found.text
 
 

@@ -443,6 +443,17 @@ def test_an_unclosed_quote_is_a_sentence_with_its_line(tmp_path):
         Table(write(tmp_path / "a.csv", "time,x,mode", *rows))
 
 
+@pytest.mark.parametrize(("times", "warned"), [(1000, ["ms"]), (1e6, ["us"]), (100, [])])
+def test_a_file_whose_times_seem_to_be_in_another_unit_is_told(tmp_path, times, warned):
+    """Of one robot, whose author wrote ms first: 9581 s were fitted beside 8 s, and the advice was `step: constant`."""
+    one, other = (
+        write(tmp_path / name, "time,x", *(f"{0.011 * k * factor},{k}" for k in range(9)))
+        for name, factor in (("a.csv", times), ("b.csv", 1))
+    )
+    words = [w for bag in group_recordings([one, other]) for w in bag.warnings if "call its column time_" in w]
+    assert [w.rpartition("_")[2] for w in words] == warned
+
+
 def test_rows_without_a_run_are_counted(tmp_path):
     path = write(tmp_path / "a.csv", "time,x,run", "0,1,a", "1,2,", "2,3,", "3,4,b")
     tables = group_recordings([path], layout=TableLayout(runs="run"))

@@ -148,7 +148,7 @@ cdef class Repeating:
             if not outside:
                 movement = 0.5 * (lower[i] + upper[i]) - after[i]
                 half = 0.5 * (upper[i] - lower[i]) / self.margin
-                repeat.run += dt * fmin(own[i], 0.0) * repeat.run + movement
+                repeat.run += fmax(dt * fmin(own[i], 0.0), -1.0) * repeat.run + movement
                 repeat.total += movement
                 repeat.half = half if half > repeat.half else repeat.half
                 repeat.steps += 1

@@ -12,10 +12,11 @@ r"""Repeats: how long states repeat exactly in healthy recordings, how far the m
 A repeat of state i is a run of transitions over which its recorded value stays the same, to the bit. With the step
 :math:`Δt_j`, the centre of the bounds :math:`\hat x_j` and the repeated value r, the nominal model moves the state by
 
-    run_{j+1} = run_j + Δt_j min(a_ii, 0) run_j + (\hat x_j - r),    sum_{j+1} = sum_j + (\hat x_j - r)
+    run_{j+1} = run_j - clip(-Δt_j a_ii, 0, 1) run_j + (\hat x_j - r),    sum_{j+1} = sum_j + (\hat x_j - r)
 
-both from 0 at the last fresh sample: the run is the state's own equation followed freely, with every other state as it
-was recorded, and the sum holds the state where it was read. Both are given in half-widths, the largest of the repeat.
+both from 0 at the last fresh sample: the run is the state's own equation followed freely, in a step to its rest at
+most, with every other state as it was recorded, and the sum holds the state where it was read. Both are given in
+half-widths, the largest of the repeat.
 
 The activity of the machine, as it concerns state i, is the range of (\\hat x_j - r) / Δt_j over the repeat, in
 half-widths: as r stays, it changes with the controls and the other states alone. The fit learns how active the machine

@@ -27,12 +27,13 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.recording import Recording, usual_step
 from uncertain_lti.recordings.table import TYPE, Table
-from uncertain_lti.signals.field_path import FUNCTIONS, QUATERNION
+from uncertain_lti.signals import field_path
+from uncertain_lti.signals.field_path import FUNCTIONS
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
 
-OF_QUATERNION = "|".join(name for name, function in FUNCTIONS.items() if function.takes is QUATERNION)
+OF_QUATERNION = "|".join(field_path.OF_QUATERNION)
 """Functions of a quaternion, as part of a regular expression."""
 WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wraps)
 """Functions that give an angle which jumps by a turn, likewise."""
@@ -344,7 +345,10 @@ _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in 
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
 
 
-_LABEL = re.compile(r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal)")
+_LABEL = re.compile(
+    r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
+    r"alarm|emergency|(^|_)e_?stop|protective_?stop)"
+)
 _LABELS = 30
 """Values that a label takes, at most."""
 
@@ -464,10 +468,21 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     return warnings
 
 
+_CODE = re.compile(r"(^|_)(mode|status|state|flag|gear)(_?\d+)?$")
+"""Name of a column that, with whole numbers up to `_LABELS` of them, says what a machine was switched to."""
+
+
+def _is_code(candidate: Candidate) -> bool:
+    values = np.unique(candidate.finite) if _CODE.search(candidate.path.lower()) else np.empty(0)
+    return 0 < len(values) <= _LABELS and bool((values == np.rint(values)).all())
+
+
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls."""
-    found = []
+    found, commanded = [], any(s.role == "control" and s.free for s in sources)
     for table in (s for s in sources if s.type == TYPE and s.role == "state"):
+        for candidate in filter(_is_code, table.free if commanded else ()):  # else it may be the only one
+            candidate.reason, candidate.ready = "a code by its name, and its numbers are no amounts", "control"
         if switches := [c for c in table.candidates if c.reason == TWO_VALUES]:
             found.append(table.parted(switches, "switch"))
         for candidate in switches:

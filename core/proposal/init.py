@@ -78,6 +78,9 @@ _RUN = re.compile(
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch"}  # words in the name of one
+_CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
+_COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
+_PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
 
 
@@ -279,8 +282,10 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    clock = called_time(candidate.path.rpartition(".")[2]) or not _CLOCK.isdisjoint(words_of(candidate.path))
-    if clock:
+    if source.type == TYPE and _PLACE.search(candidate.path.lower()):
+        return "a place on the map, and another run may be elsewhere"
+    names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
+    if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
         steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
         clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
     if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival))):

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,7 +37,7 @@ from uncertain_lti.recordings.table_times import (
     may_be,
 )
 from uncertain_lti.recordings.unreadable import missing
-from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
+from uncertain_lti.signals.field_path import OF_QUATERNION, FieldPath, FieldType, TypeFields
 from uncertain_lti.signals.values import TableLayout
 
 TOPIC = "/table"
@@ -64,7 +65,7 @@ class Table(Recording):
 
     Rows are taken in the order of the file: where the time steps back, another run may begin, and the rules of sampling
     decide. Rows without a time are left out. A column is a field of the topic `/table`, by its name with everything but
-    letters, digits and underscores replaced; a matrix is an array.
+    letters, digits and underscores replaced; a matrix is an array, and four of a quaternion are one field besides.
 
     `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run.
     """
@@ -110,6 +111,7 @@ class Table(Recording):
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
         fields = zip(once(map(field_name, names), "_"), names, strict=True)
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
+        self._quaternions = _quaternions(self.columns_by_field)
         first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
         reason = ""
         if not names:
@@ -127,8 +129,11 @@ class Table(Recording):
         """Columns as fields."""
         self._require([topic])
         fields = {name: _field_type(column) for name, column in self.columns_by_field.items()}
+        fields |= {base: FieldType("message", _QUATERNION) for base in self._quaternions}
 
         def of(type_name: str) -> Mapping[str, FieldType]:
+            if type_name == _QUATERNION:
+                return dict.fromkeys("xyzw", FieldType("number", "float64"))
             if type_name != TYPE:
                 raise SignalError(f"{type_name}: a table has no such type; check the type")
             return fields
@@ -164,13 +169,22 @@ class Table(Recording):
         steps = np.diff(self.times)
         step = float(np.median(steps)) if len(steps) else 0.0
         numbers = [(name, c) for name, c in self.columns_by_field.items() if _field_type(c).kind == "number"]
-        fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in numbers)
+        parts = {name for names in self._quaternions.values() for name in names}
+        whole = [(name, c) for name, c in numbers if name not in parts]
+        fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in whole)
+        for base in self._quaternions:
+            fields += (*(f"{base}.{axis}" for axis in "xyzw"), *(f"{name}({base})" for name in OF_QUATERNION))
         gap = float(steps.max()) * 1e-9 if len(steps) else None
         return [TopicFacts(self.topics[TOPIC], 1e9 / step if step > 0 else None, gap, fields, "none", None)]
 
     def _values(self, path: FieldPath) -> Any:
         """What `FieldPath.read` gives for every row."""
         steps = path.steps
+        if parts := self._quaternions.get(str(steps[0][1])):
+            columns = [self.columns_by_field[name] for name in parts]
+            if path.function is None:
+                return columns["xyzw".index(str(steps[1][1]))]
+            return list(map(path.function.of_parts, *(column.tolist() for column in columns)))
         column = self.columns_by_field.get(str(steps[0][1]), np.empty(0))
         if not column.size and len(self.times):
             there = shortlist(list(self.columns_by_field), 50)
@@ -192,8 +206,14 @@ class Table(Recording):
 
 
 def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:
-    """Every run of some files; those that hold one signal each of the same time get a warning."""
+    """Every run of some files; those with one signal each of the same time, or in another unit, get a warning."""
     tables = [run for path in paths for run in _every_run(path, layout or TableLayout())]
+    steps = [(float(np.median(np.diff(t.times))), t) for t in tables if len(t.times) > 2]
+    least, fastest = min(steps, key=lambda one: one[0], default=(0.0, None))
+    for (step, table), (unit, times) in product(steps, (("ms", 1e3), ("us", 1e6))):
+        if fastest is not None and 0.8 * step < least * times < 1.25 * step:
+            words = f"its steps are {step / least:.4g} times those of {fastest.path}: if its times are in {unit}"
+            table._warnings.append(f"{table.path}: {words} and those in s, call its column time_{unit}")
     alone = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED and _is_alone(t)]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
@@ -304,6 +324,22 @@ def _names_signals(columns: Mapping[str, Column]) -> str:
             if len(set(column.tolist())) <= len(column) // 20:
                 return name
     return ""
+
+
+_QUATERNION = "quaternion"
+"""Type of four columns that are one."""
+
+
+def _quaternions(columns: Mapping[str, Column]) -> dict[str, list[str]]:
+    """Names of four columns that end in x, y, z and w, by what they begin with: `q` of `qw`, `qx`, `qy` and `qz`."""
+    found = {}
+    for name in columns:
+        base = name[:-1].rstrip("_")
+        parts = [name[:-1] + axis for axis in ("XYZW" if name[-1] == "W" else "xyzw")]
+        if name == parts[3] and base and base not in columns and all(part in columns for part in parts):
+            if all(_field_type(columns[part]) == FieldType("number", "float64") for part in parts):
+                found[base] = parts
+    return found
 
 
 def _field_type(column: Column) -> FieldType:
