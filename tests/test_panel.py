@@ -23,6 +23,7 @@ from uncertain_lti.identification import fitting
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.reports.check import check_data
+from uncertain_lti.reports.findings import findings
 from uncertain_lti.validation.detectable import _alarming
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
@@ -407,10 +408,11 @@ def test_recordings_that_do_not_repeat_one_another_are_named(runs):
     alarm = model.fit_summary["alarm"]
     assert alarm["worth"] == "unproven" and len(alarm["unlike"]) >= 2
     assert alarm["headline"].startswith("unproven: 2 recordings of 3 do not repeat what the others show")
-    quiet, loud = (
-        check_data(model, EnvelopeMonitor(model).check(runs[0].replace(x=x)))
-        for x in (runs[0].x, np.roll(runs[0].x, 1, axis=1))
-    )
+    swapped = np.roll(runs[0].x, 1, axis=1)
+    checked = [EnvelopeMonitor(model).check(run) for run in (runs[0], runs[0].replace(x=swapped))]
+    quiet, loud = (check_data(model, verdicts) for verdicts in checked)
+    reasons = findings(model, "machine.model.json", checked)["rely"]["reasons"]
+    assert [r["weight"] for r in reasons if r["about"] == "alarm"] == ["unknown"]
     assert (quiet["outcome"], quiet["reason"]) == ("quiet", "")
     assert loud["outcome"] == "alarm" and loud["reason"] == f"the model is {alarm['headline']}"
 
