@@ -27,13 +27,12 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.recording import Recording, usual_step
 from uncertain_lti.recordings.table import TYPE, Table
-from uncertain_lti.signals import field_path
-from uncertain_lti.signals.field_path import FUNCTIONS
+from uncertain_lti.signals.field_path import FUNCTIONS, of_quaternion
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
 
-OF_QUATERNION = "|".join(field_path.OF_QUATERNION)
+OF_QUATERNION = "|".join(of_quaternion())
 """Functions of a quaternion, as part of a regular expression."""
 WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wraps)
 """Functions that give an angle which jumps by a turn, likewise."""

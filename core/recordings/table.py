@@ -37,7 +37,7 @@ from uncertain_lti.recordings.table_times import (
     may_be,
 )
 from uncertain_lti.recordings.unreadable import missing
-from uncertain_lti.signals.field_path import OF_QUATERNION, FieldPath, FieldType, TypeFields
+from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, of_quaternion
 from uncertain_lti.signals.values import TableLayout
 
 TOPIC = "/table"
@@ -173,7 +173,7 @@ class Table(Recording):
         whole = [(name, c) for name, c in numbers if name not in parts]
         fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in whole)
         for base in self._quaternions:
-            fields += (*(f"{base}.{axis}" for axis in "xyzw"), *(f"{name}({base})" for name in OF_QUATERNION))
+            fields += (*(f"{base}.{axis}" for axis in "xyzw"), *(f"{name}({base})" for name in of_quaternion()))
         gap = float(steps.max()) * 1e-9 if len(steps) else None
         return [TopicFacts(self.topics[TOPIC], 1e9 / step if step > 0 else None, gap, fields, "none", None)]
 

@@ -113,8 +113,11 @@ FUNCTIONS: Mapping[str, FieldFunction] = {
     "norm": FieldFunction(VECTOR, _unchanged, math.hypot),
 }
 """Name in a signals file -> function. A function added here can be used in recordings, live and by `init`."""
-OF_QUATERNION = tuple(name for name, function in FUNCTIONS.items() if function.takes is QUATERNION)
-"""Functions of a quaternion."""
+
+
+def of_quaternion() -> list[str]:
+    """Names of the functions of a quaternion."""
+    return [name for name, function in FUNCTIONS.items() if function.takes is QUATERNION]
 
 
 LONGEST_DELAY = 1_000_000
@@ -391,7 +394,7 @@ def signal_paths(
 def _inside(type_fields: TypeFields, field: FieldType, value: Any, path: str, depth: int) -> Iterator[str]:
     inner = type_fields(field.type_name)
     if set(inner) == set("xyzw") and all(part.kind == "number" for part in inner.values()):
-        yield from (f"{name}({path})" for name in OF_QUATERNION)
+        yield from (f"{name}({path})" for name in of_quaternion())
     yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1)
 
 
