@@ -48,6 +48,11 @@ WORTH_THREADS = 20_000
 """Transitions, or verdicts, from about which on what is done with all of them takes longer than to begin a thread."""
 
 
+def in_stretches(place: NDArray[np.intp], share: int, length: int) -> NDArray[np.bool_]:
+    """Which places (K,) are in one of so many stretches of a length: some of all, spread evenly, with neighbours."""
+    return np.asarray(place // length % share == 0)
+
+
 def core_count() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -19,8 +19,7 @@ from typing import Any
 
 FAULT, INTERRUPTED = 70, 130
 """Exit statuses: of a fault of the program itself, and of an interrupt; here, as nothing need be imported for them."""
-interrupts: list[int] = []
-"""Those that came: what is being imported may turn one into an error of its own."""
+_interrupts: list[int] = []
 
 
 def begin() -> int:
@@ -32,7 +31,7 @@ def begin() -> int:
             signal.signal(signal.SIGINT, _interrupt)
         from uncertain_lti.cli.main import main as run
     except (Exception, KeyboardInterrupt) as error:
-        if interrupts or isinstance(error, KeyboardInterrupt):
+        if interrupted(error):
             print("uncertain-lti: interrupted before anything was begun", file=sys.stderr)
             return INTERRUPTED
         import traceback
@@ -43,6 +42,11 @@ def begin() -> int:
     return run()
 
 
+def interrupted(error: BaseException) -> bool:
+    """Whether it comes of an interrupt: what is being imported may turn one into an error of its own."""
+    return bool(_interrupts) or isinstance(error, KeyboardInterrupt)
+
+
 def _interrupt(number: int, frame: Any) -> None:
-    interrupts.append(number)
+    _interrupts.append(number)
     raise KeyboardInterrupt

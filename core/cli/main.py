@@ -26,7 +26,7 @@ from typing import Any, NoReturn
 from uncertain_lti import __version__
 from uncertain_lti.base.errors import BagError, ModelError, UncertainLTIError, absent
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli import FAULT, INTERRUPTED, fit, interrupts, judge, start
+from uncertain_lti.cli import FAULT, INTERRUPTED, fit, interrupted, judge, start
 from uncertain_lti.cli.command import (
     BAD_INPUT,
     DONE,
@@ -181,7 +181,7 @@ def _run(command: str, given: Sequence[str]) -> int:
     except MemoryError:
         return _refuse(command, "there is not enough memory for this; give fewer or shorter recordings at a time")
     except (Exception, KeyboardInterrupt) as error:
-        if not interrupts and not isinstance(error, KeyboardInterrupt):
+        if not interrupted(error):
             return _fault(command)
         complain(command, "interrupted; no half-written file is left")
         return INTERRUPTED

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, in_stretches
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.horizon import unbroken_over
@@ -203,7 +203,7 @@ def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tup
     if len(usable) < 20 * p:
         return {}
     share = 1 + usable.size * (p + LONGEST_DELAY * (p - n)) // _ENOUGH
-    usable = usable[np.arange(usable.size) // _STRETCH % share == 0]
+    usable = usable[in_stretches(np.arange(usable.size), share, _STRETCH)]
     lagged = np.stack([problem.z_columns[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
     now = problem.z_columns[:n, usable]
     found = lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable])

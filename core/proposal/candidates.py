@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, in_stretches
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.recording import Recording, usual_step
@@ -255,7 +255,7 @@ def steps_of(
     found = [tuple(np.empty((0, len(columns))) for columns in (state, controls, state))]
     for number, every in enumerate(of[clock].arrival):
         rows = np.arange(len(every))
-        rows = rows[rows // _STRETCH % share == 0]
+        rows = rows[in_stretches(rows, share, _STRETCH)]
         arrival = every[rows]
         columns = [held(c, of[c.topic], number, of[clock], rows=rows) for c in [*state, *controls]]
         x, u = np.hsplit(np.column_stack(columns), [len(state)])

@@ -247,10 +247,8 @@ def _sift(source: Source) -> None:
     shared = shared_codes(list(each.values())) if source.type == TYPE else set()
     for candidate in source.free:
         values = each[id(candidate)]
-        if found := {
-            *codes(values),
-            *(code for code in shared if (values == code).any()),
-        }:  # numbers that stand for none
+        found = {*codes(values), *(code for code in shared if (values == code).any())}
+        if found:  # numbers that stand for none
             candidate.ignore = tuple(sorted(found))
             candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
         candidate.reason = _unfit(candidate, source)

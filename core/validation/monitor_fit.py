@@ -55,13 +55,11 @@ class Monitored:
         if panel is None:
             alarm: dict[str, Any] = {"not_learnt": self.why}
         else:
-            alarm = panel.summary(model)
+            alarm = panel.summary(model, "fitted" if self.validation is None else "left out")
             if model.memory:
                 model = model.replace(memory={**model.memory, "evidence": panel.evidence.to_dict()})
             if self.why:
                 alarm["note"] = self.why
-            if self.validation is None:
-                alarm["promises"] = [text.replace(" left out (", " fitted (") for text in alarm["promises"]]
         alarm |= {"centred": True} if self.centred else {}
         left = {"not_done": self.why} if self.validation is None else self.validation.judged_as(model).to_dict()
         return model.replace(fit_summary={**model.fit_summary, "alarm": alarm}, validation=left)

@@ -33,6 +33,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -223,7 +224,7 @@ class Panel:
         """Independent recordings, groups or blocks."""
         return len(self.evidence.peaks)
 
-    @property
+    @cached_property
     def alarming(self) -> int:
         """How many recordings, groups or blocks would alarm at the thresholds that all the others give."""
         evidence, rules = self.evidence, [rule for rule in self.rules if isinstance(rule, StatisticRule)]
@@ -240,10 +241,10 @@ class Panel:
         """Whether what was left out shows that one way to fit holds better than another."""
         return len(self.unlike) <= ALONE * self.units
 
-    def summary(self, model: UncertainLTI) -> dict[str, Any]:
-        """What `fit_summary["alarm"]` of its model says."""
+    def summary(self, model: UncertainLTI, shown: str = "left out") -> dict[str, Any]:
+        """What `fit_summary["alarm"]` of its model says; `shown`: what the data was that it is learnt from."""
         kind, headline = worth(model, self)
-        return {**self.to_dict(), "worth": kind, "headline": headline, "promises": promises(model, self)}
+        return {**self.to_dict(), "worth": kind, "headline": headline, "promises": promises(model, self, shown)}
 
     @property
     def needed_hours(self) -> float:
@@ -493,7 +494,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     return "good", f"worth having: {sees}"
 
 
-def promises(model: UncertainLTI, panel: Panel) -> list[str]:
+def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list[str]:
     """What the panel promises, a sentence each: false alarms, jumps seen, and what rate was asked for."""
     span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
     evidence = panel.evidence
@@ -504,10 +505,10 @@ def promises(model: UncertainLTI, panel: Panel) -> list[str]:
     sees += [f"of {shortlist(blind, 4)} not even a jump of ten times the recorded range"] if blind else []
     if math.isfinite(panel.limit):
         count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
-        shown = f"{count or 'none'} in {lasting(evidence.hours)} left out ({plural(panel.units, panel.what)})"
+        units = f"{lasting(evidence.hours)} {shown} ({plural(panel.units, panel.what)})"
         found = [
-            f"false alarms: {shown}, which shows at most {most:.7g} per hour with {CONFIDENCE:.0%} confidence, while "
-            f"the machine is run as in the recordings"
+            f"false alarms: {count or 'none'} in {units}, which shows at most {most:.7g} per hour with "
+            f"{CONFIDENCE:.0%} confidence, while the machine is run as in the recordings"
         ]
         if panel.what != "block":
             alarming = f"{panel.alarming or 'none'} of {plural(panel.units, panel.what)}"
