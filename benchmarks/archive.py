@@ -7,10 +7,11 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""A fit over 64 bags on a local Dask cluster of two workers, and from a cache on disk: the same model as in memory.
+"""A fit over 64 tables on a local Dask cluster of two workers, and from a cache on disk: the same model as in memory.
 
-python benchmarks/archive.py            # 64 bags of 5000 samples
+python benchmarks/archive.py            # 64 tables of 5000 samples
 python benchmarks/archive.py --quick    # of 500
+python benchmarks/archive.py --wide     # 20 tables of 100 000 samples of 50 states, on one, two and four workers
 
 Prints the time of each way, how far its matrices and its objective are from those of one process that holds everything
 in memory, and training transitions outside. In one of the runs a worker is killed while the fit is under way.
@@ -19,6 +20,7 @@ in memory, and training transitions outside. In one of the runs a worker is kill
 from __future__ import annotations
 
 import argparse
+import logging
 import os
 import platform
 import signal
@@ -27,57 +29,38 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from distributed import Client, LocalCluster
 from measure import best, table
-from recorded import JAZZY, Topic, message, write
 
 from uncertain_lti import read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
-from uncertain_lti.plants.leibov import leibov2006
+from uncertain_lti.identification.fleet import DaskFleet
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
-BAGS = 64
+COUNT = 64
+LOCAL = dict(threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
+LOCAL["silence_logs"] = logging.CRITICAL  # of the worker that is killed
 DT_NS = 25_000_000
-SIGNALS = SignalMap(
-    tuple(Signal(f"x{i}", "/state", f"position[{i}]") for i in range(5)),
-    tuple(Signal(f"u{j}", "/control", f"data[{j}]") for j in range(4)),
-)
 
 
-def runs(samples):
-    """States (bags, samples, 5) and controls (bags, samples, 4) of the published matrices, drawn at each step."""
+def tables(folder, count, samples, n, m):
+    """Tables of a machine of n states, every column a signal, and these signals."""
     rng = np.random.default_rng(0)
-    plant = leibov2006()
-    nominal, spread = np.hstack([plant.A, plant.B]), np.hstack([plant.dA, plant.dB])
-    u = np.repeat(rng.uniform(-1, 1, (BAGS, samples // 20 + 1, 4)), 20, axis=1)[:, :samples]
-    x = np.zeros((BAGS, samples, 5))
-    x[:, 0] = rng.uniform(-1, 1, (BAGS, 5))
+    A, B = 0.1 * rng.normal(size=(n, n)) - 2.0 * np.eye(n), rng.normal(size=(n, m))
+    names = [*(f"x{i}" for i in range(n)), *(f"u{j}" for j in range(m))]
+    u = rng.uniform(-1, 1, (count, samples // 20 + 1, m)).repeat(20, axis=1)[:, :samples]
+    x = rng.uniform(-1, 1, (samples, count, n))
     for k in range(samples - 1):
-        z = np.hstack([x[:, k], u[:, k]])
-        drawn = nominal + spread * rng.uniform(-1, 1, (BAGS, *nominal.shape))
-        x[:, k + 1] = x[:, k] + 1e-9 * DT_NS * np.einsum("bij,bj->bi", drawn, z)
-    return x, u
-
-
-def bags(folder, samples):
-    """The runs as recordings."""
-    header = message("std_msgs/msg/Header", stamp=message("builtin_interfaces/msg/Time", sec=0, nanosec=0), frame_id="")
-    layout = message("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
-    kinds = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
-    topics = [Topic("/state", kinds[0]), Topic("/control", kinds[1])]
-    empty = np.empty(0)
-    paths = []
-    for number, (x, u) in enumerate(zip(*runs(samples), strict=True)):
-        states = [message(kinds[0], header=header, name=[], position=v, velocity=empty, effort=empty) for v in x]
-        controls = [message(kinds[1], layout=layout, data=v) for v in u]
-        encoded = [
-            [bytes(JAZZY.serialize_cdr(m, kind)) for m in several]
-            for kind, several in zip(kinds, (states, controls), strict=True)
-        ]
-        # each control is logged before the state of its instant, a step of DT apart
-        name = folder / f"run{number:02}x.mcap"
-        paths.append(write(name, topics[::-1], encoded[::-1], step_ns=DT_NS))
-    return paths
+        x[k + 1] = x[k] + 1e-9 * DT_NS * (x[k] @ A.T + u[:, k] @ B.T + 1e-2 * rng.normal(size=(count, n)))
+    for number in range(count):
+        columns = {"t [s]": 1e-9 * DT_NS * np.arange(samples)}
+        columns |= dict(zip(names, np.hstack([x[:, number], u[number]]).T, strict=True))
+        pq.write_table(pa.table(columns), folder / f"run{number:02}.parquet")
+    states, controls = (tuple(Signal(name, "/table", name) for name in some) for some in (names[:n], names[n:]))
+    return sorted(folder.glob("run*.parquet")), SignalMap(states, controls)
 
 
 def killing(cluster):
@@ -93,61 +76,93 @@ def killing(cluster):
     return say, killed
 
 
+def wide(count=20, samples=100_000):
+    """A fit on one, two and four workers: time, and what goes to them and comes back."""
+    from cloudpickle import dumps
+
+    rows, run, moved = [], DaskFleet.run, [0, 0]
+
+    def counted(client, tasks, done=None):
+        results = run(client, tasks, done)
+        moved[0] += sum(len(dumps(task)) for task in tasks)
+        moved[1] += sum(len(dumps(result)) for result in results)
+        return results
+
+    DaskFleet.run = staticmethod(counted)
+    with tempfile.TemporaryDirectory() as temporary:
+        paths, signals = tables(Path(temporary), count, samples, 50, 10)
+        cache = Path(temporary) / "cache"
+        took, _ = best(lambda: fit_archive(paths, signals, "qp", "noise", cache=cache), 1)
+        rows.append(["one process, from disk", f"{took:.0f} s", "1", "", ""])
+        for workers in (1, 2, 4):
+            moved[:] = 0, 0
+            with LocalCluster(n_workers=workers, **LOCAL) as cluster, Client(cluster) as client:
+                last, _ = best(lambda c=client: fit_archive(paths, signals, "qp", "noise", client=c), 1)
+            rows.append(
+                [f"{workers} workers", f"{last:.0f} s", f"{took / last:.2f}", *(f"{b / 1e6:.0f} MB" for b in moved)]
+            )
+    header = ["way", "reading and fit", "speed", "sent", "brought back"]
+    table(f"{count} tables, {count * (samples - 1)} transitions, n = 50, m = 10, (10) with noise", header, rows)
+
+
 def main():
     """All ways, one after the other."""
-    import logging
-
-    from distributed import Client, LocalCluster
-
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a tenth of the size")
-    samples = 500 if parser.parse_args().quick else 5000
+    parser.add_argument("--wide", action="store_true", help="many states, on more and more workers")
+    options = parser.parse_args()
+    samples = 500 if options.quick else 5000
     print(f"{os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}")
+    if options.wide:
+        wide()
+        return
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        paths = bags(folder, samples)
+        paths, signals = tables(folder, COUNT, samples, 5, 4)
 
         def row(name, criterion, took, model):
             known = models[criterion]
-            elements = max(np.abs(getattr(model, a) - getattr(known, a)).max() for a in ("A", "B", "dA", "dB"))
+            elements = max(np.abs(getattr(model, a) - getattr(known, a)).max() for a in ("A", "B", "dA", "dB", "v"))
             objective = np.max(np.abs(np.divide(model.fit_summary["objective"], known.fit_summary["objective"]) - 1))
             outside = 0
             for transient in transients:
                 s = transient.transitions()
                 lower, upper = model.bounds(s.x, s.u, s.dt)
                 outside += int((~((lower <= s.x_next) & (s.x_next <= upper))).any(axis=1).sum())
-            good = elements <= 1e-9 and objective <= 1e-12 and outside == 0
+            good = elements <= 1e-9 and objective <= 1e-11 and outside == 0
             failed.extend([] if good else [f"{name}, {criterion}"])
             rows.append([name, criterion, f"{took:.1f} s", f"{elements:.0e}", f"{objective:.0e}", str(outside)])
 
         models, failed = {}, []
-        reading, transients = best(lambda: read_transients(paths, SIGNALS), 1)
+        reading, transients = best(lambda: read_transients(paths, signals), 1)
         for criterion in ("qp", "lp"):
-            took, models[criterion] = best(lambda c=criterion: fit(transients, c), 1)
+            took, models[criterion] = best(lambda c=criterion: fit(transients, c, additive="noise"), 1)
             row("in memory", criterion, reading + took, models[criterion])
             cache = folder / f"cache_{criterion}"
-            row("cache", criterion, *best(lambda c=criterion, f=cache: fit_archive(paths, SIGNALS, c, cache=f), 1))
-        local = dict(n_workers=2, threads_per_worker=1, host="127.0.0.1", dashboard_address=None)
-        local["silence_logs"] = logging.CRITICAL  # of the worker that is killed
-        with LocalCluster(**local) as cluster, Client(cluster) as client:
+            row(
+                "cache",
+                criterion,
+                *best(lambda c=criterion, f=cache: fit_archive(paths, signals, c, "noise", cache=f), 1),
+            )
+        with LocalCluster(n_workers=2, **LOCAL) as cluster, Client(cluster) as client:
             for criterion in ("qp", "lp"):
                 row(
                     "two workers",
                     criterion,
-                    *best(lambda c=criterion: fit_archive(paths, SIGNALS, c, client=client), 1),
+                    *best(lambda c=criterion: fit_archive(paths, signals, c, "noise", client=client), 1),
                 )
             for criterion in ("qp", "lp"):
                 say, killed = killing(cluster)
                 took, model = best(
-                    lambda c=criterion, s=say: fit_archive(paths, SIGNALS, c, client=client, progress=s), 1
+                    lambda c=criterion, s=say: fit_archive(paths, signals, c, "noise", client=client, progress=s), 1
                 )
                 assert killed.is_set()
                 row("two workers, one killed", criterion, took, model)
     header = ["way", "criterion", "reading and fit", "elements differ", "objective differs", "outside"]
-    table(f"{BAGS} bags, {sum(t.transitions().k.size for t in transients)} transitions, n = 5, m = 4", header, rows)
+    table(f"{COUNT} tables, {sum(t.transitions().k.size for t in transients)} transitions, n = 5, m = 4", header, rows)
     if failed:
-        raise SystemExit(f"not the same model to 1e-9, nor objective to 1e-12: {'; '.join(failed)}")
+        raise SystemExit(f"not the same model to 1e-9, nor objective to 1e-11: {'; '.join(failed)}")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -33,6 +34,8 @@ _LOOKED_AT = 50_000
 """Transitions that the domain is made from, about; of more, every second, third, ... counts."""
 _PART = 100_000
 """Transitions per part, about: the sums of the parts are added in their order, however many threads there are."""
+_LEAST = 500
+"""Samples of a row that each of many parts brings in one pass, if it has so many near the bounds."""
 _TAKEN = 50_000
 """Transitions that the law of the residuals is taken from, about."""
 _SAME = 1e-12
@@ -102,7 +105,9 @@ class Fleet:
 
     def scan(self, candidate: Candidate) -> list[tuple[Samples, float]]:
         """One pass for the samples of least slack; see `passes.scan`."""
-        results = self.map(passes.scan, [(candidate, offset) for offset in self.offsets])
+        most = max(min(_LEAST, candidate.most), 2 * candidate.most // max(2, len(self.offsets)))
+        each = replace(candidate, most=most)  # all parts together bring about twice as many as one that is alone
+        results = self.map(passes.scan, [(each, offset) for offset in self.offsets])
         rows = []
         for i in range(len(candidate.rows)):
             rows.append((Samples.join([r[i][0] for r in results], self.p), min(r[i][1] for r in results)))

@@ -464,8 +464,8 @@ class WorkingSet:
 
     def _prove(self, settle: Settle, rows: list[Row]) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
-        most = 2 * SUBSAMPLE + self.fleet.N // 500
-        share = 0.2 * most / self.fleet.N
+        looked_for = 2 * SUBSAMPLE // 5 + self.fleet.N // 2500
+        share, most = looked_for / self.fleet.N, 3 * looked_for // 2
         scanned = False
         for _ in range(MAX_ROUNDS):
             for row in rows:  # the samples held after a pass are those of least slack: keep the first reach
