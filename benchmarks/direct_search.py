@@ -36,7 +36,7 @@ from scipy.optimize import golden
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.text import table
+from uncertain_lti.base.text import Table
 from uncertain_lti.identification import fit
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -203,7 +203,7 @@ def main() -> None:
             ]
         )
     header = ("", "N", "exact (10)", "direct search", "above", "exact [s]", "direct [s]", "ratio", "evaluations")
-    print(table(header, rows))
+    print(Table(header, rows))
 
 
 if __name__ == "__main__":

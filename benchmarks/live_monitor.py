@@ -496,7 +496,7 @@ LIMITS = (
 
 
 def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, left: float) -> None:
-    from uncertain_lti.base.text import table
+    from uncertain_lti.base.text import Table
 
     rows, held = [], []
     for n in sizes:
@@ -543,9 +543,9 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
                 ]
             )  # fmt: skip
     head = "n|Hz||CPU, µs/sample|/ default|/ events|p99 delay, ms|not received|flags not heard".split("|")
-    print(table(head, rows))
+    print(Table(head, rows))
     print()
-    print(table(["n", "Hz", "", "at most", "measured", "turns", "held", "publishing only"], held))
+    print(Table(["n", "Hz", "", "at most", "measured", "turns", "held", "publishing only"], held))
 
 
 def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[str, Any]:

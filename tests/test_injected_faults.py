@@ -205,11 +205,15 @@ def found(validation):
     return detectable(validation.model, validation.parts)
 
 
+def by_name(found):
+    return {(fault.kind, fault.signal): fault for fault in found.faults}
+
+
 def test_the_share_seen_is_that_of_faults_injected_one_by_one(validation, found):
     """Through another way: whole recordings with the fault, checked one by one, at the size that is reported."""
     every = module._cases(validation.model, validation.parts, found.within, module.CASES, 0)
     for kind, signal in (("bias", "x2"), ("drift", "x1"), ("offset", "u1"), ("freeze", "x3")):
-        fault = found.find(kind, signal)
+        fault = by_name(found)[kind, signal]
         assert fault.size > 0 and fault.share >= 0.9 - 1e-9
         signs = np.ones(found.cases)
         if KINDS[kind].both:
@@ -235,8 +239,9 @@ def test_sizes_have_the_order_that_they_must_have(validation, found):
     kinds = ("bias", "drift", "offset")
     strict = detectable(validation.model.replace(alarm_rule=AlarmRule(1, 1)), validation.parts, kinds=kinds)
     wide = detectable(validation.model.replace(alarm_rule=AlarmRule(1, 1, 3.0)), validation.parts, kinds=kinds)
+    wider = by_name(wide)
     for fault in strict.faults:
-        assert fault.size < wide.find(fault.kind, fault.signal).size
+        assert fault.size < wider[fault.kind, fault.signal].size
         assert fault.size_interval[0] <= fault.size <= fault.size_interval[1]
         assert fault.share_interval[0] <= fault.share <= fault.share_interval[1]
     long = detectable(validation.model, validation.parts, 2.4, kinds=("drift",))
@@ -245,7 +250,7 @@ def test_sizes_have_the_order_that_they_must_have(validation, found):
     blind = detectable(validation.model.replace(alarm_rule=AlarmRule(1, 1, 1e6)), validation.parts, kinds=("loss",))
     assert all(f.size == np.inf and f.share_interval[0] <= f.share <= f.share_interval[1] for f in blind.faults)
     # two violations of three: the jump of a reading is one violation, a spike two
-    assert all(found.find("spike", s).size < np.inf for s in ("x1", "x2", "x3"))
+    assert all(by_name(found)["spike", s].size < np.inf for s in ("x1", "x2", "x3"))
 
 
 def test_what_cannot_be_known_is_refused_in_words(validation):

@@ -33,6 +33,7 @@ from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.model.horizon import MOST_STEPS
 from uncertain_lti.model.model_file import FORMATS
 from uncertain_lti.model.signature import Signature
+from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.plants.leibov import leibov2006
 from uncertain_lti.sampling.transient import Transient
@@ -294,7 +295,7 @@ def test_a_saved_model_is_the_same_to_the_last_bit(tmp_path_factory, model):
     path = tmp_path_factory.getbasetemp() / "any.model.json"
     model.save(path)
     loaded = UncertainLTI.load(path)
-    for name in ("A", "B", "dA", "dB", "c", "dc", "v"):
+    for name in ARRAYS:
         assert bits(getattr(loaded, name)) == bits(getattr(model, name))
     for name in ("x_min", "x_max", "u_min", "u_max"):
         assert bits(getattr(loaded.domain, name)) == bits(getattr(model.domain, name))
@@ -554,6 +555,20 @@ def test_the_file_with_everything_armed_is_whole(tmp_path: Path) -> None:
     assert UncertainLTI.load(write(tmp_path, data)).to_dict() == data
     data["alarm"] = {"rules": [ENERGY]}
     assert UncertainLTI.from_dict(data).alarm == (StatisticRule("energy", 1.0, 0.5),)
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_a_model_of_any_parts_comes_back_from_its_file(seed: int, tmp_path: Path) -> None:
+    """Of no schedule, one or two signals, some horizons, rules of any kind, with and without a run and repeats."""
+    model = armed_model(np.random.default_rng(seed))
+    model.save(tmp_path / "m.model.json")
+    again = UncertainLTI.load(tmp_path / "m.model.json")
+    assert again.to_dict() == model.to_dict() and model.to_dict()["format"] == "uncertain-lti/2"
+    for part in ("schedule", "block_data", "alarm"):
+        assert getattr(again, part) == getattr(model, part), part
+    for mine, theirs in zip([model, *model.horizons], [again, *again.horizons], strict=True):
+        assert all(bits(getattr(mine, name)) == bits(getattr(theirs, name)) for name in ARRAYS)
+    assert (again.run is None) == (model.run is None) and (again.repeats is None) == (model.repeats is None)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,6 @@
 """Weights of a schedule: interpolation between knots, modes, two signals, and what is not known."""
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,20 +99,6 @@ def scheduled(
         nominal[0], nominal[1], half[0], half[1], nominal[2], half[2], half[3], schedule=schedule, signals=signals,
         block_data=[BlockData(r, None if r else 1) for r in range(R)],
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("axes", [(SPEED,), (GEAR,), (SPEED, GEAR)])
-def test_a_scheduled_model_comes_back_from_its_file(axes: tuple[Axis, ...], tmp_path: Path) -> None:
-    schedule = Schedule(axes)
-    further = ("gear",) * (GEAR in axes)
-    model = scheduled(np.random.default_rng(2), schedule, further)
-    model.save(tmp_path / "model.json")
-    again = UncertainLTI.load(tmp_path / "model.json")
-    assert again.to_dict() == model.to_dict() and model.to_dict()["format"] == "uncertain-lti/2"
-    assert again.schedule == schedule and again.block_data == model.block_data
-    x, u, s = np.ones((4, 2)) * 0.1, np.ones((4, 1)), np.ones((4, len(further)))
-    for mine, theirs in zip(model.bounds(x, u, 0.1, 1.0, s), again.bounds(x, u, 0.1, 1.0, s), strict=True):
-        assert mine.tobytes() == theirs.tobytes() and np.isfinite(mine).all()
 
 
 def test_at_a_knot_the_model_is_that_block_and_between_two_their_mean() -> None:

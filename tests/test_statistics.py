@@ -437,9 +437,6 @@ def test_a_fit_knows_the_utilisation_of_its_windows() -> None:
         assert len(r) == 2001 - h
         np.testing.assert_allclose(fitted.residuals_at(h).mean, r.mean(axis=0), rtol=1e-9, atol=1e-15)
         np.testing.assert_allclose(fitted.residuals_at(h).covariance, np.cov(r.T, bias=True), rtol=1e-9)
-    again = UncertainLTI.from_dict(fitted.to_dict())
-    assert again.to_dict() == fitted.to_dict()
-    assert np.array_equal(again.residuals_at(10).covariance, fitted.residuals_at(10).covariance)
 
 
 def test_residuals_are_those_of_least_squares_less_what_the_one_before_says_of_them(tmp_path) -> None:

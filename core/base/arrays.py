@@ -53,6 +53,12 @@ def in_stretches(place: NDArray[np.intp], share: int, length: int) -> NDArray[np
     return np.asarray(place // length % share == 0)
 
 
+def runs(flags: Mask) -> list[tuple[int, int]]:
+    """[start, stop) of every run of true values."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
 def core_count() -> int:
     """How many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

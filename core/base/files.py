@@ -98,28 +98,17 @@ def sha256(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
-def may_replace(path: str | os.PathLike[str], *, holds: bytes) -> bool:
-    """Whether nothing is lost at this path when a file is written there that has such words in its first 500 bytes.
-
-    So it is where there is nothing yet, and where an older file of the same kind is; a folder is not looked at.
-    """
-    try:
-        with open(path, "rb") as stream:
-            head = stream.read(500)
-    except OSError:
-        return True
-    return not head or holds in head
-
-
 def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: str) -> Path:
-    """Where a file of a kind goes, that holds such words (`may_replace`); an older one alone is replaced."""
+    """Where a file of a kind goes, that has such words in its first 500 bytes; an older one alone is replaced."""
     path = Path(output)
     if not path.parent.is_dir():
         raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
     if path.is_dir():
         raise BagError(f"{path}: is a folder; name a file in it, for example {path / example}")
-    if not may_replace(path, holds=holds):
-        raise BagError(f"{path}: is there already and is no {kind}; choose another name, or move it away")
+    with suppress(OSError), open(path, "rb") as stream:
+        head = stream.read(500)
+        if head and holds not in head:
+            raise BagError(f"{path}: is there already and is no {kind}; choose another name, or move it away")
     try_to_write(path)
     return path
 

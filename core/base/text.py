@@ -123,12 +123,6 @@ def text_of(blocks: Iterable[Block]) -> str:
     return "\n".join(map(str, blocks))
 
 
-def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as text, every row of it."""
-    rows = list(rows)
-    return str(Table(header, rows, most=len(rows)))
-
-
 def number(value: float | None) -> str:
     """Four digits, or a dash for nothing."""
     return "-" if value is None or math.isnan(value) else f"{value:.4g}"

@@ -36,7 +36,7 @@ _LONGEST_LIST = 100_000
 )
 def topics(options: argparse.Namespace) -> Result:
     """Print the topics of a recording and what each holds."""
-    from uncertain_lti.base.text import number, table
+    from uncertain_lti.base.text import Table, number
     from uncertain_lti.recordings.formats import open_recording
 
     bag = open_recording(options.bag)
@@ -58,7 +58,8 @@ def topics(options: argparse.Namespace) -> Result:
         name, kind = printable(f.info.topic, _LONGEST_NAME), printable(f.info.type, _LONGEST_NAME)
         rate = f"{number(f.rate)} in bursts" if f.bursts else number(f.rate)
         rows.append([name, kind, str(f.info.count), rate, number(f.largest_gap), stamps])
-    lines = [table(("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps"), rows)]
+    header = ("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps")
+    lines = [str(Table(header, rows, most=len(rows)))]
     for f in facts:
         name = printable(f.info.topic, _LONGEST_NAME)
         if not f.info.readable or f.info.reason:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, runs
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.kernel.arithmetic import blended
 from uncertain_lti.sampling.transient import Transient
@@ -78,8 +78,7 @@ def _recall(model: Any, recalled: Recalled, z: Array, k: int, dt: Array) -> None
         return
     steady, scale = model.operating_point.steady, model.operating_point.scale
     now, past = z[[k, before], recalled.of] * scale[recalled.of] + steady[recalled.of]
-    value = past if memory.kind == "lag" else now - past
-    value = value / dt[before] if memory.kind == "rate" else value
+    value = memory.taken(now, past, dt[before])
     z[k, recalled.position] = (value - steady[recalled.position]) / scale[recalled.position]
 
 
@@ -94,8 +93,7 @@ def run_over(model: Any, transient: Transient) -> Array:
     s = model.operating_point.normalise_s(transient.s)
     usable, dt = transient.usable, transient.dt
     run = np.full(x.shape, np.nan)
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], usable, [False]]).astype(np.int8)))
-    for start, stop in edges.reshape(-1, 2):
+    for start, stop in runs(usable):
         run[start : stop + 1] = simulate(model, x[start], u[start:stop], dt[start:stop], s[start:stop])
     return run
 

@@ -22,7 +22,7 @@ import cython
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, runs
 from uncertain_lti.base.text import html_table, named, number_text, plural, times
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
 from uncertain_lti.model.repeats import Looked
@@ -390,7 +390,7 @@ class Verdicts:
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
-        raised = int(np.count_nonzero(np.diff(np.concatenate([[False], self.alarm]).astype(np.int8)) == 1))
+        raised = len(runs(self.alarm))
         said = f"{1 - left / judged:.3%} inside all bounds" if judged else "none possible"
         alarm = f"alarm raised {times(raised)}" if raised else "no alarm"
         return f"Verdicts({self.transient.name!r}: {plural(judged, 'verdict')}, {said}, {alarm})"

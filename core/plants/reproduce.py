@@ -24,7 +24,7 @@ from scipy.linalg import expm
 
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.base.text import number, table
+from uncertain_lti.base.text import Table, number
 from uncertain_lti.identification import fit
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
@@ -146,7 +146,7 @@ def trim_text() -> str:
     ]  # fmt: skip
     header = ("PLA", "N1 [rpm]", "N2 [rpm]", "thrust [kN]", "kg/(kgf h)", "air [kg/s]", "P3/P2", "bypass", "T4 [K]",
               "T5 [K]", "fuel [kg/s]")  # fmt: skip
-    return "Steady states of the nonlinear engine, sea level, at rest\n" + table(header, rows)
+    return "Steady states of the nonlinear engine, sea level, at rest\n" + str(Table(header, rows))
 
 
 def cases_text(cases: Sequence[Case]) -> str:
@@ -158,7 +158,7 @@ def cases_text(cases: Sequence[Case]) -> str:
     ]  # fmt: skip
     header = ("identified from", "", "additive", "outside fit", "all", *SHORT, "outside domain")
     title = "Check: lever from 68 to 60 deg, 100 transitions; shares inside the one-step bounds"
-    return f"{title}\n{table(header, rows)}"
+    return f"{title}\n{Table(header, rows)}"
 
 
 def width_text(cases: Sequence[Case]) -> str:
@@ -174,7 +174,7 @@ def width_text(cases: Sequence[Case]) -> str:
     header = ("identified from", "", "additive", *SHORT, "(4)", *(f"(5) {s}" for s in SHORT))
     return (
         "Mean width of the bounds over the check, and discrepancies (4) and (5) of the nominal model's free run;\n"
-        "widths and (5) in 1e-4 of the scale\n" + table(header, rows)
+        "widths and (5) in 1e-4 of the scale\n" + str(Table(header, rows))
     )
 
 
@@ -195,7 +195,7 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
         rows.append([name, *(f"{v.real:.2f}{v.imag:+.2f}j" if abs(v.imag) > 1e-9 else f"{v.real:.2f}" for v in values)])
     return (
         "Eigenvalues of A [1/s]; over one step: (exp(A Δt) - I) / Δt, what (3) sees of the same engine\n"
-        + table(("", "1", "2", "3", "4", "5"), rows)
+        + str(Table(("", "1", "2", "3", "4", "5"), rows))
     )  # fmt: skip
 
 
@@ -207,5 +207,5 @@ def matrix_text(model: UncertainLTI, name: str) -> str:
         rows = [
             [SHORT[i], *(f"{a:.2f} ± {d:.2g}" for a, d in zip(nominal[i], half[i], strict=True))] for i in range(m.n)
         ]
-        parts.append(f"A, B [1/s], {title}\n" + table(("", *SHORT, *SHORT_CONTROLS), rows))
+        parts.append(f"A, B [1/s], {title}\n{Table(('', *SHORT, *SHORT_CONTROLS), rows)}")
     return "\n\n".join(parts)

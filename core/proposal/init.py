@@ -486,7 +486,7 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
         of = group[names.index(one.of)]
         memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
         steady = of.steady if memory.kind == "lag" else 0.0
-        unit = f"{of.unit}/s" if of.unit and memory.kind == "rate" else of.unit
-        recalled = replace(of, name=one.name, path=memory.of(of.path), steady=steady, unit=unit, delay=0)
+        path, unit = memory.of(of.path), memory.unit(of.unit)
+        recalled = replace(of, name=one.name, path=path, steady=steady, unit=unit, delay=0)
         lines.append(entry(recalled, comment=gain))
     return lines

@@ -414,10 +414,8 @@ def recall(values: Array, memory: Memory, dt: Array, opens: NDArray[np.bool_]) -
     begin = np.maximum.accumulate(np.where(opens, place, 0)) if len(values) else place
     source = place - memory.samples
     past = np.where(source >= begin, values[np.maximum(source, 0)], math.nan)
-    if memory.kind == "lag":
-        return past
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return values - past if memory.kind == "diff" else (values - past) / dt
+        return np.asarray(memory.taken(values, past, dt))
 
 
 def with_memories(transient: Transient, memories: Sequence[Remembered]) -> Transient:
@@ -446,14 +444,15 @@ def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
 
 def memory_of(signal: Signal, memory: Memory, name: str) -> Signal:
     """A memory of a signal, as a control."""
-    unit = f"{signal.unit}/s" if signal.unit and memory.kind == "rate" else signal.unit
     steady = signal.steady if memory.kind == "lag" else 0.0
     if signal.delay:
         samples = signal.delay + memory.samples if memory.kind == "lag" else 0
         if not samples:
             raise TransientError(f"'{signal.name}' is delayed, and has no {memory.kind}; take it of the field itself")
         memory = Memory("lag", samples)
-    return replace(signal, name=name, field=memory.of(signal.field), steady=steady, unit=unit, delay=0)
+    return replace(
+        signal, name=name, field=memory.of(signal.field), steady=steady, unit=memory.unit(signal.unit), delay=0
+    )
 
 
 def _column(transient: Transient, values: Array, memory: Memory) -> Array:

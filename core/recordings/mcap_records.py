@@ -34,7 +34,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema
 from numpy.typing import NDArray
 
 from uncertain_lti.recordings.mcap_walk import walk_records
-from uncertain_lti.recordings.mcap_writer import McapWriter
+from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD, McapWriter
 from uncertain_lti.recordings.unreadable import changed, os_error
 
 try:
@@ -52,7 +52,6 @@ FOOTER_SIZE = RECORD.size + 20
 PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 LATEST = 2**63 - 1  # ns; times are kept with a sign
 _MESSAGE = int(Opcode.MESSAGE)
-_MESSAGE_HEAD = struct.Struct("<BQHIQQ").pack
 
 
 class Block(NamedTuple):
@@ -133,7 +132,7 @@ class Contents:
 
 def message_record(channel: int, sequence: int, log_time: int, publish_time: int, data: bytes | memoryview) -> bytes:
     """One message as an MCAP file has it."""
-    head = _MESSAGE_HEAD(_MESSAGE, MESSAGE.size + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
+    head = MESSAGE_HEAD.pack(_MESSAGE, MESSAGE.size + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
     return b"".join((head, data))
 
 
@@ -211,7 +210,6 @@ def seconds(time_ns: int) -> str:
 
 
 _LARGEST = 1 << 30  # bytes of a record outside blocks
-_HEAD = RECORD.size + MESSAGE.size
 
 
 def declare(writer: McapWriter, contents: Contents) -> NDArray[np.uint16]:
@@ -244,7 +242,8 @@ def _block(writer: McapWriter, contents: Contents, block: Block, numbers: NDArra
     channel = numbers[found.channel]
     known = channel > 0
     kept = known & (found.end > found.begin) if contents.converted else known
-    channel, times, begin, end = channel[kept], found.log_time[kept], found.begin[kept] - _HEAD, found.end[kept]
+    channel, times, end = channel[kept], found.log_time[kept], found.end[kept]
+    begin = found.begin[kept] - MESSAGE_HEAD.size
     if len(channel):
         data = np.frombuffer(records, dtype=np.uint8)
         data[begin + RECORD.size], data[begin + RECORD.size + 1] = channel & 255, channel >> 8

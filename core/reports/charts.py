@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.arrays import Array, Mask, runs
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -388,12 +388,6 @@ def heading(verdicts: Verdicts) -> str:
 def base_name(path: str | os.PathLike[str]) -> str:
     """The last part of a path."""
     return os.path.basename(path) or str(path)
-
-
-def runs(flags: Mask) -> list[tuple[int, int]]:
-    """[start, stop) of every run of true values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def series_of(role: str, low: Array, high: Array, columns: Columns) -> Series:

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Mask
+from uncertain_lti.base.arrays import Array, Mask, runs
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import (
     Block,
@@ -47,7 +47,6 @@ from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.charts import runs
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient, Transitions

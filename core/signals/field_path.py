@@ -146,6 +146,16 @@ class Memory:
         """The field path of this memory of a field."""
         return f"lag({field}, {self.samples})" if self.kind == "lag" else f"{self.kind}({field})"
 
+    def taken(self, now: Any, past: Any, dt: Any) -> Any:
+        """What it makes of the present value, the earlier one, and the step that leads to the former, s."""
+        if self.kind == "lag":
+            return past
+        return now - past if self.kind == "diff" else (now - past) / dt
+
+    def unit(self, of: str) -> str:
+        """The unit of this memory of a quantity in some unit."""
+        return f"{of}/s" if of and self.kind == "rate" else of
+
 
 @lru_cache(maxsize=4096)
 def parse_memory(text: str) -> tuple[Memory | None, str]:
@@ -341,15 +351,16 @@ class FieldPath:
             raise SignalError(f"{here} is not one number but {what}; {_instead(topic, type_name, type_fields)}")
 
 
-def _instead(topic: str, type_name: str, type_fields: TypeFields, limit: int = 24) -> str:
+def _instead(topic: str, type_name: str, type_fields: TypeFields) -> str:
     found = list(numeric_paths(type_name, type_fields))
-    more = f", and {len(found) - limit} more" if len(found) > limit else ""
-    return f"numeric field paths of {topic}: {', '.join(found[:limit]) or 'none'}{more}"
+    more = f", and {len(found) - _MOST_PATHS} more" if len(found) > _MOST_PATHS else ""
+    return f"numeric field paths of {topic}: {', '.join(found[:_MOST_PATHS]) or 'none'}{more}"
 
 
 _NO_SIGNALS = ("std_msgs/msg/Header", "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Duration")
 _DEPTH = 8
 _MOST_NAMES = 100
+_MOST_PATHS = 24  # in an error
 
 
 def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> Iterator[str]:

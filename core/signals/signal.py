@@ -86,11 +86,6 @@ class Signal:
         """Whether the field is a memory; one that is no field path is refused by `check`."""
         return memory_of(self.field)[0] is not None
 
-    def admits(self, value: float) -> bool:
-        """Whether a value of the field counts."""
-        low, high = self.valid or (-math.inf, math.inf)
-        return not (value < low or value > high or value in self.ignored)
-
     @property
     def ignored(self) -> frozenset[float]:
         """`ignore`, and its values as single precision rounds them."""
@@ -139,11 +134,8 @@ def memory_of(field: object) -> tuple[Memory | None, str]:
 
 
 def _single(value: float) -> float:
-    """The nearest number of single precision; the value itself beyond its range."""
-    try:
-        return float(struct.unpack("f", struct.pack("f", value))[0])
-    except OverflowError:
-        return value
+    """The nearest number of single precision; infinity beyond its range."""
+    return float(struct.unpack("f", struct.pack("f", value))[0])
 
 
 @dataclass(frozen=True)
@@ -311,8 +303,7 @@ def _with_memories(top: Mapping[str, Any]) -> dict[str, list[Any]]:
         memory, inner = memory_of(entry.get("field")) if isinstance(entry, dict) else (None, "")
         if memory is None or (of := listed.get((str(entry.get("topic")), inner))) is None:
             return entry
-        unit = str(of.get("unit") or "")
-        own = {"scale": of.get("scale", 1.0), "unit": f"{unit}/s" if unit and memory.kind == "rate" else unit}
+        own = {"scale": of.get("scale", 1.0), "unit": memory.unit(str(of.get("unit") or ""))}
         own |= {"steady": of["steady"]} if memory.kind == "lag" and "steady" in of else {}
         return own | entry
 

@@ -109,10 +109,6 @@ class Detectable:
         faults = [fault.to_dict() for fault in self.faults]
         return _plain({"within": self.within, "share": SHARE, **vars(self), "faults": faults})
 
-    def find(self, kind: str, signal: str) -> Seen | None:
-        """One of the faults."""
-        return next((f for f in self.faults if (f.kind, f.signal) == (kind, signal)), None)
-
 
 @dataclass(frozen=True, eq=False)
 class _Cases(Windows):

@@ -116,10 +116,7 @@ def _recall(recalled: Recalled, moved: Array, k: int, dt: Array) -> Array:
     """What a memory (W,) makes at sample k of differences (W, L) of what it recalls."""
     memory = recalled.memory
     past = moved[:, k - memory.samples] if k >= memory.samples else np.zeros(len(moved))
-    if memory.kind == "lag":
-        return past
-    difference: Array = moved[:, k] - past
-    return difference / dt[:, k - 1] if memory.kind == "rate" and k else difference
+    return np.asarray(memory.taken(moved[:, k], past, dt[:, k - 1] if k else 1.0))
 
 
 _CHANGES: Mapping[str, Callable[[Array, Array, Array, Array], Array]] = {
