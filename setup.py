@@ -127,7 +127,7 @@ setup(
         "uncertain_lti.plants": ["*.json"],
         "uncertain_lti.recordings": ["*.pyi", "*.pyx"],
         "uncertain_lti.reports": ["assets/*"],
-        "uncertain_lti.sampling": ["*.pyi", "*.pyx"],
+        "uncertain_lti.sampling": ["*.pxi", "*.pyi", "*.pyx"],
         NAME: ["*.xml"],
     },
     data_files=[
