@@ -136,6 +136,21 @@ def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_pa
     assert np.allclose(table.columns["y"], 1.25 + np.arange(9)) and table.columns["z"].dtype == object
 
 
+def test_a_minus_that_is_no_hyphen_is_one(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,x\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(9)), encoding="utf-8")
+    assert np.array_equal(read_table(path).columns["x"], -0.5 - np.arange(9)) and not read_table(path).notes
+
+
+def test_a_table_of_many_columns_is_read(tmp_path):
+    """Its names alone take more than what the shape was once looked for in."""
+    names = [f"plant/area_{i}/measured value of the sensor" for i in range(3000)]
+    rows = [",".join([str(k), *(["0.5"] * len(names))]) for k in range(5)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([",".join(["time", *names]), *rows]))
+    assert len(read_table(path).columns) == 3001
+
+
 def test_every_command_takes_them(tables, shipped, names, tmp_path, cli):
     path, model, signals = str(tables[".csv"]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
     assert f"/table: {', '.join(names)}" in cli("topics", path).out
