@@ -293,6 +293,24 @@ def test_a_steady_control_that_ceases_is_told_while_its_publisher_stays(every: i
     assert f"messages on {CONTROL} again" in rig.lines and not rig.session.ceased(rig.now, TIMEOUT)
 
 
+def test_the_reason_names_what_is_expected_and_what_was_heard_where_no_message_names_a_signal() -> None:
+    rig = Rig()
+    for _ in range(30):
+        rig.take(STATE, joint_state(rig.t_ns, [1.0, 2.0], ("c", "d")))
+        rig.wait(0.1)
+    there = f"{STATE}: there is no 'a' in the message's names; names there: c, d"
+    assert rig.session.reason(rig.now, TIMEOUT).startswith("no verdict for more than 1 s: nothing received on")
+    rig.take(CONTROL, vector(rig.t_ns, 0.0, 0.0))
+    assert rig.session.reason(rig.now, TIMEOUT) == f"no verdict for more than 1 s: {there}"
+    rig.send(20)
+    rig.wait(2.0)
+    silent = f"no verdict for more than 1 s: no message on {STATE}"
+    assert rig.session.reason(rig.now, TIMEOUT) == silent
+    rig.take(STATE, joint_state(rig.t_ns, [1.0, 2.0], ("c", "d")))
+    assert rig.session.reason(rig.now, TIMEOUT) == f"{silent}; {there}"
+    assert there in rig.session.report(rig.now, TIMEOUT)[0].message
+
+
 def test_silence_of_each_input_and_its_return_are_told_once() -> None:
     rig = Rig()
     rig.wait(30.0)

@@ -126,6 +126,7 @@ class Session(Stream):
                 complaints.insert(0, "alarm: it was on at the last verdict")
             if silent > timeout and self.heard(self.sampler.clock) is not None:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
+                complaints += [why for why in self.absent(self.model.signals) if why not in complaints]
             else:
                 complaints.insert(0, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet")
             if never:
@@ -147,11 +148,10 @@ class Session(Stream):
         text = self.reasons.text
         if self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
-        why = "no sample could be judged"
+        silent = [f"no message on {self.sampler.clock}"] if self.silent_for(now) > timeout else []
+        why = "; ".join([*silent, *self.absent(self.model.signals)]) or "no sample could be judged"
         if never := [topic for topic in self.types if self.heard(topic) is None]:
             why = f"nothing received on {', '.join(never)}"
-        elif self.silent_for(now) > timeout:
-            why = f"no message on {self.sampler.clock}"
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
