@@ -137,6 +137,19 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
     assert level == OK and re.fullmatch(r"the alarm is over after 0\.0\d+ s", line)
 
 
+def test_an_alarm_says_that_messages_came_too_late_just_before() -> None:
+    rig = Rig.at_work()
+    rig.session.report(rig.now, TIMEOUT)
+    rig.take(CONTROL, vector(rig.t_ns - 3 * STEP_NS, 0.1, 0.1))
+    rig.send(3, off=2.0)
+    assert rig.lines[-1].endswith("; 1 message came too late just before")
+    rig.send(9)
+    rig.session.report(rig.now, TIMEOUT)
+    rig.lines.clear()
+    rig.send(3, off=2.0)
+    assert "too late" not in rig.lines[-1]
+
+
 def test_a_jump_larger_than_any_of_the_fit_is_logged_and_reported_with_its_limit() -> None:
     rig = Rig()
     rig.model = rig.model.replace(domain=replace(rig.model.domain, step_max=np.array([0.01, 1e3])))

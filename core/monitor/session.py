@@ -79,7 +79,7 @@ class Session(Stream):
         without, never = self.without_verdict(now), [topic for topic in self.types if self.heard(topic) is None]
         complaints, calm = list(problems), list[str]()
         lacking = self.lacking(period.counters)
-        came_late = Counters(self.sampler.counters - period.counters).of(LATE)
+        came_late = self.came_late(period.counters)
         if period.last_unknown is not None:
             why = self.model.why_unknown(period.last_unknown.before)
             complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
@@ -103,7 +103,7 @@ class Session(Stream):
             coarse = self.coarse_clock(period.statuses[Status.EQUAL])
             complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
         if came_late:
-            complaints.append(f"{sum(came_late.values())} messages came too late")
+            complaints.append(f"{came_late} messages came too late")
         if period.unreadable:
             complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
         if period.future:
@@ -199,6 +199,10 @@ class Session(Stream):
         since = Counters(self.sampler.counters - before)
         lacking = since.of(MISSING) | since.of(TOO_OLD)
         return [signal for signal in self.model.signals if signal.name in lacking]
+
+    def came_late(self, before: Counter[str]) -> int:
+        """Messages that came after their sample was closed, since some counters."""
+        return sum(Counters(self.sampler.counters - before).of(LATE).values())
 
     def absent(self, lacking: Iterable[Signal]) -> list[str]:
         """What the last message of each topic has not of what is read from it, the first of these signals in words."""
@@ -357,6 +361,8 @@ class EventLog:
             line += f"; {', '.join(jumped[:SHOWN])}" if jumped else ""
             if frozen:
                 line = f"alarm, frozen: {'; '.join(session.frozen_text(moved) for moved in frozen[:SHOWN])}"
+            if late := session.came_late(session.period.counters):
+                line += f"; {plural(late, 'message')} came too late just before"
             line += "; it lasts until ~/reset" if session.rule.latch else ""
             self._alarm_since = now
             self._named = self._matters["alarm"].may(now)
@@ -454,7 +460,7 @@ class EventLog:
         found = [f"nothing received on {', '.join(never)}"] if never else []
         clock = session.sampler.clock
         if clock not in never and session.silent_for(now) > timeout / 2:
-            return "; ".join([f"no message on {clock}", *found])
+            return "; ".join([f"no message on {clock}", *found, *session.absent(session.model.signals)])
         since = session.sampler.counters - self._counters
         if lacking := session.lacking(self._counters):
             found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")
