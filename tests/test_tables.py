@@ -550,6 +550,21 @@ def test_equal_names_do_not_take_for_ever(tmp_path):
         assert len(Table(path).columns_by_field) == number
 
 
+@pytest.mark.parametrize("kind", ["duration[us]", "time64[us]", "time32[ms]"])
+def test_times_of_arrow_that_are_no_instants_are_read(tmp_path, kind):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    unit = 10**3 if "ms" in kind else 10**6
+    steps = pa.array([k * unit // 50 for k in range(9)], pa.int32() if "ms" in kind else pa.int64())
+    path = tmp_path / "a.parquet"
+    types = {"duration[us]": pa.duration("us"), "time64[us]": pa.time64("us"), "time32[ms]": pa.time32("ms")}
+    parquet.write_table(pa.table({"time": steps.cast(types[kind]), "x": np.arange(9.0)}), path)
+    (tmp_path / "s.yaml").write_text("states: [{name: x, topic: /table, field: x}]")
+    (t,) = read_transients(path, tmp_path / "s.yaml")
+    assert np.diff(t.t_ns).tolist() == [20_000_000] * 8
+
+
 def test_a_small_parquet_that_expands_is_refused(tmp_path):
     pa = pytest.importorskip("pyarrow")
     from pyarrow import parquet

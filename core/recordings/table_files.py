@@ -326,14 +326,18 @@ def _read_arrow(path: Path) -> RawTable:
         kind = column.type
         if pa.types.is_dictionary(kind):
             column, kind = column.cast(kind.value_type), kind.value_type
+        if pa.types.is_duration(kind):
+            columns[name] = column = pa.array(np.asarray(column) / np.timedelta64(1, "s"))
+            kind = column.type
         if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
             found[name] = _nanoseconds(path, name, np.asarray(column))
         elif pa.types.is_boolean(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
             found[name] = np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
         elif pa.types.is_integer(kind):
             found[name] = np.asarray(column)
-        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
-            found[name] = np.array([text or "" for text in column.to_pylist()], dtype=object)
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_time(kind):
+            texts = column.cast(pa.string()).to_pylist()  # times of day as in a CSV file
+            found[name] = np.array([text or "" for text in texts], dtype=object)
         else:
             notes.setdefault(f"of type {kind}", []).append(name)
     read = _of_one_length(path, found, notes)
