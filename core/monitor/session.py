@@ -398,7 +398,8 @@ class EventLog:
                 self._log(OK, f"the alarm {like.words}")
         known, clock, lags = self._matters["problems"].logged or (), session.sampler.clock, session.lags
         condition = session.arming.condition or "there is no condition any more"
-        lag = [f"stamps on {topic} lag those on {clock} by {s:.3g} s, more than a step" for topic, s in lags.items()]
+        way = {topic: "lag" if s > 0.0 else "lead" for topic, s in lags.items()}
+        lag = [f"stamps on {t} {way[t]} those on {clock} by {abs(s):.3g} s, more than a step" for t, s in lags.items()]
         resets = session.sampler.counters["resets"]
         if session.reasons.rivals:  # then it is their stamps that step back
             self._matters["resets"].logged = resets
