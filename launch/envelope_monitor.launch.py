@@ -42,6 +42,10 @@ def start(context):
     required, respawn = truth("required", given["required"]), truth("respawn", given["respawn"])
     if required and respawn:
         raise ValueError("required:=true ends the launch with the node, and respawn:=true starts it again; choose one")
+    try:
+        delay = float(given["respawn_delay"])
+    except ValueError:
+        raise ValueError(f"respawn_delay:={given['respawn_delay']} is no number; give seconds") from None
     values = {"use_sim_time": truth("use_sim_time", given["use_sim_time"])}
     if given["model"]:
         values["model"] = given["model"]
@@ -61,7 +65,7 @@ def start(context):
         arguments=["--ros-args", "--log-level", given["log_level"]],
         prefix=given["prefix"] or None,
         respawn=respawn,
-        respawn_delay=float(given["respawn_delay"]),
+        respawn_delay=delay,
         on_exit=ended if required else None,
         output="screen",
     )

@@ -285,7 +285,7 @@ def test_a_lag_of_more_than_a_step_is_said_live_and_when_a_recording_is_read(eng
 
 
 @pytest.mark.parametrize("rate", [0.2, 5.0])
-@pytest.mark.parametrize("lag", [0.0, 2.4])
+@pytest.mark.parametrize("lag", [0.0, 2.4, -2.4])
 def test_a_lag_is_that_of_the_stamps_where_a_recording_is_played_at_another_speed(engine, rate: float, lag: float):
     model, bag = engine
     seldom = [m for i, m in enumerate(sent(bag)) if m[1] == STATE_TOPIC or i % 34 < 2]
@@ -293,3 +293,19 @@ def test_a_lag_is_that_of_the_stamps_where_a_recording_is_played_at_another_spee
     session = session_of(model, Rule())
     run(session, played, until=played[-1][0])
     assert session.lags == ({CONTROL_TOPIC: pytest.approx(lag * STEP, rel=0.2)} if lag else {})
+
+
+def test_a_topic_that_has_fallen_silent_has_no_lag(engine):
+    """Its last message came an hour ago, and the clock topic's arrivals jitter."""
+    model, bag = engine
+    rng, hour, come = np.random.default_rng(0), 3600, []
+    for i, (at, topic, log, data, sent_ns) in enumerate(sent(bag)):
+        if i < 40:
+            stamp = int.from_bytes(data[4:8], "little") - hour
+            before = data[:4] + stamp.to_bytes(4, "little") + data[8:]
+            come.append((at - hour, topic, log - hour * 10**9, before, sent_ns - hour * 10**9))
+        elif topic == STATE_TOPIC:
+            come.append((at + rng.uniform(0.0, 0.4 * STEP), topic, log, data, sent_ns))
+    session = session_of(model, Rule())
+    run(session, come)
+    assert session.lags == {}

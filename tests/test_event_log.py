@@ -137,6 +137,19 @@ def test_an_alarm_is_a_warning_that_names_the_states_and_by_how_much_and_its_end
     assert level == OK and re.fullmatch(r"the alarm is over after 0\.0\d+ s", line)
 
 
+def test_an_alarm_says_that_messages_came_too_late_just_before() -> None:
+    rig = Rig.at_work()
+    rig.session.report(rig.now, TIMEOUT)
+    rig.take(CONTROL, vector(rig.t_ns - 3 * STEP_NS, 0.1, 0.1))
+    rig.send(3, off=2.0)
+    assert rig.lines[-1].endswith("; 1 message came too late just before")
+    rig.send(9)
+    rig.session.report(rig.now, TIMEOUT)
+    rig.lines.clear()
+    rig.send(3, off=2.0)
+    assert "too late" not in rig.lines[-1]
+
+
 def test_a_jump_larger_than_any_of_the_fit_is_logged_and_reported_with_its_limit() -> None:
     rig = Rig()
     rig.model = rig.model.replace(domain=replace(rig.model.domain, step_max=np.array([0.01, 1e3])))
@@ -291,6 +304,24 @@ def test_a_steady_control_that_ceases_is_told_while_its_publisher_stays(every: i
     rig.send(200 * every, control=False)
     rig.send(30)
     assert f"messages on {CONTROL} again" in rig.lines and not rig.session.ceased(rig.now, TIMEOUT)
+
+
+def test_the_reason_names_what_is_expected_and_what_was_heard_where_no_message_names_a_signal() -> None:
+    rig = Rig()
+    for _ in range(30):
+        rig.take(STATE, joint_state(rig.t_ns, [1.0, 2.0], ("c", "d")))
+        rig.wait(0.1)
+    there = f"{STATE}: there is no 'a' in the message's names; names there: c, d"
+    assert rig.session.reason(rig.now, TIMEOUT).startswith("no verdict for more than 1 s: nothing received on")
+    rig.take(CONTROL, vector(rig.t_ns, 0.0, 0.0))
+    assert rig.session.reason(rig.now, TIMEOUT) == f"no verdict for more than 1 s: {there}"
+    rig.send(20)
+    rig.wait(2.0)
+    silent = f"no verdict for more than 1 s: no message on {STATE}"
+    assert rig.session.reason(rig.now, TIMEOUT) == silent
+    rig.take(STATE, joint_state(rig.t_ns, [1.0, 2.0], ("c", "d")))
+    assert rig.session.reason(rig.now, TIMEOUT) == f"{silent}; {there}"
+    assert there in rig.session.report(rig.now, TIMEOUT)[0].message
 
 
 def test_silence_of_each_input_and_its_return_are_told_once() -> None:

@@ -76,7 +76,14 @@ def test_a_damaged_installation_is_no_alarm(module, status):
     assert "uncertain-lti = uncertain_lti.cli:begin" in (ROOT / "setup.py").read_text()
 
 
-@pytest.mark.parametrize("error", ["KeyboardInterrupt", "ImportError('umath failed to import')"])
+@pytest.mark.parametrize(
+    ("number", "error"),
+    [
+        ("SIGINT", "KeyboardInterrupt"),
+        ("SIGINT", "ImportError('umath failed to import')"),
+        ("SIGTERM", "KeyboardInterrupt"),
+    ],
+)
 @pytest.mark.parametrize(
     ("module", "said"),
     [
@@ -84,13 +91,13 @@ def test_a_damaged_installation_is_no_alarm(module, status):
         ("uncertain_lti.recordings.bag", " topics: interrupted; no half-written file is left\n"),
     ],
 )
-def test_an_interrupt_is_said_whatever_an_import_makes_of_it(module, said, error):
-    """As numpy and rclpy do."""
+def test_an_interrupt_is_said_whatever_an_import_makes_of_it(module, said, number, error):
+    """As numpy and rclpy do; `kill` ends in order, too, with no half-written file left."""
     first = (
         "import builtins, signal, sys; from uncertain_lti.cli import begin as main; real = builtins.__import__\n"
         "def interrupted(name, *rest):\n"
         f"    if name == {module!r}:\n"
-        "        try: signal.raise_signal(signal.SIGINT)\n"
+        f"        try: signal.raise_signal(signal.{number})\n"
         f"        except KeyboardInterrupt: raise {error} from None\n"
         "    return real(name, *rest)\n"
         "builtins.__import__ = interrupted; sys.exit(main())"

@@ -611,6 +611,9 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     there = "there is no 'c' in the message's names; names there: a, b"
     assert accepted == (True, f"parameter enable: {STATE} comes without a number in position[c]: {there}")
     assert world.set(enable=f"{STATE} position[b] > -9") == (True, "")
+    path = str(saved(model, tmp_path))
+    assert world.set(model=path, enable="/machine/mod data == 3") == (True, nobody)
+    assert world.set(model=path, enable="") == (True, "")
 
 
 def test_a_second_node_of_the_same_name_is_told(world: World, tmp_path: Path) -> None:

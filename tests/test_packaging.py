@@ -266,3 +266,13 @@ def test_a_launch_ends_with_the_node_that_it_requires(monkeypatch):
         end(2)
     assert end(0) is sys.modules["launch.actions"].Shutdown.return_value
     assert end(0, shutting_down=True) is end(-2, shutting_down=True) is None, "Ctrl-C ends it already"
+
+
+def test_a_launch_argument_that_is_no_number_is_named(monkeypatch):
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    launched = runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))
+    given = {name: default for name, (default, _) in launched["ARGUMENTS"].items()} | {"respawn_delay": "abc"}
+    launched["start"].__globals__["LaunchConfiguration"] = lambda name: MagicMock(perform=lambda _: given[name])
+    with pytest.raises(ValueError, match="^respawn_delay:=abc is no number; give seconds$"):
+        launched["start"](None)

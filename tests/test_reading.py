@@ -477,6 +477,9 @@ def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path
         read_as_fitted(zero, model.signals)
     silent = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, [("/y", 1, float64(1.0))], "silent.mcap")
     refuses(BagError, "silent.mcap: /x has no message; record it", read_as_fitted, silent, model.signals)
+    junk = save(tmp_path, {"/x": JOINT_STATE}, [("/x", k * MS, b"\0\7\0\0") for k in range(9)], "junk.mcap")
+    said = r"junk.mcap: /x: 9 messages left out that cannot be decoded \(.* begins with 0007\); record it"
+    refuses(BagError, said, read_as_fitted, junk, model.signals)
     driven = replace(fitted.signals, controls=(Signal("y", "/y", "data"),), time={**fitted.signals.time, "/y": "log"})
     quiet = save(tmp_path, {"/x": JOINT_STATE, "/y": FLOAT64}, stamped, "quiet.mcap")
     refuses(BagError, "quiet.mcap: /y has no message; record it", read_as_fitted, quiet, model_of(driven).signals)

@@ -136,6 +136,21 @@ def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_pa
     assert np.allclose(table.columns["y"], 1.25 + np.arange(9)) and table.columns["z"].dtype == object
 
 
+def test_a_minus_that_is_no_hyphen_is_one(tmp_path):
+    path = tmp_path / "a.csv"
+    path.write_text("time,x\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(9)), encoding="utf-8")
+    assert np.array_equal(read_table(path).columns["x"], -0.5 - np.arange(9)) and not read_table(path).notes
+
+
+def test_a_table_of_many_columns_is_read(tmp_path):
+    """Its names alone take more than what the shape was once looked for in."""
+    names = [f"plant/area_{i}/measured value of the sensor" for i in range(3000)]
+    rows = [",".join([str(k), *(["0.5"] * len(names))]) for k in range(5)]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([",".join(["time", *names]), *rows]))
+    assert len(read_table(path).columns) == 3001
+
+
 def test_every_command_takes_them(tables, shipped, names, tmp_path, cli):
     path, model, signals = str(tables[".csv"]), str(tmp_path / "m.model.json"), tmp_path / "s.yaml"
     assert f"/table: {', '.join(names)}" in cli("topics", path).out
@@ -533,6 +548,21 @@ def test_equal_names_do_not_take_for_ever(tmp_path):
     path = write(tmp_path / "a.csv", ",".join(["time"] + ["x"] * number), *rows)
     with bounded(seconds=5):
         assert len(Table(path).columns_by_field) == number
+
+
+@pytest.mark.parametrize("kind", ["duration[us]", "time64[us]", "time32[ms]"])
+def test_times_of_arrow_that_are_no_instants_are_read(tmp_path, kind):
+    pa = pytest.importorskip("pyarrow")
+    from pyarrow import parquet
+
+    unit = 10**3 if "ms" in kind else 10**6
+    steps = pa.array([k * unit // 50 for k in range(9)], pa.int32() if "ms" in kind else pa.int64())
+    path = tmp_path / "a.parquet"
+    types = {"duration[us]": pa.duration("us"), "time64[us]": pa.time64("us"), "time32[ms]": pa.time32("ms")}
+    parquet.write_table(pa.table({"time": steps.cast(types[kind]), "x": np.arange(9.0)}), path)
+    (tmp_path / "s.yaml").write_text("states: [{name: x, topic: /table, field: x}]")
+    (t,) = read_transients(path, tmp_path / "s.yaml")
+    assert np.diff(t.t_ns).tolist() == [20_000_000] * 8
 
 
 def test_a_small_parquet_that_expands_is_refused(tmp_path):

@@ -207,6 +207,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.snapshots.clear()
         if self.active:
             self.subscribe()
+            self._find_enable_type()
         name = Path(self.settings["model"]).name
         self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
         self._event_log.begin(session, time.monotonic())

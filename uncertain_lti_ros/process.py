@@ -105,13 +105,18 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
             node._parameter_overrides[parameter.name] = whole_to_real(given, parameter.default)
         try:
             declared = node.declare_parameter(parameter.name, parameter.default, parameter.descriptor())
+            if declared.value is None:  # an empty list
+                raise InvalidParameterValueException(parameter.name, None, "")
             values[parameter.name] = declared.value
         except (InvalidParameterTypeException, InvalidParameterValueException):
             given = node._parameter_overrides[parameter.name].value
+            given = [] if given is None else given
             shown = repr(given) if isinstance(given, str) else _shown(given)
             remedy = f"for example -p {parameter.name}:={parameter.example}"
             if isinstance(parameter.default, str):
-                remedy = f"if it looks like something else, quote it twice: -p \"{parameter.name}:='{shown}'\""
+                listed = isinstance(given, list)
+                why = "write no brackets" if listed else "if it looks like something else, quote it twice"
+                remedy = f"{why}: -p \"{parameter.name}:='{','.join(map(str, given)) if listed else shown}'\""
             raise ArgumentError(
                 f"parameter {parameter.name} is {shown}, and {parameter.wanted} is wanted; {remedy}"
             ) from None

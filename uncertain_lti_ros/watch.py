@@ -135,7 +135,7 @@ class Watched:
         with self._lock:
             said, heard, reason = self._said, self._heard, self._reason
             statistic_names, (t_ns, *rows) = said.statistic_names, said.rows()
-        shown = t_ns > t_ns[-1:] - self._window * 1e9
+        shown = t_ns >= t_ns[-1:] - self._window * 1e9
         shown[: max(np.flatnonzero(np.diff(t_ns) < -_PASS), default=-1) + 1] = False  # of the pass before, in a loop
         alarm, flags, utilisation, statistics = (row[shown] for row in rows)
         t = (t_ns[shown] - t_ns[-1:]) * 1e-9

@@ -18,7 +18,7 @@ import sys
 from typing import Any
 
 FAULT, INTERRUPTED = 70, 130
-"""Exit statuses: of a fault of the program itself, and of an interrupt; here, as nothing need be imported for them."""
+"""Exit statuses: of a fault of the program itself, and of a signal; here, as nothing need be imported for them."""
 _interrupts: list[int] = []
 
 
@@ -27,8 +27,9 @@ def begin() -> int:
     try:
         import signal
 
-        if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            signal.signal(signal.SIGINT, _interrupt)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) in (signal.SIG_DFL, signal.default_int_handler):
+                signal.signal(number, _interrupt)
         from uncertain_lti.cli.main import main as run
     except (Exception, KeyboardInterrupt) as error:
         if interrupted(error):

@@ -206,7 +206,7 @@ def build_parser(chosen: str = "", every: bool = False) -> argparse.ArgumentPars
         prog="uncertain-lti",
         description="Fit an uncertain linear model to recorded transients, and report when a machine leaves it.",
         epilog="Exit status: 0 done, 1 the alarm was raised, 2 bad usage or input, 3 a check that says nothing of "
-        "the machine, 70 a fault of this program, 130 interrupted by Ctrl-C.",
+        "the machine, 70 a fault of this program, 130 interrupted by a signal.",
     )
     parser.add_argument("--version", action="version", version=f"uncertain-lti {__version__}")
     parser.set_defaults(build_parser=build_parser)

@@ -79,7 +79,7 @@ class Session(Stream):
         without, never = self.without_verdict(now), [topic for topic in self.types if self.heard(topic) is None]
         complaints, calm = list(problems), list[str]()
         lacking = self.lacking(period.counters)
-        came_late = Counters(self.sampler.counters - period.counters).of(LATE)
+        came_late = self.came_late(period.counters)
         if period.last_unknown is not None:
             why = self.model.why_unknown(period.last_unknown.before)
             complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
@@ -103,7 +103,7 @@ class Session(Stream):
             coarse = self.coarse_clock(period.statuses[Status.EQUAL])
             complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
         if came_late:
-            complaints.append(f"{sum(came_late.values())} messages came too late")
+            complaints.append(f"{came_late} messages came too late")
         if period.unreadable:
             complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
         if period.future:
@@ -126,6 +126,7 @@ class Session(Stream):
                 complaints.insert(0, "alarm: it was on at the last verdict")
             if silent > timeout and self.heard(self.sampler.clock) is not None:
                 complaints.insert(0, f"no message on {self.sampler.clock} for {silent:.1f} s")
+                complaints += [why for why in self.absent(self.model.signals) if why not in complaints]
             else:
                 complaints.insert(0, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet")
             if never:
@@ -147,11 +148,10 @@ class Session(Stream):
         text = self.reasons.text
         if self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
-        why = "no sample could be judged"
+        silent = [f"no message on {self.sampler.clock}"] if self.silent_for(now) > timeout else []
+        why = "; ".join([*silent, *self.absent(self.model.signals)]) or "no sample could be judged"
         if never := [topic for topic in self.types if self.heard(topic) is None]:
             why = f"nothing received on {', '.join(never)}"
-        elif self.silent_for(now) > timeout:
-            why = f"no message on {self.sampler.clock}"
         said = f"no verdict for more than {timeout:g} s: {why}"
         return f"{text}; {said}" if self.alarm else said
 
@@ -199,6 +199,10 @@ class Session(Stream):
         since = Counters(self.sampler.counters - before)
         lacking = since.of(MISSING) | since.of(TOO_OLD)
         return [signal for signal in self.model.signals if signal.name in lacking]
+
+    def came_late(self, before: Counter[str]) -> int:
+        """Messages that came after their sample was closed, since some counters."""
+        return sum(Counters(self.sampler.counters - before).of(LATE).values())
 
     def absent(self, lacking: Iterable[Signal]) -> list[str]:
         """What the last message of each topic has not of what is read from it, the first of these signals in words."""
@@ -357,6 +361,8 @@ class EventLog:
             line += f"; {', '.join(jumped[:SHOWN])}" if jumped else ""
             if frozen:
                 line = f"alarm, frozen: {'; '.join(session.frozen_text(moved) for moved in frozen[:SHOWN])}"
+            if late := session.came_late(session.period.counters):
+                line += f"; {plural(late, 'message')} came too late just before"
             line += "; it lasts until ~/reset" if session.rule.latch else ""
             self._alarm_since = now
             self._named = self._matters["alarm"].may(now)
@@ -392,7 +398,8 @@ class EventLog:
                 self._log(OK, f"the alarm {like.words}")
         known, clock, lags = self._matters["problems"].logged or (), session.sampler.clock, session.lags
         condition = session.arming.condition or "there is no condition any more"
-        lag = [f"stamps on {topic} lag those on {clock} by {s:.3g} s, more than a step" for topic, s in lags.items()]
+        way = {topic: "lag" if s > 0.0 else "lead" for topic, s in lags.items()}
+        lag = [f"stamps on {t} {way[t]} those on {clock} by {abs(s):.3g} s, more than a step" for t, s in lags.items()]
         resets = session.sampler.counters["resets"]
         if session.reasons.rivals:  # then it is their stamps that step back
             self._matters["resets"].logged = resets
@@ -454,7 +461,7 @@ class EventLog:
         found = [f"nothing received on {', '.join(never)}"] if never else []
         clock = session.sampler.clock
         if clock not in never and session.silent_for(now) > timeout / 2:
-            return "; ".join([f"no message on {clock}", *found])
+            return "; ".join([f"no message on {clock}", *found, *session.absent(session.model.signals)])
         since = session.sampler.counters - self._counters
         if lacking := session.lacking(self._counters):
             found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")

@@ -303,22 +303,23 @@ class Stream:
 
     @property
     def lags(self) -> dict[str, float]:
-        """Topics whose stamps lag those of the clock topic by more than a step, and by how much, s."""
+        """Topics whose stamps lag those of the clock topic by more than a step, and by how much, s; negative: lead."""
         step = self.model.sampling.dt_median or math.inf
         lags = {topic: median(behind) for topic, behind in self._behind.items() if len(behind) >= _LOOKS}
-        return {topic: lag for topic, lag in lags.items() if lag > step}
+        return {topic: lag for topic, lag in lags.items() if abs(lag) > step}
 
     def _look_at_lags(self) -> None:
         """Compare stamps; how fast they go by the steady clock, as where a recording is played, the last look tells."""
         latest, clock = self.sampler.latest(), self._heard.get(self.sampler.clock, 0.0)
         if latest is None or clock <= self._looked[1]:
             return
-        pace, self._looked = (latest[0] - self._looked[0]) / (clock - self._looked[1]), (latest[0], clock)
+        before = self._looked[1]
+        pace, self._looked = (latest[0] - self._looked[0]) / (clock - before), (latest[0], clock)
         if pace <= 0.0:  # the first look, or time has stepped back
             return
         for topic in self._stamped:
             kept = self.sampler.kept(topic)
-            if kept and kept[-1][0]:
+            if kept and kept[-1][0] and self._heard[topic] > before:  # else the pace's error counts for all the time
                 behind = self._behind.setdefault(topic, deque(maxlen=_MOST_LOOKS))
                 behind.append((latest[0] - kept[-1][0] + pace * (self._heard[topic] - clock)) * 1e-9)
 

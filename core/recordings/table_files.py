@@ -30,7 +30,7 @@ from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"
-_LOOK = 1 << 16  # bytes in which the shape of a CSV file is looked for
+_LOOK = 1 << 20  # bytes in which the shape of a CSV file is looked for
 _LOOK_LINES = 60
 _MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?"}
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
@@ -184,7 +184,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
 
 def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
     """Numbers where most cells are some, else text; and what was done."""
-    plain = [cell.strip() for cell in cells]
+    plain = [cell.strip().replace("\u2212", "-") for cell in cells]  # the minus of some languages
     if not any("_" in cell for cell in cells):  # `1_0` is 10 to Python alone
         with suppress(ValueError):
             return np.array([float(cell) for cell in cells]), ""
@@ -326,14 +326,18 @@ def _read_arrow(path: Path) -> RawTable:
         kind = column.type
         if pa.types.is_dictionary(kind):
             column, kind = column.cast(kind.value_type), kind.value_type
+        if pa.types.is_duration(kind):
+            columns[name] = column = pa.array(np.asarray(column) / np.timedelta64(1, "s"))
+            kind = column.type
         if pa.types.is_timestamp(kind) or pa.types.is_date(kind):
             found[name] = _nanoseconds(path, name, np.asarray(column))
         elif pa.types.is_boolean(kind) or pa.types.is_floating(kind) or pa.types.is_decimal(kind):
             found[name] = np.asarray(column.cast(pa.float64(), safe=False), dtype=np.float64)
         elif pa.types.is_integer(kind):
             found[name] = np.asarray(column)
-        elif pa.types.is_string(kind) or pa.types.is_large_string(kind):
-            found[name] = np.array([text or "" for text in column.to_pylist()], dtype=object)
+        elif pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_time(kind):
+            texts = column.cast(pa.string()).to_pylist()  # times of day as in a CSV file
+            found[name] = np.array([text or "" for text in texts], dtype=object)
         else:
             notes.setdefault(f"of type {kind}", []).append(name)
     read = _of_one_length(path, found, notes)

@@ -101,7 +101,8 @@ def _refuse_absent(bag: Recording, topic: str, path: FieldPath, column: NDArray[
     if first is not None and (absent := path.absent(first)):
         raise SignalError(f"field '{path.text}' of {topic} in {bag.path}: {absent}")
     if not len(column):
-        raise BagError(f"{bag.path}: {topic} has no message; record it, or choose another topic or recording")
+        why = notes[1].get(topic, f"{bag.path}: {topic} has no message")
+        raise BagError(f"{why}; record it, or choose another topic or recording")
 
 
 Paths = str | os.PathLike[str] | Iterable[str | os.PathLike[str]]
