@@ -765,7 +765,7 @@ def test_a_table_in_which_nothing_is_a_state_is_refused_with_what_was_left_out(t
 
 def test_rows_out_of_order_are_told(tmp_path):
     bag = read_csv(tmp_path, "time,x", (f"{k * 7 % 20},{k % 3}" for k in range(20)))
-    assert "6 of 20 rows are older than the row before: sort the rows by 'time', or name" in bag.warnings[0]
+    assert "6 of 20 rows are older than the row before: sort the rows by 'time', or name" in bag.warnings[-1]
 
 
 def test_runs_in_a_table_may_step_back_before_the_first(tmp_path):
@@ -803,6 +803,14 @@ def test_times_since_1970_are_found_without_a_name_though_some_step_back(tmp_pat
     refuses(BagError, "no column is called time", read_csv, tmp_path, "column,x", [row[3:] for row in rows])
 
 
+def test_row_numbers_without_a_name_are_no_time(tmp_path):
+    """Of a data frame at 20 Hz they made a plant of a row per second; without names above, they are all there is."""
+    rows = [f"{k},{k % 7},{k % 5}" for k in range(60)]
+    refuses(BagError, "no column is called time", read_csv, tmp_path, ",x,y", rows)
+    (tmp_path / "b.csv").write_text("\n".join(rows))
+    assert "taken for the time" in open_recording(tmp_path / "b.csv").warnings[0]
+
+
 def test_another_time_is_told_where_most_rows_share_one(tmp_path):
     bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
     assert bag.warnings[0].endswith(
@@ -827,9 +835,11 @@ def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
         ("time (millisec)", 5, 0.005, "taken for ms"),
         ("ms_today", 40, 0.04, "taken for ms"),
         ("us_since_boot", 2500, 0.0025, "taken for us"),
-        ("timestamp", 8001, 8001.0, "taken for s, a long way from row to row"),
+        ("timestamp", 8001, 8001.0, "taken for s, 8001 from row to row"),
         ("timestamp", 7200, 7200.0, ""),  # by the hour or so
-        ("timestamp", 50, 50.0, ""),
+        ("timestamp", 5, 5.0, "taken for s, 5 from row to row"),
+        ("timestamp_s", 5, 5.0, ""),
+        ("timestamp", 1, 1.0, ""),
     ],
 )
 def test_the_unit_of_a_clock_is_in_its_name_or_asked_for(head, step, seconds, words, tmp_path):

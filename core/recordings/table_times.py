@@ -102,8 +102,10 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
     else:
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
         doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
-        if unit == "s" and _coarse(values):
-            doubt = ", a long way from row to row: for others name it time_us or time_ms, or give `table: {unit: us}`"
+        if unit == "s" and not stated and (step := _coarse(values)):
+            doubt = (
+                f", {step:.6g} from row to row: for others name it time_us or time_ms, or give `table: {{unit: us}}`"
+            )
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
         times = _of_numbers(where, table, column, UNITS[unit])
@@ -125,6 +127,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     if len(dated) == 1:
         return dated[0], ""
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
+    if first == ["column 1"] and names[1:2] != ["column 2"] and set(np.diff(table.columns["column 1"]).tolist()) == {1}:
+        first = []  # the row numbers of a data frame, which alone have no name
     for name in [*(n for n in names if re.fullmatch(r"\w+_time", _bare(n))), *first]:
         if _grows(table.columns[name]):
             return name, "it is taken for the time, as it grows from row to row"
@@ -268,12 +272,12 @@ def _like_days(values: Column) -> bool:
     return fine and any(least < low and high < most for least, most in ((20_000, 80_000), (690_000, 800_000)))
 
 
-def _coarse(values: Column) -> bool:
-    """Whether whole numbers rise by hundreds from row to row, and not by whole minutes, as of a clock of ms or us."""
+def _coarse(values: Column) -> float:
+    """Usual step of whole numbers, where it is beyond 1 and no whole minutes, as of a clock of ms or us; else 0."""
     steps = np.diff(values[np.isfinite(values)].astype(np.float64))
-    return len(steps) > 2 and bool(
-        np.median(steps) >= 100 and (steps % 1 == 0).all() and (steps % 60 != 0).mean() > 0.5
-    )
+    if len(steps) < 3 or (steps % 1 != 0).any() or (steps % 60 != 0).mean() <= 0.5:
+        return 0.0
+    return step if (step := float(np.median(steps))) > 1 else 0.0
 
 
 def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:
