@@ -960,17 +960,19 @@ def test_a_servo_whose_command_comes_in_the_row_of_its_answer_is_a_state(tmp_pat
     )
 
 
-@pytest.mark.parametrize("moves", [True, False])
-def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, moves):
+@pytest.mark.parametrize(("name", "moves"), [("valve", True), ("valve", False), ("battery", True), ("ErrRP", True)])
+def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, name, moves):
+    """A battery's level and a place, which change as seldom, were controls."""
     rng = np.random.default_rng(4)
     valve, level, rows = 0.0, 0.0, []
     for k in range(600):
         valve = float(rng.choice([0.0, 0.4, 1.0])) if k % 25 == 0 else valve
         rows.append((f"{0.1 * k:.1f}", valve, f"{level:.6f}"))
         level += 0.1 * ((valve if moves else 0.0) - 0.5 * level) + 1e-3 * rng.standard_normal()
-    path = csv(tmp_path / "tank.csv", ["time", "valve", "level"], rows)
+    path = csv(tmp_path / "tank.csv", ["time", name, "level"], rows)
     proposal = propose([path])
     commands = [c.path for c in proposal.controls]
+    moves = moves and name == "valve"
     assert commands == (["valve"] if moves else []), proposal.text
     assert ("by correlation alone: nothing is called a command here" in proposal.text) == moves
     if moves:
@@ -1098,6 +1100,7 @@ def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
             "ki": np.full(300, gain),
             "Cycle": np.arange(300) % 170 // 4,
             "Robot_ProtectiveStop": (np.arange(300) > 296) * 1.0,
+            "grip_lost": (np.arange(300) % 50 == 40) * 1.0,
             "level": level,
             "flow": np.diff(level, prepend=0),
         }

@@ -346,7 +346,7 @@ _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpee
 
 _LABEL = re.compile(
     r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
-    r"alarm|emergency|(^|_)e_?stop|protective_?stop)"
+    r"alarm|emergency|(^|_)e_?stop|protective_?stop|(^|_)(lost|fail(ed|ure)?)$)"
 )
 _LABELS = 30
 """Values that a label takes, at most."""
@@ -368,6 +368,9 @@ _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|me
 
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 
+
+_TOLD = re.compile(r"^err|error|(^|_)(soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)")
+"""Likewise, of what is measured or reckoned, in the names of columns."""
 
 FEWEST_SET, MOST_SET = 3, 0.2
 """A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
@@ -547,12 +550,13 @@ def _plain(path: str) -> str:
 def _held_columns(table: Source) -> Source | None:
     """Columns of a table that are held, and set now and then, if they show in the next step of the others.
 
-    They leave the table for a topic of their own, whose role is a guess.
+    What is measured by its name is none. They leave the table for a topic of their own, whose role is a guess.
     """
     if table.type != TYPE:
         return None
     changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
-    held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows)]
+    told = {c for c in table.free for named in (_STATE, _APART, _TOLD) if named.search(c.path.lower())}
+    held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows) and c not in told]
     rest = [c for c in table.free if c not in held]
     shows = held and rest and most_shown(rest, {table.topic: table}, held) > SHOWS
     return table.parted(held, "guess") if shows else None
