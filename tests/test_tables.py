@@ -601,6 +601,7 @@ WRITTEN = (  # over noon; %I %p as English has it
     "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y  %I:%M:%S.000 %p", "%Y-%m-%d %I:%M:%S%p", "%I:%M:%S %p", "%d-%b-%y %I.%M.%S %p",
     "%m/%d/%Y %I:%M:%S A.M.", "%d-%b-%Y %H:%M:%S", "%d %B %Y, %H:%M:%S", "%b %d, %Y %I:%M:%S %p",
     "%a %b %d %H:%M:%S %Y", "%a, %d %b %Y %H:%M:%S GMT",
+    "%a %b %d %Y %H:%M:%S GMT+0000 (Coordinated Universal Time)",
     "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d-%m-%Y %H:%M:%S", "%Y%m%dT%H%M%S",
     "%Y%m%d%H%M%S", "%Y-%m-%d %H:%M:%S:000", "%d %m %Y %H:%M:%S", "%d-%m-%y %H:%M:%S", "%Y %m %d %H %M %S",
 )  # fmt: skip
@@ -858,6 +859,23 @@ def test_the_name_of_a_text_file_with_numbers_does_not_matter(suffix, tmp_path):
     assert len(bag.times) == 40 and bag.columns_by_field["x"][1] == 1.5
     path.write_bytes(bytes(range(256)) * 20)
     refuses(BagError, "bytes that are no text", group_recordings, [path])
+
+
+def test_seconds_of_a_minute_are_no_time(tmp_path):
+    """Of a clock in three columns they alone were the time."""
+    rows = [f"{9 + k // 3600},{k // 60 % 60},{k % 60},{k % 7}" for k in range(0, 900, 2)]
+    refuses(BagError, "no column is called time", read_csv, tmp_path, "H,MIN,SEC,x", rows)
+    assert not read_csv(tmp_path, "SEC,x", (f"{0.1 * k:.1f},{k % 7}" for k in range(60))).warnings
+
+
+def test_units_whose_rows_take_turns_are_told(tmp_path):
+    """Seven sensors of a greenhouse were one machine, whose state jumped from one to the next."""
+    rng = np.random.default_rng(1)
+    units = rng.choice(["a1", "b2", "c3"], 300)
+    bag = read_csv(tmp_path, "time,unit,x,y", (f"{k},{unit},{k % 7},{k % 5}" for k, unit in enumerate(units)))
+    assert "rows are of 3 'unit' by turns: if they are units, say so" in bag.warnings[0]
+    for cells in (np.sort(units), np.where(units == "a1", "", units)):  # one after the other, or an event now and then
+        assert not read_csv(tmp_path, "time,unit,x,y", (f"{k},{c},{k % 7},1" for k, c in enumerate(cells))).warnings
 
 
 def test_years_of_two_digits_may_come_first(tmp_path):

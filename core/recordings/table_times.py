@@ -119,7 +119,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     plain = [name for name in names if table.columns[name].ndim == 1]
     called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
     still = [name for name in called if _stands_still(table.columns[name])]
-    called = [name for name in called if name not in still]
+    called = [name for name in called if name not in still and not _of_a_minute(name, table.columns[name])]
     if likely := [name for name in called if may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
         return called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0], ""
@@ -173,6 +173,12 @@ def _days_beside(table: RawTable, column: str) -> str:
 
 def _stands_still(column: Column) -> bool:
     return column.dtype.kind in "iuf" and len(column) > 2 and bool((column == column[0]).all())
+
+
+def _of_a_minute(name: str, column: Column) -> bool:
+    """Whether it has the seconds of a clock whose minutes and hours are in other columns."""
+    seconds = column.dtype.kind in "iuf" and len(column) > 1 and re.fullmatch(r"sec(ond)?s?", _bare(name)) is not None
+    return seconds and bool(0 <= column.min() and column.max() < 60 and (np.diff(column) < 0).any())
 
 
 def may_be(column: Column) -> bool:
@@ -237,7 +243,7 @@ def _spelt(text: str) -> str:
         year, _, month, day, hour, minutes, rest = dated.groups()
         clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
         text = f"{year}-{int(month):02}-{int(day):02}{clock}"
-    return re.sub(r"\s+(GMT)$", "Z", text)
+    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda zone: zone[1] or "Z", text)  # as browsers write it
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
