@@ -242,6 +242,7 @@ def test_what_is_desired_is_a_reference(column, role):
     [
         ("x u v r delta n", "delta n"), ("U_m_s V_m_s Q_rad_s rudder", "rudder"), ("x v u", "u"), ("n delta u", "u"),
         ("T_brine_in T_brine_out", ""), ("T_brine_in T_out in", "T_brine_in in"), ("Brake_IN Speed", "Brake_IN"),
+        ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
 def test_a_velocity_of_a_body_and_an_inlet_are_measured_and_its_rudder_is_set(columns, controls):
@@ -432,6 +433,8 @@ def test_the_weather_is_an_input_and_a_flow_of_outdoor_air_is_measured(tmp_path)
         rows.append((k, heat, f"{outdoor[k]:.2f}", f"{flow[k]:.2f}", f"{room + 0.05 * rng.normal():.2f}"))
         room += 0.1 * (20.0 * heat + outdoor[k] - room) + 0.02 * flow[k]
     columns = ["time", "Heating", "AHU: Outdoor Air Temp", "AHU: Outdoor Air Flow", "Room"]
+    modelica = ["time", "Heating", "weaSta_reaWeaTDryBul_y", "Flow", "Room"]
+    assert [c.path for c in propose([csv(tmp_path / "b.csv", modelica, rows)]).controls] == modelica[1:3]
     proposal = propose([csv(tmp_path / "a.csv", columns, rows)])
     assert [c.path for c in proposal.controls] == ["Heating", "AHU_Outdoor_Air_Temp"]
     assert [c.path for c in proposal.states] == ["AHU_Outdoor_Air_Flow", "Room"]

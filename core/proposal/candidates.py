@@ -340,7 +340,7 @@ _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|dr
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 
 
-_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in a table
+_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)tau(_?con)?_?\d*$")  # of a control in a table
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
 
 
@@ -363,13 +363,15 @@ _STATE = re.compile(
 )
 
 
-_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|measur|estimat")
+_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 
 
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 
 
-_TOLD = re.compile(r"^err|error|(^|_)(soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)")
+_TOLD = re.compile(
+    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
+)
 """Likewise, of what is measured or reckoned, in the names of columns."""
 
 FEWEST_SET, MOST_SET = 3, 0.2
