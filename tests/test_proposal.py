@@ -377,6 +377,18 @@ def test_topics_and_names_that_yaml_would_misread(tmp_path):
     assert fitted([path], proposal).n == 4
 
 
+@pytest.mark.parametrize(("held", "words"), [(0.0, "the machine is at rest"), (0.3, "to the states cannot be told")])
+def test_a_command_that_never_moves_is_told_and_rounding_is_no_state(tmp_path, held, words):
+    """A vehicle that drove at one speed was called at rest, and a joint that moved by 4e-12 rad alarmed."""
+    rng, x, messages = np.random.default_rng(0), np.zeros(2), []
+    for k in range(400):
+        x = 0.9 * x + [1.0, 1e-12] * rng.normal(size=2)
+        messages += [Message("/j/states", at(k), joint_state(at(k), x, ["a", "b"]), at(k)), f64("/j/cmd", at(k), held)]
+    _, proposal = proposed(tmp_path, messages, {"/j/states": JOINT})
+    assert words in " ".join(proposal.warnings) and [c.path for c in proposal.states] == ["position[a]"]
+    assert "which is rounding" in proposal.text
+
+
 def test_nothing_to_propose_is_said(tmp_path):
     messages = [Message("/talk", k, cdr("std_msgs/msg/String", data="x"), k) for k in range(50)]
     path = save(tmp_path / "a.mcap", messages, {"/talk": "std_msgs/msg/String"})

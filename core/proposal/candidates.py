@@ -500,9 +500,11 @@ def at_rest(sources: Sequence[Source]) -> str:
     if not commands or any(s.free for s in commands):
         return ""
     still = shortlist([f"{s.topic} {c.path} {c.reason}" for s in commands for c in s.candidates[:1]], 3)
+    held = any(c.finite.any() for s in commands for c in s.candidates)
+    rest = "what it does to the states cannot be told" if held else "the machine is at rest"
     return (
-        f"no command moves ({still}): the machine is at rest, and what is proposed drifts or is disturbed; record the "
-        "machine at work before you fit a model"
+        f"no command moves ({still}): {rest}, and what is proposed drifts or is disturbed; record the machine at work"
+        f"{', with other commands,' * held} before you fit a model"
     )
 
 

@@ -104,7 +104,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
         if unit == "s" and not stated and (step := _coarse(values)):
             doubt = (
-                f", {step:.6g} from row to row: for others name it time_us or time_ms, or give `table: {{unit: us}}`"
+                f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `table: {{unit: us}}`"
             )
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
