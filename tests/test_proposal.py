@@ -250,6 +250,11 @@ def test_a_velocity_of_a_body_and_an_inlet_are_measured_and_its_rudder_is_set(co
     assert [c for c in columns.split() if role_of_column(c, beside) == "control"] == controls.split()
 
 
+@pytest.mark.parametrize(("beside", "role"), [("r y u e", "reference"), ("x y u v r", "state"), ("r y", "state")])
+def test_r_beside_u_and_y_is_a_set_point_and_no_yaw_rate(beside, role):
+    assert role_of_column("r", set(beside.split())) == role
+
+
 def test_a_cascade_keeps_every_tank(tmp_path):
     """The command shows in the first tank only; the others follow."""
     rng = np.random.default_rng(3)

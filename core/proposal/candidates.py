@@ -439,7 +439,7 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
             return "state" if low in _BODY[0] else "control"
     if _ANSWER.search(low):
         return "state"
-    if _REFERENCE.search(low):
+    if _REFERENCE.search(low) or (low == "r" and {"u", "y"}.issubset(beside) and {"v", "x", "p"}.isdisjoint(beside)):
         return "reference"
     return "control" if _COMMAND.search(low) or _COLUMN.search(low) or _SET.search(name) else "state"
 
