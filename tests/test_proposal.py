@@ -242,11 +242,17 @@ def test_what_is_desired_is_a_reference(column, role):
     [
         ("x u v r delta n", "delta n"), ("U_m_s V_m_s Q_rad_s rudder", "rudder"), ("x v u", "u"), ("n delta u", "u"),
         ("T_brine_in T_brine_out", ""), ("T_brine_in T_out in", "T_brine_in in"), ("Brake_IN Speed", "Brake_IN"),
+        ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
 def test_a_velocity_of_a_body_and_an_inlet_are_measured_and_its_rudder_is_set(columns, controls):
     beside = {bare(column) for column in columns.split()}
     assert [c for c in columns.split() if role_of_column(c, beside) == "control"] == controls.split()
+
+
+@pytest.mark.parametrize(("beside", "role"), [("r y u e", "reference"), ("x y u v r", "state"), ("r y", "state")])
+def test_r_beside_u_and_y_is_a_set_point_and_no_yaw_rate(beside, role):
+    assert role_of_column("r", set(beside.split())) == role
 
 
 def test_a_cascade_keeps_every_tank(tmp_path):
@@ -376,6 +382,18 @@ def test_topics_and_names_that_yaml_would_misread(tmp_path):
     assert fitted([path], proposal).n == 4
 
 
+@pytest.mark.parametrize(("held", "words"), [(0.0, "the machine is at rest"), (0.3, "to the states cannot be told")])
+def test_a_command_that_never_moves_is_told_and_rounding_is_no_state(tmp_path, held, words):
+    """A vehicle that drove at one speed was called at rest, and a joint that moved by 4e-12 rad alarmed."""
+    rng, x, messages = np.random.default_rng(0), np.zeros(2), []
+    for k in range(400):
+        x = 0.9 * x + [1.0, 1e-12] * rng.normal(size=2)
+        messages += [Message("/j/states", at(k), joint_state(at(k), x, ["a", "b"]), at(k)), f64("/j/cmd", at(k), held)]
+    _, proposal = proposed(tmp_path, messages, {"/j/states": JOINT})
+    assert words in " ".join(proposal.warnings) and [c.path for c in proposal.states] == ["position[a]"]
+    assert "which is rounding" in proposal.text
+
+
 def test_nothing_to_propose_is_said(tmp_path):
     messages = [Message("/talk", k, cdr("std_msgs/msg/String", data="x"), k) for k in range(50)]
     path = save(tmp_path / "a.mcap", messages, {"/talk": "std_msgs/msg/String"})
@@ -432,6 +450,8 @@ def test_the_weather_is_an_input_and_a_flow_of_outdoor_air_is_measured(tmp_path)
         rows.append((k, heat, f"{outdoor[k]:.2f}", f"{flow[k]:.2f}", f"{room + 0.05 * rng.normal():.2f}"))
         room += 0.1 * (20.0 * heat + outdoor[k] - room) + 0.02 * flow[k]
     columns = ["time", "Heating", "AHU: Outdoor Air Temp", "AHU: Outdoor Air Flow", "Room"]
+    modelica = ["time", "Heating", "weaSta_reaWeaTDryBul_y", "Flow", "Room"]
+    assert [c.path for c in propose([csv(tmp_path / "b.csv", modelica, rows)]).controls] == modelica[1:3]
     proposal = propose([csv(tmp_path / "a.csv", columns, rows)])
     assert [c.path for c in proposal.controls] == ["Heating", "AHU_Outdoor_Air_Temp"]
     assert [c.path for c in proposal.states] == ["AHU_Outdoor_Air_Flow", "Room"]
@@ -960,17 +980,19 @@ def test_a_servo_whose_command_comes_in_the_row_of_its_answer_is_a_state(tmp_pat
     )
 
 
-@pytest.mark.parametrize("moves", [True, False])
-def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, moves):
+@pytest.mark.parametrize(("name", "moves"), [("valve", True), ("valve", False), ("battery", True), ("ErrRP", True)])
+def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, name, moves):
+    """A battery's level and a place, which change as seldom, were controls."""
     rng = np.random.default_rng(4)
     valve, level, rows = 0.0, 0.0, []
     for k in range(600):
         valve = float(rng.choice([0.0, 0.4, 1.0])) if k % 25 == 0 else valve
         rows.append((f"{0.1 * k:.1f}", valve, f"{level:.6f}"))
         level += 0.1 * ((valve if moves else 0.0) - 0.5 * level) + 1e-3 * rng.standard_normal()
-    path = csv(tmp_path / "tank.csv", ["time", "valve", "level"], rows)
+    path = csv(tmp_path / "tank.csv", ["time", name, "level"], rows)
     proposal = propose([path])
     commands = [c.path for c in proposal.controls]
+    moves = moves and name == "valve"
     assert commands == (["valve"] if moves else []), proposal.text
     assert ("by correlation alone: nothing is called a command here" in proposal.text) == moves
     if moves:
@@ -1098,6 +1120,7 @@ def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
             "ki": np.full(300, gain),
             "Cycle": np.arange(300) % 170 // 4,
             "Robot_ProtectiveStop": (np.arange(300) > 296) * 1.0,
+            "grip_lost": (np.arange(300) % 50 == 40) * 1.0,
             "level": level,
             "flow": np.diff(level, prepend=0),
         }

@@ -631,6 +631,7 @@ WRITTEN = (  # over noon; %I %p as English has it
     "%m/%d/%Y %I:%M:%S %p", "%m/%d/%Y  %I:%M:%S.000 %p", "%Y-%m-%d %I:%M:%S%p", "%I:%M:%S %p", "%d-%b-%y %I.%M.%S %p",
     "%m/%d/%Y %I:%M:%S A.M.", "%d-%b-%Y %H:%M:%S", "%d %B %Y, %H:%M:%S", "%b %d, %Y %I:%M:%S %p",
     "%a %b %d %H:%M:%S %Y", "%a, %d %b %Y %H:%M:%S GMT",
+    "%a %b %d %Y %H:%M:%S GMT+0000 (Coordinated Universal Time)",
     "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d-%m-%Y %H:%M:%S", "%Y%m%dT%H%M%S",
     "%Y%m%d%H%M%S", "%Y-%m-%d %H:%M:%S:000", "%d %m %Y %H:%M:%S", "%d-%m-%y %H:%M:%S", "%Y %m %d %H %M %S",
 )  # fmt: skip
@@ -795,7 +796,7 @@ def test_a_table_in_which_nothing_is_a_state_is_refused_with_what_was_left_out(t
 
 def test_rows_out_of_order_are_told(tmp_path):
     bag = read_csv(tmp_path, "time,x", (f"{k * 7 % 20},{k % 3}" for k in range(20)))
-    assert "6 of 20 rows are older than the row before: sort the rows by 'time', or name" in bag.warnings[0]
+    assert "6 of 20 rows are older than the row before: sort the rows by 'time', or name" in bag.warnings[-1]
 
 
 def test_runs_in_a_table_may_step_back_before_the_first(tmp_path):
@@ -833,6 +834,14 @@ def test_times_since_1970_are_found_without_a_name_though_some_step_back(tmp_pat
     refuses(BagError, "no column is called time", read_csv, tmp_path, "column,x", [row[3:] for row in rows])
 
 
+def test_row_numbers_without_a_name_are_no_time(tmp_path):
+    """Of a data frame at 20 Hz they made a plant of a row per second; without names above, they are all there is."""
+    rows = [f"{k},{k % 7},{k % 5}" for k in range(60)]
+    refuses(BagError, "no column is called time", read_csv, tmp_path, ",x,y", rows)
+    (tmp_path / "b.csv").write_text("\n".join(rows))
+    assert "taken for the time" in open_recording(tmp_path / "b.csv").warnings[0]
+
+
 def test_another_time_is_told_where_most_rows_share_one(tmp_path):
     bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
     assert bag.warnings[0].endswith(
@@ -857,9 +866,11 @@ def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
         ("time (millisec)", 5, 0.005, "taken for ms"),
         ("ms_today", 40, 0.04, "taken for ms"),
         ("us_since_boot", 2500, 0.0025, "taken for us"),
-        ("timestamp", 8001, 8001.0, "taken for s, a long way from row to row"),
+        ("timestamp", 1000000, 1e6, "taken for s, 1000000 from row to row"),
         ("timestamp", 7200, 7200.0, ""),  # by the hour or so
-        ("timestamp", 50, 50.0, ""),
+        ("timestamp", 5, 5.0, "taken for s, 5 from row to row"),
+        ("timestamp_s", 5, 5.0, ""),
+        ("timestamp", 1, 1.0, ""),
     ],
 )
 def test_the_unit_of_a_clock_is_in_its_name_or_asked_for(head, step, seconds, words, tmp_path):
@@ -878,6 +889,23 @@ def test_the_name_of_a_text_file_with_numbers_does_not_matter(suffix, tmp_path):
     assert len(bag.times) == 40 and bag.columns_by_field["x"][1] == 1.5
     path.write_bytes(bytes(range(256)) * 20)
     refuses(BagError, "bytes that are no text", group_recordings, [path])
+
+
+def test_seconds_of_a_minute_are_no_time(tmp_path):
+    """Of a clock in three columns they alone were the time."""
+    rows = [f"{9 + k // 3600},{k // 60 % 60},{k % 60},{k % 7}" for k in range(0, 900, 2)]
+    refuses(BagError, "no column is called time", read_csv, tmp_path, "H,MIN,SEC,x", rows)
+    assert not read_csv(tmp_path, "SEC,x", (f"{0.1 * k:.1f},{k % 7}" for k in range(60))).warnings
+
+
+def test_units_whose_rows_take_turns_are_told(tmp_path):
+    """Seven sensors of a greenhouse were one machine, whose state jumped from one to the next."""
+    rng = np.random.default_rng(1)
+    units = rng.choice(["a1", "b2", "c3"], 300)
+    bag = read_csv(tmp_path, "time,unit,x,y", (f"{k},{unit},{k % 7},{k % 5}" for k, unit in enumerate(units)))
+    assert "rows are of 3 'unit' by turns: if they are units, say so" in bag.warnings[0]
+    for cells in (np.sort(units), np.where(units == "a1", "", units)):  # one after the other, or an event now and then
+        assert not read_csv(tmp_path, "time,unit,x,y", (f"{k},{c},{k % 7},1" for k, c in enumerate(cells))).warnings
 
 
 def test_years_of_two_digits_may_come_first(tmp_path):

@@ -109,7 +109,7 @@ def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Tra
             transient, k = transients[problem.source[unlisted[0]]], int(problem.k[unlisted[0]])
             recorded = np.hstack([transient.x[k], transient.u[k], transient.s[k]])[row]
             raise FitError(
-                f"{transient.name}: '{axis.signal}' is {recorded:g} at t = {transient.t[k]:.6g} s (and in "
+                f"{transient.name}: '{axis.signal}' is {recorded:g} at t = {transient.t[k]:.4f} s (and in "
                 f"{plural(len(unlisted), 'transition')} of all), a mode that the schedule does not list; list it, or "
                 f"leave that part of the recording out"
             )

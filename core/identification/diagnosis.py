@@ -503,7 +503,7 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
     for index in indices[:4]:
         source, k = int(problem.source[index]), int(problem.k[index])
         if source < len(transients):
-            places.setdefault(transients[source].name, []).append(f"{transients[source].t[k]:.6g} s")
+            places.setdefault(transients[source].name, []).append(f"{round(float(transients[source].t[k]), 4):.10g} s")
         else:
             places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
     where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())

@@ -130,7 +130,7 @@ def fit(
 
     def where(index: int) -> str:
         of, k = transients[problem.source[index]], int(problem.k[index])
-        return f"the step from sample {k} of {of.name} (t = {of.t[k]:.6g} s)"
+        return f"the step from sample {k} of {of.name} (t = {of.t[k]:.4f} s)"
 
     Fleet([problem]).check_solvable(where, [s.name for s in signals.states])
 

@@ -340,13 +340,13 @@ _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|dr
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 
 
-_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_")  # of a control in a table
+_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)tau(_?con)?_?\d*$")  # of a control in a table
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
 
 
 _LABEL = re.compile(
     r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
-    r"alarm|emergency|(^|_)e_?stop|protective_?stop)"
+    r"alarm|emergency|(^|_)e_?stop|protective_?stop|(^|_)(lost|fail(ed|ure)?)$)"
 )
 _LABELS = 30
 """Values that a label takes, at most."""
@@ -363,11 +363,16 @@ _STATE = re.compile(
 )
 
 
-_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|measur|estimat")
+_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 
 
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 
+
+_TOLD = re.compile(
+    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
+)
+"""Likewise, of what is measured or reckoned, in the names of columns."""
 
 FEWEST_SET, MOST_SET = 3, 0.2
 """A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
@@ -434,7 +439,7 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
             return "state" if low in _BODY[0] else "control"
     if _ANSWER.search(low):
         return "state"
-    if _REFERENCE.search(low):
+    if _REFERENCE.search(low) or (low == "r" and {"u", "y"}.issubset(beside) and {"v", "x", "p"}.isdisjoint(beside)):
         return "reference"
     return "control" if _COMMAND.search(low) or _COLUMN.search(low) or _SET.search(name) else "state"
 
@@ -495,9 +500,11 @@ def at_rest(sources: Sequence[Source]) -> str:
     if not commands or any(s.free for s in commands):
         return ""
     still = shortlist([f"{s.topic} {c.path} {c.reason}" for s in commands for c in s.candidates[:1]], 3)
+    held = any(c.finite.any() for s in commands for c in s.candidates)
+    rest = "what it does to the states cannot be told" if held else "the machine is at rest"
     return (
-        f"no command moves ({still}): the machine is at rest, and what is proposed drifts or is disturbed; record the "
-        "machine at work before you fit a model"
+        f"no command moves ({still}): {rest}, and what is proposed drifts or is disturbed; record the machine at work"
+        f"{', with other commands,' * held} before you fit a model"
     )
 
 
@@ -547,12 +554,13 @@ def _plain(path: str) -> str:
 def _held_columns(table: Source) -> Source | None:
     """Columns of a table that are held, and set now and then, if they show in the next step of the others.
 
-    They leave the table for a topic of their own, whose role is a guess.
+    What is measured by its name is none. They leave the table for a topic of their own, whose role is a guess.
     """
     if table.type != TYPE:
         return None
     changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
-    held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows)]
+    told = {c for c in table.free for named in (_STATE, _APART, _TOLD) if named.search(c.path.lower())}
+    held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows) and c not in told]
     rest = [c for c in table.free if c not in held]
     shows = held and rest and most_shown(rest, {table.topic: table}, held) > SHOWS
     return table.parted(held, "guess") if shows else None

@@ -445,7 +445,9 @@ HELD = 0.8
 """Share of an analyser's changes that come after the same number of rows, two or more."""
 GATED = 0.99
 """Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
-_WEATHER = re.compile(r"(^|_)(outdoor|outside|ambient|weather)(?!.*(coil|damper|fan|flow|pump|unit|valve))")
+_WEATHER = re.compile(
+    r"(^|_)(outdoor|outside|ambient|weather|wea(bus|sta)_)(?!.*(coil|damper|fan|flow|pump|unit|valve))"
+)
 _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
 
 

@@ -67,6 +67,8 @@ LONGEST_ARRAY = 24
 """Entries of an array that are looked at one by one; a longer one is a picture, a scan or a map."""
 
 
+DUST = 1e-9
+"""Range of a number of a ROS message, in its SI unit, below which no sensor tells it: of a simulated joint at rest."""
 MOST_VALUES = 50_000_000
 """Numbers read at most; fields beyond are listed and not looked at."""
 
@@ -267,6 +269,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "never a number"
     if finite.min() == finite.max():
         return f"always {finite[0] + 0.0:.6g}"
+    if source.type != TYPE and np.ptp(finite) < DUST:
+        return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     if len(finite) < 0.5 * len(values):
         what = "rows only, so fill its empty cells with the number above" if source.type == TYPE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"

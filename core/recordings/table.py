@@ -13,8 +13,9 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -53,6 +54,7 @@ _DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not o
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
+_ROWS_EACH = 20  # that a unit has at least
 
 
 def is_table(path: Path) -> bool:
@@ -118,6 +120,11 @@ class Table(Recording):
             reason = f"there is no column but the time, '{time}'; choose another file"
         elif of := _names_signals(self.columns_by_field):
             reason = f"column '{of}' names the signal of a row's one number; write a column for each signal"
+        texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if not reason else []
+        turns = ((name, _take_turns(column.tolist())) for name, column in texts if len(texts) < len(names))
+        if of := next((f"{number} '{name}'" for name, number in turns if number), ""):
+            say = "say so in the signals file, `table: {runs: COLUMN}`, or write a file for each"
+            self._warnings.append(f"{path}: the rows are of {of} by turns: if they are units, {say}")
         kind = file.suffix[1:].lower()
         self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, reason, first, last)}
 
@@ -238,6 +245,15 @@ def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> t
         if 2 <= len(names) <= 2 * number and len(np.unique(np.column_stack([times, which]), axis=0)) == len(times):
             return number, name
     return number, ""
+
+
+def _take_turns(cells: Sequence[object]) -> int:
+    """How many names take turns from row to row, nearly as often as if each row were of any of them; 0 if none do."""
+    rows = np.array(list(Counter(cells).values()))
+    if len(rows) < 2 or rows.min() < _ROWS_EACH or not all(cells):
+        return 0
+    changes = 1.0 - float(((rows / len(cells)) ** 2).sum())
+    return len(rows) if sum(a != b for a, b in pairwise(cells)) >= 0.8 * changes * len(cells) else 0
 
 
 def _file_and_run(path: Path) -> tuple[Path, str | None]:

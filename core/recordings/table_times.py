@@ -102,8 +102,10 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
     else:
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
         doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
-        if unit == "s" and _coarse(values):
-            doubt = ", a long way from row to row: for others name it time_us or time_ms, or give `table: {unit: us}`"
+        if unit == "s" and not stated and (step := _coarse(values)):
+            doubt = (
+                f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `table: {{unit: us}}`"
+            )
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
         times = _of_numbers(where, table, column, UNITS[unit])
@@ -117,7 +119,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     plain = [name for name in names if table.columns[name].ndim == 1]
     called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
     still = [name for name in called if _stands_still(table.columns[name])]
-    called = [name for name in called if name not in still]
+    called = [name for name in called if name not in still and not _of_a_minute(name, table.columns[name])]
     if likely := [name for name in called if may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
         return called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0], ""
@@ -125,6 +127,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     if len(dated) == 1:
         return dated[0], ""
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
+    if first == ["column 1"] and names[1:2] != ["column 2"] and set(np.diff(table.columns["column 1"]).tolist()) == {1}:
+        first = []  # the row numbers of a data frame, which alone have no name
     for name in [*(n for n in names if re.fullmatch(r"\w+_time", _bare(n))), *first]:
         if _grows(table.columns[name]):
             return name, "it is taken for the time, as it grows from row to row"
@@ -169,6 +173,12 @@ def _days_beside(table: RawTable, column: str) -> str:
 
 def _stands_still(column: Column) -> bool:
     return column.dtype.kind in "iuf" and len(column) > 2 and bool((column == column[0]).all())
+
+
+def _of_a_minute(name: str, column: Column) -> bool:
+    """Whether it has the seconds of a clock whose minutes and hours are in other columns."""
+    seconds = column.dtype.kind in "iuf" and len(column) > 1 and re.fullmatch(r"sec(ond)?s?", _bare(name)) is not None
+    return seconds and bool(0 <= column.min() and column.max() < 60 and (np.diff(column) < 0).any())
 
 
 def may_be(column: Column) -> bool:
@@ -233,7 +243,7 @@ def _spelt(text: str) -> str:
         year, _, month, day, hour, minutes, rest = dated.groups()
         clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
         text = f"{year}-{int(month):02}-{int(day):02}{clock}"
-    return re.sub(r"\s+(GMT)$", "Z", text)
+    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda zone: zone[1] or "Z", text)  # as browsers write it
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
@@ -268,12 +278,12 @@ def _like_days(values: Column) -> bool:
     return fine and any(least < low and high < most for least, most in ((20_000, 80_000), (690_000, 800_000)))
 
 
-def _coarse(values: Column) -> bool:
-    """Whether whole numbers rise by hundreds from row to row, and not by whole minutes, as of a clock of ms or us."""
+def _coarse(values: Column) -> float:
+    """Usual step of whole numbers, where it is beyond 1 and no whole minutes, as of a clock of ms or us; else 0."""
     steps = np.diff(values[np.isfinite(values)].astype(np.float64))
-    return len(steps) > 2 and bool(
-        np.median(steps) >= 100 and (steps % 1 == 0).all() and (steps % 60 != 0).mean() > 0.5
-    )
+    if len(steps) < 3 or (steps % 1 != 0).any() or (steps % 60 != 0).mean() <= 0.5:
+        return 0.0
+    return step if (step := float(np.median(steps))) > 1 else 0.0
 
 
 def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:

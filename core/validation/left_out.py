@@ -121,7 +121,7 @@ def leave_out(
     cuts = [(t, *span) for t in transients for span in (block_spans(t, blocks) if blocks else [(0, len(t))])]
     if gap is None:
         gap = guard_interval(full, cuts) if blocks else 0.0
-    shown = [f"{t.name} from {t.t[a]:.6g} to {t.t[b - 1]:.6g} s" if blocks else t.name for t, a, b in cuts]
+    shown = [f"{t.name} from {t.t[a]:.4f} to {t.t[b - 1]:.4f} s" if blocks else t.name for t, a, b in cuts]
     unit_of = names or list(map(str, range(len(cuts))))
     together = [[i for i, unit in enumerate(unit_of) if unit == one] for one in dict.fromkeys(unit_of)]
     if folds is not None and (blocks or folds < len(together)):
