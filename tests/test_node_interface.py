@@ -82,7 +82,7 @@ def test_every_parameter_tells_its_meaning_range_and_whether_it_can_be_set(world
     world.run_node("envelope_monitor", {}, "--params-file", file, "-p", "autostart:=false")
     names = [p.name for p in PARAMETERS]
     request = DescribeParameters.Request(names=names)
-    described = world.call(DescribeParameters, f"{NODE}/describe_parameters", request).descriptors
+    described = world.call(DescribeParameters, f"{NODE}/describe_parameters", request, again=2.0).descriptors
     assert [d.name for d in described] == names
     for parameter, descriptor in zip(PARAMETERS, described, strict=True):
         assert descriptor.description == parameter.text and len(parameter.text) > 20
