@@ -322,6 +322,7 @@ def test_a_machine_sampled_more_slowly_than_the_timeout_is_not_silent_between_tw
     slow = model.replace(sampling=Sampling(0.4), signals=replace(model.signals, max_gap=1.0))
     on = bench(slow, state_timeout=0.1)
     on.plant.send(2)
+    on.process.says("judging a, b")
     count = on.diagnostics.count
     for _ in range(4):
         on.plant.t_ns += 400_000_000 - STEP_NS
