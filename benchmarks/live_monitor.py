@@ -543,9 +543,9 @@ def compare(rates: list[float], sizes: list[int], seconds: float, repeats: int, 
                 ]
             )  # fmt: skip
     head = "n|Hz||CPU, µs/sample|/ default|/ events|p99 delay, ms|not received|flags not heard".split("|")
-    print(Table(head, rows))
+    print(Table(head, rows, most=len(rows)))
     print()
-    print(Table(["n", "Hz", "", "at most", "measured", "turns", "held", "publishing only"], held))
+    print(Table(["n", "Hz", "", "at most", "measured", "turns", "held", "publishing only"], held, most=len(held)))
 
 
 def soak(seconds: float, rate: float, n: int, domain: int, armed: bool) -> dict[str, Any]:
