@@ -137,6 +137,11 @@ def lasting(hours: float) -> str:
     return f"{hours / 24:.3g} days"
 
 
+def moment(t: float) -> str:
+    """A time in a recording, s, written out to a tenth of a millisecond, so that it can be found again."""
+    return f"{round(float(t), 4):.10g}"
+
+
 def apart(values: Sequence[float]) -> list[str]:
     """Numbers with as many digits, four at least, as tell those apart that differ."""
     texts: list[str] = []

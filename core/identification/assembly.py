@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array, real
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.problem import Columns, Problem, Regimes
 from uncertain_lti.model.operating_point import OperatingPoint, normalise_columns
 from uncertain_lti.sampling.transient import Transient
@@ -109,7 +109,7 @@ def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Tra
             transient, k = transients[problem.source[unlisted[0]]], int(problem.k[unlisted[0]])
             recorded = np.hstack([transient.x[k], transient.u[k], transient.s[k]])[row]
             raise FitError(
-                f"{transient.name}: '{axis.signal}' is {recorded:g} at t = {transient.t[k]:.4f} s (and in "
+                f"{transient.name}: '{axis.signal}' is {recorded:g} at t = {moment(transient.t[k])} s (and in "
                 f"{plural(len(unlisted), 'transition')} of all), a mode that the schedule does not list; list it, or "
                 f"leave that part of the recording out"
             )

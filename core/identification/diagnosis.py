@@ -18,8 +18,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.arrays import Array, runs
+from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.evidence import (
@@ -414,8 +414,9 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
         if still.mean() > 0.5:  # held, quantised, or at rest most of the time
             continue
         still[1:] &= problem.source[1:] == problem.source[:-1]
-        runs = np.flatnonzero(np.diff(np.concatenate([[False], still, [False]]).astype(np.int8))).reshape(-1, 2)
-        for start, stop in runs[runs[:, 1] - runs[:, 0] >= FROZEN]:
+        for start, stop in runs(still):
+            if stop - start < FROZEN:
+                continue
             moving = (np.ptp(problem.z[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
             moving[i] = False
             if moving.any() and low[i] < problem.z[start, i] < high[i]:
@@ -503,7 +504,7 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
     for index in indices[:4]:
         source, k = int(problem.source[index]), int(problem.k[index])
         if source < len(transients):
-            places.setdefault(transients[source].name, []).append(f"{round(float(transients[source].t[k]), 4):.10g} s")
+            places.setdefault(transients[source].name, []).append(f"{moment(transients[source].t[k])} s")
         else:
             places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
     where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())

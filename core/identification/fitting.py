@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each
 from uncertain_lti.base.errors import FitError, SignalError
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.assembly import assemble, median_step
 from uncertain_lti.identification.diagnosis import describe
 from uncertain_lti.identification.discard import carriers, choose_discards
@@ -130,7 +130,7 @@ def fit(
 
     def where(index: int) -> str:
         of, k = transients[problem.source[index]], int(problem.k[index])
-        return f"the step from sample {k} of {of.name} (t = {of.t[k]:.4f} s)"
+        return f"the step from sample {k} of {of.name} (t = {moment(of.t[k])} s)"
 
     Fleet([problem]).check_solvable(where, [s.name for s in signals.states])
 

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
@@ -121,7 +121,7 @@ def leave_out(
     cuts = [(t, *span) for t in transients for span in (block_spans(t, blocks) if blocks else [(0, len(t))])]
     if gap is None:
         gap = guard_interval(full, cuts) if blocks else 0.0
-    shown = [f"{t.name} from {t.t[a]:.4f} to {t.t[b - 1]:.4f} s" if blocks else t.name for t, a, b in cuts]
+    shown = [f"{t.name} from {moment(t.t[a])} to {moment(t.t[b - 1])} s" if blocks else t.name for t, a, b in cuts]
     unit_of = names or list(map(str, range(len(cuts))))
     together = [[i for i, unit in enumerate(unit_of) if unit == one] for one in dict.fromkeys(unit_of)]
     if folds is not None and (blocks or folds < len(together)):
