@@ -283,7 +283,7 @@ def full_utilisation(model: UncertainLTI, run: Transient) -> np.ndarray:
     return verdicts.utilisation[verdicts.judged]
 
 
-def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
+def test_a_rate_moves_thresholds_as_far_as_the_recordings_can_show_it(runs):
     quiet = fit(runs, "lp", additive="noise")
     rate = 10 * quiet.fit_summary["alarm"]["limit_per_hour"]
     asked = fit(runs, "lp", additive="noise", false_alarms=rate)
@@ -291,7 +291,13 @@ def test_a_rate_lowers_thresholds_as_far_as_the_recordings_can_show_it(runs):
     pairs = zip(asked.alarm, quiet.alarm, strict=True)
     assert all((np.array(a.thresholds(2)) < np.array(b.thresholds(2))).all() for a, b in pairs)
     little = fit(runs, "lp", additive="noise", false_alarms=1e-3)
-    assert little.alarm == quiet.alarm
+    raised = [np.divide(a.thresholds(2), b.thresholds(2)) for a, b in zip(little.alarm, quiet.alarm, strict=True)]
+    evidence = Evidence.from_dict(quiet.memory["evidence"])
+    rules = [replace(rule, threshold=1.0) for rule in quiet.alarm]
+    factor = evidence.apart(rules, "transients").max()
+    assert 1.0 < factor < 1.5 and quiet.fit_summary["alarm"]["units_alarming"] > 0
+    assert np.concatenate(raised) == pytest.approx(factor**2)  # squares of sizes
+    assert little.fit_summary["alarm"]["units_alarming"] == 0
     said = little.fit_summary["alarm"]["promises"][-1]
     assert "cannot show that" in said and "days more without an alarm would" in said
     refuses(FitError, "positive number per hour", fit, runs, false_alarms=-1.0, progress=pytest.fail)  # before the work

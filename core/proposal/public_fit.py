@@ -129,7 +129,8 @@ def fit(
         bounds; or these rules.
     false_alarms : float, optional
         False alarms per hour at most, the upper limit with 90 % confidence, that the panel is learnt for. Default: what
-        the recordings can show. If they cannot show the rate, the nearest is taken, and the summary says so.
+        the recordings can show. If they cannot show the rate, thresholds rise, by half at most, until no recording
+        passes those of the others, and the summary says so.
     progress : callable, optional
         Called with one line of text per pass over the data, and per discard.
     groups : sequence or str, optional

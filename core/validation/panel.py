@@ -145,6 +145,16 @@ class Evidence:
             found.append(_threshold(windows, n, what == "block", *of))
         return found
 
+    def apart(self, rules: Sequence[StatisticRule], what: str) -> Array:
+        """(G,): the largest size on each over the thresholds that all the others give, 0 where theirs is larger."""
+        found = np.zeros(len(self.peaks))
+        for unit in np.unique(self.peaks.argmax(axis=0)):
+            others = np.delete(self.peaks, unit, axis=0)
+            top = np.where(self.top > self.peaks.max(axis=0), self.top, others.max(axis=0, initial=0.0))
+            given = replace(self, peaks=others, top=top).thresholds(rules, self.widths.shape[1], what)
+            found[unit] = (self.peaks[unit] / np.concatenate(given)).max()
+        return found
+
     def learnt(self, rules: Sequence[StatisticRule], what: str) -> tuple[StatisticRule, ...]:
         """These rules with their thresholds."""
         found = []
@@ -226,15 +236,9 @@ class Panel:
 
     @cached_property
     def alarming(self) -> int:
-        """How many recordings, groups or blocks would alarm at the thresholds that all the others give."""
-        evidence, rules = self.evidence, [rule for rule in self.rules if isinstance(rule, StatisticRule)]
-        peaks, found = evidence.peaks, 0
-        for unit in np.unique(peaks.argmax(axis=0)):
-            others = np.delete(peaks, unit, axis=0)
-            top = np.where(evidence.top > peaks.max(axis=0), evidence.top, others.max(axis=0, initial=0.0))
-            given = replace(evidence, peaks=others, top=top).thresholds(rules, evidence.widths.shape[1], self.what)
-            found += bool((peaks[unit] > evidence.factor * np.concatenate(given)).any())
-        return found
+        """How many recordings, groups or blocks would alarm at thresholds of all the others, raised alike."""
+        rules = [rule for rule in self.rules if isinstance(rule, StatisticRule)]
+        return int((self.evidence.apart(rules, self.what) > self.evidence.factor).sum())
 
     @property
     def vouched(self) -> bool:
@@ -312,7 +316,8 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     """The panel of a model, from what was left out of the fit and from the fit itself.
 
     `fitted`: what was fitted, judged by the model; `rate`: false alarms per hour, the upper limit with CONFIDENCE; the
-    thresholds are as near to it as the data can show. Raises FitError if there is nothing to learn from.
+    thresholds are as near to it as the data can show, or, where they cannot, at most MOST times as large, such that no
+    part alarms at those of the others. Raises FitError if there is nothing to learn from.
     """
     check_rate(rate)
     parts = [part for part in validation.parts if part.judged]
@@ -327,7 +332,11 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     rules = rules_for(model, stretch, dt, apart)
     evidence, shown, unlike = _gathered(rules, left, fitted, dt)
     found = evidence.with_alarms(rules, validation.what, shown)
-    while rate is not None and _limit(found, len(rules)) <= rate and found.factor > _LEAST:
+    beyond = rate is not None and _limit(found, len(rules)) > rate
+    if beyond:
+        factor = float(np.clip(evidence.apart(rules, validation.what).max(), 1.0, MOST))
+        found = replace(evidence, factor=factor).with_alarms(rules, validation.what, shown)
+    while rate is not None and not beyond and found.factor > _LEAST:
         lower = replace(evidence, factor=found.factor / _FINE).with_alarms(rules, validation.what, shown)
         if _limit(lower, len(rules)) > rate:
             break
@@ -512,14 +521,21 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
         ]
         if panel.what != "block":
             alarming = f"{panel.alarming or 'none'} of {plural(panel.units, panel.what)}"
-            found.append(
-                f"at thresholds of the others alone {alarming} would alarm: expect about as many of further ones"
-            )
+            further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
+            further = f"expect {further} of further ones"
+            if panel.alarming and panel.asked is None:
+                further += "; to have fewer, ask for a low rate (--false-alarms)"
+            found.append(f"at thresholds of the others alone {alarming} would alarm: {further}")
     else:
         found = ["false alarms: one stretch says nothing of their rate; record more"]
     found.append(f"sees within {evidence.dt:.3g} s {'; '.join(sees)}")
     if panel.asked is not None and not panel.limit <= panel.asked:
         more = panel.needed_hours - evidence.hours
         remedy = f"{lasting(more)} more without an alarm would" if more > 0 else "record more"
-        found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {remedy}")
+        higher = (
+            f"the thresholds are {share:.0%} higher, as the parts differ; "
+            if (share := evidence.factor - 1) > 0
+            else ""
+        )
+        found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {higher}{remedy}")
     return found
