@@ -136,6 +136,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
     if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
         none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
+    none = "; ".join([*table.notes, none])
     raise BagError(
         f"{path}: {none} is called time or looks like it; rename the one that is, or name it in a signals file, "
         f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
