@@ -358,6 +358,9 @@ def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
         ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
         ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
         ("{unit: day}", r"s.yaml: table: unit is 'day'.*; write one of s, ms, us, ns, min, h"),
+        ("{step: fast}", r"s.yaml: table: step is 'fast'; write a number"),
+        ("{step: 0}", r"s.yaml: table: step is 0.0; write the s from row to row"),
+        ("{step: 1, unit: ms}", r"s.yaml: table: step is of rows without a time, and unit of a time; take one away"),
         ("{time: []}", r"s.yaml: table: time is \[\]; write the name of a column"),
         ("5", r"s.yaml: table: a mapping is wanted here, not a number"),
     ],
@@ -366,6 +369,26 @@ def test_what_is_wrong_with_the_layout_is_said(many, tmp_path, table, words):
     text = (tmp_path / "s.yaml").read_text().split("\n")
     (tmp_path / "s.yaml").write_text("\n".join([f"table: {table}", *text[2:]]))
     refuses((BagError, SignalError), words, read_transients, many, tmp_path / "s.yaml")
+
+
+def test_rows_without_a_time_have_a_step_and_any_column_is_a_time_from_the_first_command_on(tmp_path, monkeypatch, cli):
+    monkeypatch.chdir(tmp_path)
+    noise, y, rows = random.Random(0), 0.0, []
+    for k in range(900):
+        u = float(k // 40 % 3)
+        y += 0.1 * (u - y) + 0.02 * noise.gauss(0, 1)
+        rows.append((8.0 * k, u, y))
+    Path("run.csv").write_text("count,drive,speed\n" + "".join(f"{c},{u},{y}\n" for c, u, y in rows))
+    Path("bare.txt").write_text("drive speed\n" + "".join(f"{u} {y}\n" for _, u, y in rows))
+    refuses(BagError, r"bare.txt: .*`--table step=0.01`", propose, ["bare.txt"])
+    cli("start", "bare.txt", "--table", "step=0.008", "--output", "bare")
+    cli("init", "run.csv", "--table", "time=count", "unit=ms", "--output", "run.yaml")
+    assert cli.json("topics", "bare.txt", "--table", "step=0.008")["topics"][0]["rate"] == 125
+    model = UncertainLTI.load("bare.model.json")
+    assert model.signals.table == TableLayout(step=0.008) and model.signals.table.to_dict() == {"step": 0.008}
+    (bare,), (run,) = read_transients("bare.txt", model.signals), read_transients("run.csv", "run.yaml")
+    assert bare.state_names == run.state_names == ("speed",)
+    np.testing.assert_array_equal(bare.t - bare.t[0], run.t - run.t[0])
 
 
 def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):

@@ -356,6 +356,7 @@ def propose(
     states: Sequence[str] = (),
     controls: Sequence[str] = (),
     like: str = "",
+    table: TableLayout | None = None,
 ) -> Proposal:
     """Suggest states and controls of a machine from recordings of it.
 
@@ -378,6 +379,9 @@ def propose(
         The member of many that are alike, such as a joint, that the file is drawn up for; default the one whose command
         shows most. The file is for all members in which the same numbers move.
 
+    table : TableLayout, optional
+        Which columns of tables are time and run, or their step, for the file as well; default to look for them.
+
     Returns
     -------
     Proposal
@@ -388,12 +392,13 @@ def propose(
     BagError
         A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
-    bags = group_recordings(list(paths))
+    layout = table or TableLayout()
+    bags = group_recordings(list(paths), layout=layout)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
-    runs = run_column(bags)
-    if runs:
-        bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
+    if not layout.runs and (runs := run_column(bags)):
+        layout = replace(layout, runs=runs)
+        bags = group_recordings(list(paths), layout=layout)
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
@@ -401,7 +406,7 @@ def propose(
         chosen, used = plant_signals(sources)
         if not chosen:
             raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
-        text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
+        text = signals_file(bags, sources, chosen, used, "", layout=layout, plant=True)
         return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
@@ -448,7 +453,7 @@ def propose(
     except ModuleNotFoundError as error:  # all but this needs no solver
         memories = []
         warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
-    text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
+    text = signals_file(bags, sources, chosen, used, doubt, memories, members, layout)
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
 
 

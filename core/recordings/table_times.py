@@ -79,6 +79,9 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
 
     Returns (rows,): ns; `NO_TIME` where a row has none.
     """
+    if layout.step is not None:
+        rows = len(next(iter(table.columns.values()), ()))
+        return "", np.rint(np.arange(rows) * (layout.step * 1e9)).astype(np.int64), ""
     if layout.time is not None:
         column, words = find_column(path, layout.time, list(table.columns), "the time"), ""
     else:
@@ -138,9 +141,9 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
         none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
     none = "; ".join([*table.notes, none])
     raise BagError(
-        f"{path}: {none} is called time or looks like it; rename the one that is, or name it in a signals file, "
-        f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
-        f"{shortlist(names, 50)}"
+        f"{path}: {none} is called time or looks like it; rename the one that is, or name it, `--table time=COLUMN`; "
+        "for rows at one step without a time say how many s it has, `--table step=0.01` (in a signals file "
+        f"`table: {{step: 0.01}}`); columns there: {shortlist(names, 50)}"
     )
 
 
