@@ -1076,6 +1076,23 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])
 
 
+def test_columns_that_one_table_lacks_are_left_out_and_tables_of_two_topics_refused(tmp_path):
+    rows = {name: [] for name in ("both", "first", "second", "command")}
+    for k in range(200):
+        for name, row in rows.items():
+            row.append(f"{math.sin(k / 9 + len(name)):.6f}")
+    names = ("a.csv", ["both", "first"]), ("b.csv", ["second", "both"]), ("c.csv", ["command"])
+    for name, columns in names:
+        cells = zip(*(rows[column] for column in columns), strict=True)
+        lines = [f"{k / 50},{','.join(row)}" for k, row in enumerate(cells)]
+        (tmp_path / name).write_text("\n".join([f"time,{','.join(columns)}", *lines]) + "\n")
+    proposal = propose([tmp_path / "a.csv", tmp_path / "b.csv"])
+    assert [c.path for c in proposal.states] == ["both"]
+    assert "/table first, second: not in every recording" in proposal.text
+    words = "not in every recording.*; give recordings of one machine, with the same topics and columns"
+    refuses(BagError, words, propose, [tmp_path / "a.csv", tmp_path / "c.csv"])
+
+
 def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     """Another drive is elsewhere, and the numbers of a mode are names: neither tells what comes next."""
     rng = np.random.default_rng(3)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -92,8 +93,10 @@ _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[Source]:
     """Every topic of the recordings with its numbers."""
     facts: dict[str, TopicFacts] = {}
+    held: dict[str, Counter[str]] = defaultdict(Counter)  # in how many recordings a field is
     for bag in bags:
         for fact in bag.facts(progress):
+            held[fact.info.topic].update(fact.fields)
             known = facts.get(fact.info.topic)
             if known is None or (not known.fields and fact.fields):
                 facts[fact.info.topic] = fact
@@ -101,7 +104,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     for topic, fact in facts.items():
         total = sum(_messages(bag, topic) for bag in bags)
         if fact.info.type == TYPE:
-            sources += _of_table(fact, total, all(topic in b.topics for b in bags))
+            sources += _of_table(topic, total, {f: number == len(bags) for f, number in held[topic].items()})
             continue
         stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
         source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
@@ -169,16 +172,17 @@ def _tells_runs(table: Table, name: str) -> bool:
     return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] < 0).all())
 
 
-def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
-    """The columns of a table, those that are commands by their names apart from the others."""
+def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Source]:
+    """The columns of tables, those that are commands by their names apart from the others."""
     by_role: dict[str, list[str]] = {}
-    beside = {bare(field) for field in fact.fields}
-    for field in fact.fields:
+    beside = {bare(field) for field in everywhere}
+    for field in everywhere:
         by_role.setdefault(role_of_column(field, beside), []).append(field)
-    reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if everywhere else _APART
-    topic, sources = fact.info.topic, []
+    reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if any(everywhere.values()) else _APART
+    sources = []
     for role, fields in by_role.items():
-        candidates = [] if reason else _candidates(topic, fields)
+        candidates = [] if reason else _candidates(topic, [f for f in fields if everywhere[f]])
+        candidates += [Candidate(topic, f, reason=_APART) for f in fields if not everywhere[f] and not reason]
         sources.append(Source(topic, TYPE, role, False, None, candidates=candidates, reason=reason))
     return sources
 
@@ -419,8 +423,8 @@ def propose(
         why = [f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]]
         reasons = "; ".join(dict.fromkeys([*why, *warnings[:3]]))
         nothing = f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})"
-        if any(s.reason == _APART for s in sources):
-            raise BagError(f"{nothing}; give recordings of one machine, with the same topics")
+        if any(_APART in s.reason for s in sources):
+            raise BagError(f"{nothing}; give recordings of one machine, with the same topics and columns")
         named = "name the topics of its states in `uncertain-lti init --states`"
         raise BagError(f"{nothing}; record the machine at work, and longer, or {named}")
     chosen, doubt = choose(measured, commands, like)
