@@ -903,6 +903,16 @@ def test_stamps_that_are_rounded_of_an_even_clock_make_the_step_constant(tmp_pat
         assert narrower.max() < 0.5
 
 
+def test_recordings_of_two_rates_have_no_constant_step(tmp_path):
+    rng = np.random.default_rng(3)
+    paths = []
+    for step in (0.08, 0.1):
+        u = np.repeat(rng.normal(size=60), 20)
+        columns = {"speed": answers(rng, u[:, None])[:, 0], "speed_cmd": u}
+        paths.append(table_of(tmp_path / f"{step}.csv", columns, np.round(step * np.arange(len(u)), 2)))
+    assert "step:" not in propose(paths).text
+
+
 def test_a_delay_that_half_of_the_recording_denies_is_none():
     """The vanes follow the speed by a schedule, so that a late angle stands in for earlier speeds, by 4 %."""
     proposal = propose([Path(__file__).parents[1] / "bags" / "turbofan_levels_noise.mcap"])
