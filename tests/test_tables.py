@@ -735,7 +735,11 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
         assert set(np.diff(newest.times).tolist()) == {60 * 10**9} and newest.columns_by_field["x"][0] == 29
         assert "newest row comes first" in newest.warnings[-1]
     for head, rows, words in (
-        ("time,x", (f"{k // 10},{k}" for k in range(100)), "90 of 100 rows have the time of a row before"),
+        (
+            "time,x",
+            (f"{k // 10},{k % 10}" for k in range(100)),
+            "90 of 100 rows have the time of a row before, and only",
+        ),
         ("Date,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9)), "write days of a spreadsheet"),
     ):
         assert re.search(words, " ".join(read_csv(tmp_path, head, rows).warnings))
@@ -743,6 +747,18 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
     assert list(read_csv(tmp_path, "time,Größe °C", ["0,1", "1,2"], "cp1252").columns_by_field) == ["Größe_C"]
     rows = read_csv(tmp_path, "time,signal,value", (f"{k},{('speed', 'load')[k % 2]},{k * k}" for k in range(90)))
     assert "column 'signal' names the signal" in rows.topics["/table"].reason
+
+
+def test_rows_of_whole_seconds_come_evenly_and_those_of_units_do_not(tmp_path):
+    """Of a machine at 20 Hz, stamped in whole seconds, with a pause of five; units of another one are no rows of it."""
+    t = 1.7e9 + 0.35 + np.concatenate([np.arange(0, 10, 0.05), np.arange(15, 25, 0.05)])
+    bag = read_csv(tmp_path, "time,x,y", (f"{math.floor(s)},{math.sin(s):.6f},{s % 7:.3f}" for s in t))
+    assert np.abs(np.diff(bag.times) * 1e-9 - np.diff(t)).max() < 0.06 and np.abs(bag.times * 1e-9 - t).max() < 0.06
+    assert "taken to come evenly" in bag.warnings[0]
+    units = read_csv(
+        tmp_path, "time,x,y", (f"{k // 20},{k % 20 + k // 20 / 9},{k % 20 * 3 - k // 20}" for k in range(400))
+    )
+    assert np.unique(units.times).size == 20 and "the 20 rows of a time one for each of 20 units" in units.warnings[0]
 
 
 def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):

@@ -147,6 +147,24 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     )
 
 
+def spread(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Times that several rows share, such as whole seconds, as if the rows of each came evenly until the next.
+
+    Beside a pause, and at both ends, they come as fast as usual.
+    """
+    first = np.flatnonzero(np.diff(times, prepend=times[0] - 1))
+    rows, gaps = np.diff(first, append=len(times)), np.diff(times[first])
+    usual, each = (int(np.median(gaps)), int(np.median(rows))) if len(gaps) else (0, 1)
+    gaps = np.append(gaps, usual + 1)  # both ends are beside a pause
+    ends, begins = gaps > usual, np.append(True, gaps[:-1] > usual)
+    span = np.minimum(gaps, usual)
+    steps = span / np.where(ends | begins, np.maximum(rows, each), rows)
+    late = np.where(begins & ~ends, span - rows * steps, 0.0)
+    which = np.repeat(np.arange(len(first)), rows)
+    place = np.arange(len(times)) - first[which]
+    return np.asarray(times + np.rint(late[which] + place * steps[which]).astype(np.int64))
+
+
 def _bare(name: str) -> str:
     """Name of a column without its unit, as `_NAMES` has it."""
     low = re.sub(r"[\s/]+", "_", re.sub(r"[\[(].*", "", name).strip(" /").lower())
