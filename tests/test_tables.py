@@ -644,6 +644,18 @@ def test_days_are_read_where_one_order_of_day_and_month_alone_goes_forward(tmp_p
     assert run.t_ns[0] == np.datetime64("2014-01-12T00:00", "ns").astype(int)
 
 
+@pytest.mark.parametrize("form", ["{day} {hour:02}:{m:02}:05 {zone}", "{day} {hour}:{m:02}:05 AM {zone}"])
+def test_a_day_has_the_zone_behind_it(tmp_path, form):
+    """As .NET writes an instant; the clock is put back from two hours before UTC to one."""
+    rows = []
+    for k in range(180):
+        local, zone = (k, "+02:00") if k < 60 else (k - 60, "+01:00")
+        rows.append(form.format(day="10/26/2025", hour=2 + local // 60, m=local % 60, zone=zone) + f",{k}")
+    bag = read_csv(tmp_path, "Ts,x", rows)
+    assert bag.times[0] == np.datetime64("2025-10-26T00:00:05", "ns").astype(int)
+    assert set(np.diff(bag.times).tolist()) == {60 * 10**9}
+
+
 def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
     bag = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}" for k in range(90)))
     assert set(np.diff(bag.times).tolist()) == {10**9}

@@ -28,7 +28,7 @@ NO_TIME = -(2**63)
 """Instant of a row without one."""
 
 _NAMES = (
-    r"(__|%)?time(_?stamp)?", r"t", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
+    r"(__|%)?time(_?stamp)?", r"ts?", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
     r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
     r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
@@ -37,7 +37,10 @@ _UNIT = {
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
-_DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
+_DAY = re.compile(
+    r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?"
+    r"([+-]\d\d:?\d\d)?"
+)
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _DOTTED = re.compile(r"([01]?\d|2[0-3])\.([0-5]\d)\.([0-5]\d)")  # 18.00.00
 _MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)")  # as Excel writes times with decimals
@@ -248,6 +251,8 @@ def _spelt(text: str) -> str:
         return text.replace(".", ":")
     if _ISO.match(text) or _CLOCK.match(text):
         return text
+    zone = found[1] if (found := re.search(r"\s([+-]\d\d:?\d\d)$", text)) else ""  # as .NET writes it
+    text = text.removesuffix(zone).rstrip()
     if half := _HALF.fullmatch(text):
         day, hour, minutes, seconds, letter = half.groups("00")
         of = int(hour) % 12 + 12 * (letter in "Pp") if int(hour) <= 12 else int(hour)
@@ -265,7 +270,7 @@ def _spelt(text: str) -> str:
         year, _, month, day, hour, minutes, rest = dated.groups()
         clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
         text = f"{year}-{int(month):02}-{int(day):02}{clock}"
-    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda zone: zone[1] or "Z", text)  # as browsers write it
+    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda gmt: gmt[1] or "Z", text) + zone  # as browsers write it
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
@@ -431,7 +436,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
         which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
         raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
     iso = iter(orders[taken[0]])
-    return [next(iso) if _DAY.fullmatch(cell) else cell for cell in cells], note
+    return [next(iso) + (match[7] or "") if (match := _DAY.fullmatch(cell)) else cell for cell in cells], note
 
 
 def _is_even(texts: Sequence[str]) -> bool:
