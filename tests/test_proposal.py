@@ -1109,10 +1109,10 @@ def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     u, mode = np.repeat(rng.normal(size=60), 25), np.repeat(rng.choice([0.0, 9.0, 10.0], size=30), 50)
     speed, lat_g = answers(rng, np.column_stack([u + 0.1 * mode, u])).T
     way = np.round(np.cumsum(np.abs(speed)), 1)
-    columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "gps_lon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
-    columns |= {"speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
+    columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "PilotLon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
+    columns |= {"Heading": np.cumsum(5 * speed) % 360, "speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
     proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
-    assert [c.path for c in proposal.states] == ["speed", "lat_g"], proposal.text
+    assert [c.path for c in proposal.states] == ["unwrap(Heading, 360)", "speed", "lat_g"], proposal.text
     assert [c.path for c in proposal.controls] == ["throttle"], proposal.text
     assert "c1_mode" in proposal.text and "a code by its name, and its numbers are no amounts" in proposal.text
 

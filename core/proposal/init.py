@@ -288,7 +288,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    if source.type == TYPE and _PLACE.search(candidate.path.lower()):
+    if source.type == TYPE and _PLACE.search("_".join(words_of(candidate.path))):
         return "a place on the map, and another run may be elsewhere"
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
     if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
@@ -323,7 +323,7 @@ def _wrapped(source: Source) -> None:
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
         jumps = (t for t in (math.tau, 360.0) if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
         turn = math.tau if angle else next(jumps, 0.0)
-        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)
+        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path.lower())
         if angle or (turn and named):
             candidate.path = f"unwrap({candidate.path}{', 360' * (turn > 7)})"
             candidate.values = [_unwrapped(v, turn) for v in candidate.values]
