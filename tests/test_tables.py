@@ -200,6 +200,7 @@ def lines(delimiter=",", point=".", time=lambda t: f"{t:.1f}"):
         "time, speed, cmd\n" + lines(", "),
         "# time speed cmd\n" + lines(" "),
         "# of a bench, in s\n\n time   speed  cmd \n  " + lines("   ").replace("\n", "  \n  "),
+        ",,time,speed,cmd\n" + lines(),
         "time,speed,cmd,\n" + lines().replace("\n", ",\n"),
         "time,speed,cmd\n" + lines().replace("\n", ",\n"),
         "time_on,t,speed,cmd\n" + "".join(f"0,{line}\n" for line in lines().split()),  # no time stands still
@@ -766,7 +767,7 @@ def test_rows_of_whole_seconds_come_evenly_and_those_of_units_do_not(tmp_path):
     t = 1.7e9 + 0.35 + np.concatenate([np.arange(0, 10, 0.05), np.arange(15, 25, 0.05)])
     bag = read_csv(tmp_path, "time,x,y", (f"{math.floor(s)},{math.sin(s):.6f},{s % 7:.3f}" for s in t))
     assert np.abs(np.diff(bag.times) * 1e-9 - np.diff(t)).max() < 0.06 and np.abs(bag.times * 1e-9 - t).max() < 0.06
-    assert "taken to come evenly" in bag.warnings[0]
+    assert "taken to come evenly in the 1 s after it" in bag.warnings[0]
     units = read_csv(
         tmp_path, "time,x,y", (f"{k // 20},{k % 20 + k // 20 / 9},{k % 20 * 3 - k // 20}" for k in range(400))
     )

@@ -104,12 +104,13 @@ class Table(Recording):
             of_rows = {name: raw.columns[name][kept] for name in names}
             number, unit = _for_each_time(self.times, of_rows)
             flow = number > 1 and not unit and (np.diff(self.times) >= 0).all() and _flows(of_rows.values(), number)
-            self.times = spread(self.times) if flow else self.times
             each = f"are the {number} rows of a time one for each of {number} units? then "
             each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
             other = next((name for name in names if called_time(name) and goes_forward(raw.columns[name])), "")
-            taken = "they are taken to come evenly after it: "
-            if not flow:
+            if flow:
+                usual = float(np.median(np.diff(np.unique(self.times)))) * 1e-9
+                self.times, taken = spread(self.times), f"they are taken to come evenly in the {usual:g} s after it: "
+            else:
                 taken = f"only the first of such rows counts: {f'{each}write a file for each; else ' * (number > 1)}"
             self._warnings.append(
                 f"{path}: {equal} of {len(kept)} rows have the time of a row before, and {taken}"

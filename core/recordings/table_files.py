@@ -277,6 +277,7 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     named = any(len(cells) == wide and 2 * len(set(cells) - {""}) > wide for cells in above)
     if not named and not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none of the names
         above = [[*cells, ""] if len(cells) == wide - 1 else cells for cells in above]
+    above = [filled if len(filled := [c for c in cells if c]) == wide else cells for cells in above]
     last = next((cells for cells in reversed(above) if len(cells) > 1 and not any(map(_is_value, cells))), [])
     above = [cells for cells in above if len(cells) == wide]
     kinds = [len(set(cells) - {""}) for cells in above]

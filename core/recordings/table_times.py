@@ -109,9 +109,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
         doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
         if unit == "s" and not stated and (step := _coarse(values)):
-            doubt = (
-                f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `table: {{unit: us}}`"
-            )
+            doubt = f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `--table unit=us`"
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
         times = _of_numbers(where, table, column, UNITS[unit])
