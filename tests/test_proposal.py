@@ -501,8 +501,11 @@ def test_of_a_plant_a_twin_is_judged_and_what_says_the_same_to_the_last_digit_is
     rng = np.random.default_rng(0)
     p = 50 + 20 * answers(rng, np.zeros((2000, 1)), 1.0, 0.9)[:, 0]
     columns = {"P1": p.round(3), "P2": (0.5 * p + 0.05 * rng.normal(size=2000)).round(3), "P1_bar": (1e-2 * p).round(4)}
+    columns["P_set"] = np.repeat(rng.uniform(40, 60, 100), 20).round(1)
+    columns["P_error"] = (columns["P_set"] - columns["P1"]).round(2)
     proposal = propose([table_of(tmp_path / "a.csv", columns, 60.0 * np.arange(2000))])
     assert [c.path for c in proposal.states] == ["P1", "P2"] and "P1_bar: moves with P1" in proposal.text
+    assert "P_error: is P_set less P1" in proposal.text  # a step of the set point is no fault
 
 
 # --- many columns ------------------------------------------------------------------------------------------------
