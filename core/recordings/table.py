@@ -257,9 +257,11 @@ def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> t
 
 def _flows(columns: Iterable[Column], rows: int) -> bool:
     """Whether most numbers change less from row to row than over the rows of a time, which are of one machine then."""
-    numbers = [c[np.isfinite(c)].astype(np.float64) for c in columns if c.dtype.kind in "iuf" and c.ndim == 1]
-    moving = [c for c in numbers if len(c) > 2 * rows and (c[rows:] != c[:-rows]).any()]
-    shares = [float(np.abs(np.diff(c)).mean() / np.abs(c[rows:] - c[:-rows]).mean()) for c in moving]
+    shares = []
+    for column in (c for c in columns if c.dtype.kind in "iuf" and c.ndim == 1):
+        values = column[np.isfinite(column)].astype(np.float64)
+        if len(values) > 2 * rows and (later := float(np.abs(values[rows:] - values[:-rows]).mean())) > 0:
+            shares.append(float(np.abs(np.diff(values)).mean()) / later)
     return bool(shares) and float(np.median(shares)) < 0.5
 
 
