@@ -227,6 +227,12 @@ def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
 
 
+def test_a_magnetometer_and_a_frame_are_measured_though_their_type_says_little():
+    for topic, kind in (("/ardrone/mag", "Vector3Stamped"), ("/b", "MagneticField"), ("tf", "TransformStamped")):
+        assert role_by_name(topic, f"geometry_msgs/msg/{kind}") == "state"
+    assert role_by_name("/body_mage", "std_msgs/msg/Float64") == ""
+
+
 COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "yaw_sp_move_rate", "level_sp", "ref_x")]
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
