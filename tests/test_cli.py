@@ -28,6 +28,7 @@ from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.plants.leibov import STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.reports.findings import findings
 
 
 def refused(cli, *words):
@@ -292,6 +293,8 @@ def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, wor
     data["states"]["x1"]["jump"] = {**data["alarms"][0], "text": "x1 jumped"}
     at = words.removeprefix("first at ").rpartition(" for ")[0].rstrip(",")
     assert f"x1 jumped at {at}" in check_text(data).splitlines()
+    (told,) = findings(model, "m.model.json", [verdicts])["happened"]
+    assert ("first at 2023-11-15T23:13:20 UTC, 25 h on" in told["text"]) == (at.endswith("on"))
 
 
 def test_the_longest_alarm_is_told_beside_the_first():

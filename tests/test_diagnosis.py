@@ -127,6 +127,16 @@ def test_control_lost_in_the_noise_is_named():
     assert not any(WORDS["weak"] in m for m in messages(run(u=u, noise=0.0, count=1500, seed=4)) if "'valve'" in m)
 
 
+@pytest.mark.parametrize("field", ["v", "lag(u, 1)"])
+def test_a_control_that_acts_a_sample_later_is_not_called_weak_beside_that_sample(field):
+    u = steps(np.random.default_rng(4), 1501)
+    u[1:, 1], u[0, 1] = u[:-1, 0], 0.0
+    states, controls = [Signal(name, "/a", name) for name in ("speed", "flow")], [Signal("valve", "/b", "u")]
+    signals = SignalMap(states, [*controls, Signal("before", "/b", field)])
+    found = messages(run(u=u, noise=1e-2, plant=(A, B * [0.0, 1.0]), signals=signals))
+    assert any(WORDS["weak"] in m and "'valve'" in m for m in found) == (field == "v")
+
+
 def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
     K = np.array([[2.0, 0.3], [0.1, 1.5]])
     found = messages(run(feedback=K, noise=0.0, u=np.zeros((1501, 2))))

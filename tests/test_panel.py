@@ -512,6 +512,16 @@ def test_recordings_far_from_one_another_give_a_panel_that_promises_no_rate():
     assert alarm["promises"][-1].endswith("the recordings cannot show that; record more")
 
 
+def test_recordings_of_rates_far_apart_are_said_to_be_that():
+    runs = [plant(seed) for seed in range(2)]
+    slower = Transient(3 * runs[1].t, runs[1].x, runs[1].u, name="slower")
+    assert (
+        fit([runs[0], slower])
+        .fit_summary["alarm"]["not_learnt"]
+        .endswith("fit recordings of one rate: the steps of these are of 0.1 to 0.3 s")
+    )
+
+
 def test_recordings_in_which_no_state_moves_give_a_model_that_says_so() -> None:
     rng = np.random.default_rng(1)
     still = Transient(0.025 * np.arange(300), np.full((300, 2), 5.0), rng.uniform(size=(300, 2)))

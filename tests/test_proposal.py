@@ -227,6 +227,12 @@ def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
 
 
+def test_a_magnetometer_and_a_frame_are_measured_though_their_type_says_little():
+    for topic, kind in (("/ardrone/mag", "Vector3Stamped"), ("/b", "MagneticField"), ("tf", "TransformStamped")):
+        assert role_by_name(topic, f"geometry_msgs/msg/{kind}") == "state"
+    assert role_by_name("/body_mage", "std_msgs/msg/Float64") == ""
+
+
 COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "yaw_sp_move_rate", "level_sp", "ref_x")]
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
@@ -501,8 +507,11 @@ def test_of_a_plant_a_twin_is_judged_and_what_says_the_same_to_the_last_digit_is
     rng = np.random.default_rng(0)
     p = 50 + 20 * answers(rng, np.zeros((2000, 1)), 1.0, 0.9)[:, 0]
     columns = {"P1": p.round(3), "P2": (0.5 * p + 0.05 * rng.normal(size=2000)).round(3), "P1_bar": (1e-2 * p).round(4)}
+    columns["P_set"] = np.repeat(rng.uniform(40, 60, 100), 20).round(1)
+    columns["P_error"] = (columns["P_set"] - columns["P1"]).round(2)
     proposal = propose([table_of(tmp_path / "a.csv", columns, 60.0 * np.arange(2000))])
     assert [c.path for c in proposal.states] == ["P1", "P2"] and "P1_bar: moves with P1" in proposal.text
+    assert "P_error: is P_set less P1" in proposal.text  # a step of the set point is no fault
 
 
 # --- many columns ------------------------------------------------------------------------------------------------
@@ -903,6 +912,16 @@ def test_stamps_that_are_rounded_of_an_even_clock_make_the_step_constant(tmp_pat
         assert narrower.max() < 0.5
 
 
+def test_recordings_of_two_rates_have_no_constant_step(tmp_path):
+    rng = np.random.default_rng(3)
+    paths = []
+    for step in (0.08, 0.1):
+        u = np.repeat(rng.normal(size=60), 20)
+        columns = {"speed": answers(rng, u[:, None])[:, 0], "speed_cmd": u}
+        paths.append(table_of(tmp_path / f"{step}.csv", columns, np.round(step * np.arange(len(u)), 2)))
+    assert "step:" not in propose(paths).text
+
+
 def test_a_delay_that_half_of_the_recording_denies_is_none():
     """The vanes follow the speed by a schedule, so that a late angle stands in for earlier speeds, by 4 %."""
     proposal = propose([Path(__file__).parents[1] / "bags" / "turbofan_levels_noise.mcap"])
@@ -1076,16 +1095,33 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])
 
 
+def test_columns_that_one_table_lacks_are_left_out_and_tables_of_two_topics_refused(tmp_path):
+    rows = {name: [] for name in ("both", "first", "second", "command")}
+    for k in range(200):
+        for name, row in rows.items():
+            row.append(f"{math.sin(k / 9 + len(name)):.6f}")
+    names = ("a.csv", ["both", "first"]), ("b.csv", ["second", "both"]), ("c.csv", ["command"])
+    for name, columns in names:
+        cells = zip(*(rows[column] for column in columns), strict=True)
+        lines = [f"{k / 50},{','.join(row)}" for k, row in enumerate(cells)]
+        (tmp_path / name).write_text("\n".join([f"time,{','.join(columns)}", *lines]) + "\n")
+    proposal = propose([tmp_path / "a.csv", tmp_path / "b.csv"])
+    assert [c.path for c in proposal.states] == ["both"]
+    assert "/table first, second: not in every recording" in proposal.text
+    words = "not in every recording.*; give recordings of one machine, with the same topics and columns"
+    refuses(BagError, words, propose, [tmp_path / "a.csv", tmp_path / "c.csv"])
+
+
 def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     """Another drive is elsewhere, and the numbers of a mode are names: neither tells what comes next."""
     rng = np.random.default_rng(3)
     u, mode = np.repeat(rng.normal(size=60), 25), np.repeat(rng.choice([0.0, 9.0, 10.0], size=30), 50)
     speed, lat_g = answers(rng, np.column_stack([u + 0.1 * mode, u])).T
     way = np.round(np.cumsum(np.abs(speed)), 1)
-    columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "gps_lon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
-    columns |= {"speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
+    columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "PilotLon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
+    columns |= {"Heading": np.cumsum(5 * speed) % 360, "speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
     proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
-    assert [c.path for c in proposal.states] == ["speed", "lat_g"], proposal.text
+    assert [c.path for c in proposal.states] == ["unwrap(Heading, 360)", "speed", "lat_g"], proposal.text
     assert [c.path for c in proposal.controls] == ["throttle"], proposal.text
     assert "c1_mode" in proposal.text and "a code by its name, and its numbers are no amounts" in proposal.text
 

@@ -198,6 +198,9 @@ def lines(delimiter=",", point=".", time=lambda t: f"{t:.1f}"):
         "time;speed;cmd\n" + lines(";", ","),
         "time\tspeed\tcmd\n" + lines("\t"),
         "time, speed, cmd\n" + lines(", "),
+        "# time speed cmd\n" + lines(" "),
+        "# of a bench, in s\n\n time   speed  cmd \n  " + lines("   ").replace("\n", "  \n  "),
+        ",,time,speed,cmd\n" + lines(),
         "time,speed,cmd,\n" + lines().replace("\n", ",\n"),
         "time,speed,cmd\n" + lines().replace("\n", ",\n"),
         "time_on,t,speed,cmd\n" + "".join(f"0,{line}\n" for line in lines().split()),  # no time stands still
@@ -356,6 +359,9 @@ def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
         ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
         ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
         ("{unit: day}", r"s.yaml: table: unit is 'day'.*; write one of s, ms, us, ns, min, h"),
+        ("{step: fast}", r"s.yaml: table: step is 'fast'; write a number"),
+        ("{step: 0}", r"s.yaml: table: step is 0.0; write the s from row to row"),
+        ("{step: 1, unit: ms}", r"s.yaml: table: step is of rows without a time, and unit of a time; take one away"),
         ("{time: []}", r"s.yaml: table: time is \[\]; write the name of a column"),
         ("5", r"s.yaml: table: a mapping is wanted here, not a number"),
     ],
@@ -364,6 +370,26 @@ def test_what_is_wrong_with_the_layout_is_said(many, tmp_path, table, words):
     text = (tmp_path / "s.yaml").read_text().split("\n")
     (tmp_path / "s.yaml").write_text("\n".join([f"table: {table}", *text[2:]]))
     refuses((BagError, SignalError), words, read_transients, many, tmp_path / "s.yaml")
+
+
+def test_rows_without_a_time_have_a_step_and_any_column_is_a_time_from_the_first_command_on(tmp_path, monkeypatch, cli):
+    monkeypatch.chdir(tmp_path)
+    noise, y, rows = random.Random(0), 0.0, []
+    for k in range(900):
+        u = float(k // 40 % 3)
+        y += 0.1 * (u - y) + 0.02 * noise.gauss(0, 1)
+        rows.append((8.0 * k, u, y))
+    Path("run.csv").write_text("count,drive,speed\n" + "".join(f"{c},{u},{y}\n" for c, u, y in rows))
+    Path("bare.txt").write_text("drive speed\n" + "".join(f"{u} {y}\n" for _, u, y in rows))
+    refuses(BagError, r"bare.txt: .*`--table step=0.01`", propose, ["bare.txt"])
+    cli("start", "bare.txt", "--table", "step=0.008", "--output", "bare")
+    cli("init", "run.csv", "--table", "time=count", "unit=ms", "--output", "run.yaml")
+    assert cli.json("topics", "bare.txt", "--table", "step=0.008")["topics"][0]["rate"] == 125
+    model = UncertainLTI.load("bare.model.json")
+    assert model.signals.table == TableLayout(step=0.008) and model.signals.table.to_dict() == {"step": 0.008}
+    (bare,), (run,) = read_transients("bare.txt", model.signals), read_transients("run.csv", "run.yaml")
+    assert bare.state_names == run.state_names == ("speed",)
+    np.testing.assert_array_equal(bare.t - bare.t[0], run.t - run.t[0])
 
 
 def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
@@ -384,7 +410,9 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time,x\n", "there is no line of numbers in it"),
         ("a.csv", b"time\n1\n2\n", "there is one column only in it"),
         ("a.csv", b"\x00\x01\x02" * 100, "holds bytes that are no text"),
-        ("a.csv", b"time x y\n1 2 3\n2 3 4\n", "apart by spaces alone"),
+        ("a.csv", b"time x y\n1 2 3\n2 a 4\n", "apart by spaces, and not all are numbers"),
+        ("a.csv", b"linear:\n  x: 0.1\n---\nlinear:\n  x: 0.2\n", "what `ros2 topic echo` prints"),
+        ("a.csv", b"x,time,y\n2,3\n1,4\n3,4\n", "header names 3 columns and its rows have 2 cells.*no column is"),
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
@@ -617,6 +645,18 @@ def test_days_are_read_where_one_order_of_day_and_month_alone_goes_forward(tmp_p
     assert run.t_ns[0] == np.datetime64("2014-01-12T00:00", "ns").astype(int)
 
 
+@pytest.mark.parametrize("form", ["{day} {hour:02}:{m:02}:05 {zone}", "{day} {hour}:{m:02}:05 AM {zone}"])
+def test_a_day_has_the_zone_behind_it(tmp_path, form):
+    """As .NET writes an instant; the clock is put back from two hours before UTC to one."""
+    rows = []
+    for k in range(180):
+        local, zone = (k, "+02:00") if k < 60 else (k - 60, "+01:00")
+        rows.append(form.format(day="10/26/2025", hour=2 + local // 60, m=local % 60, zone=zone) + f",{k}")
+    bag = read_csv(tmp_path, "Ts,x", rows)
+    assert bag.times[0] == np.datetime64("2025-10-26T00:00:05", "ns").astype(int)
+    assert set(np.diff(bag.times).tolist()) == {60 * 10**9}
+
+
 def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
     bag = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}" for k in range(90)))
     assert set(np.diff(bag.times).tolist()) == {10**9}
@@ -708,7 +748,11 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
         assert set(np.diff(newest.times).tolist()) == {60 * 10**9} and newest.columns_by_field["x"][0] == 29
         assert "newest row comes first" in newest.warnings[-1]
     for head, rows, words in (
-        ("time,x", (f"{k // 10},{k}" for k in range(100)), "90 of 100 rows have the time of a row before"),
+        (
+            "time,x",
+            (f"{k // 10},{k % 10}" for k in range(100)),
+            "90 of 100 rows have the time of a row before, and only",
+        ),
         ("Date,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9)), "write days of a spreadsheet"),
     ):
         assert re.search(words, " ".join(read_csv(tmp_path, head, rows).warnings))
@@ -716,6 +760,18 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
     assert list(read_csv(tmp_path, "time,Größe °C", ["0,1", "1,2"], "cp1252").columns_by_field) == ["Größe_C"]
     rows = read_csv(tmp_path, "time,signal,value", (f"{k},{('speed', 'load')[k % 2]},{k * k}" for k in range(90)))
     assert "column 'signal' names the signal" in rows.topics["/table"].reason
+
+
+def test_rows_of_whole_seconds_come_evenly_and_those_of_units_do_not(tmp_path):
+    """Of a machine at 20 Hz, stamped in whole seconds, with a pause of five; units of another one are no rows of it."""
+    t = 1.7e9 + 0.35 + np.concatenate([np.arange(0, 10, 0.05), np.arange(15, 25, 0.05)])
+    bag = read_csv(tmp_path, "time,x,y", (f"{math.floor(s)},{math.sin(s):.6f},{s % 7:.3f}" for s in t))
+    assert np.abs(np.diff(bag.times) * 1e-9 - np.diff(t)).max() < 0.06 and np.abs(bag.times * 1e-9 - t).max() < 0.06
+    assert "taken to come evenly in the 1 s after it" in bag.warnings[0]
+    units = read_csv(
+        tmp_path, "time,x,y", (f"{k // 20},{k % 20 + k // 20 / 9},{k % 20 * 3 - k // 20}" for k in range(400))
+    )
+    assert np.unique(units.times).size == 20 and "the 20 rows of a time one for each of 20 units" in units.warnings[0]
 
 
 def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):

@@ -227,6 +227,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--like": _takes(
         "of many alike (joints, motors) the one that the file is drawn up for, such as j3", "MEMBER", default=""
     ),
+    "--table": _takes(
+        "of tables, as under `table` in a signals file: time=COLUMN unit=ms, runs=COLUMN, or step=0.01, the s from row "
+        "to row where no column is a time",
+        "KEY=VALUE",
+        nargs="+",
+        default=[],
+    ),
     "--check": _takes("recordings to report on (default: those that are fitted)", "BAG", nargs="+", default=[]),
     # layouts
     "--foxglove": _takes("for Foxglove and Lichtblick", "FILE.json"),

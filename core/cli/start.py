@@ -21,6 +21,7 @@ from typing import Any
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.cli.command import RECORDINGS, Result, declared, helped, model_target
+from uncertain_lti.signals.values import TableLayout
 
 _LONGEST_NAME = 200  # letters
 _LONGEST_LIST = 100_000
@@ -31,7 +32,7 @@ _LONGEST_LIST = 100_000
 
 @declared(
     "list the topics of a recording, and which fields could be signals",
-    *("bag", "--json"),
+    *("bag", "--table", "--json"),
     quiet="print the list and errors only: no notes, no progress",
 )
 def topics(options: argparse.Namespace) -> Result:
@@ -39,7 +40,7 @@ def topics(options: argparse.Namespace) -> Result:
     from uncertain_lti.base.text import Table, number
     from uncertain_lti.recordings.formats import open_recording
 
-    bag = open_recording(options.bag)
+    bag = open_recording(options.bag, layout=_layout(options))
     facts = bag.facts(options.progress.iterate("reading"))
     if options.json:
         held = [
@@ -69,6 +70,11 @@ def topics(options: argparse.Namespace) -> Result:
     return Result(text="\n".join(lines))
 
 
+def _layout(options: argparse.Namespace) -> TableLayout:
+    """What --table says of the columns of tables."""
+    return TableLayout.from_dict(dict(pair.partition("=")[::2] for pair in options.table), "--table")
+
+
 # --- init ------------------------------------------------------------------------------------------------------------
 
 
@@ -76,7 +82,7 @@ def topics(options: argparse.Namespace) -> Result:
     "propose a signals file for a recording, with reasons, for you to edit",
     helped("bags", f"{RECORDINGS} of the same machine"),
     helped("--output", "signals file to write; must not exist yet (default: print it)", metavar="FILE"),
-    *("--states", "--controls", "--like"),
+    *("--states", "--controls", "--like", "--table"),
     helped("--json", "print what is proposed as JSON, with the text of the file"),
     quiet="print errors only (and without --output the file): no summary, no notes, no progress",
 )
@@ -91,7 +97,7 @@ def init(options: argparse.Namespace) -> Result:
             raise SignalError(f"{output}: is there already; choose another output, or move it away")
         target(output, holds=b"", kind="signals file", example="signals.yaml")
     reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
-    proposal = propose(options.bags, reading, **chosen, like=options.like)
+    proposal = propose(options.bags, reading, **chosen, like=options.like, table=_layout(options))
     options.progress.note(*proposal.warnings)
     proposed = {
         kind: [{"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind]
@@ -127,7 +133,7 @@ _WRITTEN = "write NAME.yaml, which is used as it is if it is there already, NAME
 @declared(
     "from recordings of the healthy machine to a monitor: init, fit and report in one go",
     helped("bags", f"{RECORDINGS} of the healthy machine"),
-    "--check",
+    *("--check", "--table"),
     helped("--output", f"{_WRITTEN} (default: machine)", metavar="NAME", default="machine"),
     "--force",
     helped("--json", "print what init, fit and report say, as JSON"),
@@ -148,8 +154,9 @@ def start(options: argparse.Namespace) -> Result:
     if os.path.exists(signals):
         options.say(f"signals: as {signals} has them")
     else:
-        group_recordings(options.check or [])
-        parts["init"] = _part(options, ["init", *options.bags, "--output", signals]).data
+        group_recordings(options.check or [], layout=_layout(options))
+        table = ["--table", *options.table] * bool(options.table)
+        parts["init"] = _part(options, ["init", *options.bags, "--output", signals, *table]).data
         options.say(_proposed(parts["init"]))
         options.say(f"signals file written to {signals}: it says why; edit it and start again with --force")
     forced = ["--force"] * options.force

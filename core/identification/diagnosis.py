@@ -143,7 +143,7 @@ def describe(
         lacking = {} if late else _missing(part, signals)
         lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
         messages += lacking.values()
-        messages += _weak(problem, sums, names, past, lacking)
+        messages += _weak(problem, sums, signals, past, lacking)
         later = [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)]
         messages += _fed_back(part, names, past, later)
         messages += [m for i, m in noisy.items() if i not in lacking]
@@ -230,15 +230,17 @@ def _collinear(problem: Problem, sums: Moments, names: Sequence[str], past: Coll
 
 
 def _weak(
-    problem: Problem, sums: Moments, names: Sequence[str], past: Collection[int], lacking: Collection[int]
+    problem: Problem, sums: Moments, signals: Sequence[Signal], past: Collection[int], lacking: Collection[int]
 ) -> list[str]:
-    """Controls whose effect is lost in the noise."""
+    """Controls whose effect is lost in the noise, unless another sample of the same field has it."""
+    found = lost(problem, sums, past)
+    seen = {(s.topic, s.inner) for j, s in enumerate(signals) if j >= problem.n and j not in found}
     return [
-        f"control '{names[j]}' moves too little to be distinguished from the noise: its strongest effect, on "
-        f"'{names[state]}', is {certainty:.2g} times its standard error; record it with larger or more steps "
+        f"control '{signals[j].name}' moves too little to be distinguished from the noise: its strongest effect, on "
+        f"'{signals[state].name}', is {certainty:.2g} times its standard error; record it with larger or more steps "
         f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
-        for j, (state, certainty) in lost(problem, sums, past).items()
-        if state not in lacking
+        for j, (state, certainty) in found.items()
+        if state not in lacking and (signals[j].topic, signals[j].inner) not in seen
     ]
 
 

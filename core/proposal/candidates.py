@@ -359,7 +359,7 @@ _REFERENCE = re.compile(
 
 _STATE = re.compile(
     r"(state|odom|pose|twist|imu|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
-    r"depth|pressure|temperature|power|attitude|estimat|log|response|data$)"
+    r"depth|pressure|temperature|power|attitude|estimat|log|response|data$|(^|_)mag(net|_|$)|compass|transform)"
 )
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import os
 import re
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -92,8 +93,10 @@ _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[Source]:
     """Every topic of the recordings with its numbers."""
     facts: dict[str, TopicFacts] = {}
+    held: dict[str, Counter[str]] = defaultdict(Counter)  # in how many recordings a field is
     for bag in bags:
         for fact in bag.facts(progress):
+            held[fact.info.topic].update(fact.fields)
             known = facts.get(fact.info.topic)
             if known is None or (not known.fields and fact.fields):
                 facts[fact.info.topic] = fact
@@ -101,7 +104,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     for topic, fact in facts.items():
         total = sum(_messages(bag, topic) for bag in bags)
         if fact.info.type == TYPE:
-            sources += _of_table(fact, total, all(topic in b.topics for b in bags))
+            sources += _of_table(topic, total, {f: number == len(bags) for f, number in held[topic].items()})
             continue
         stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
         source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
@@ -169,16 +172,17 @@ def _tells_runs(table: Table, name: str) -> bool:
     return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] < 0).all())
 
 
-def _of_table(fact: TopicFacts, rows: int, everywhere: bool) -> list[Source]:
-    """The columns of a table, those that are commands by their names apart from the others."""
+def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Source]:
+    """The columns of tables, those that are commands by their names apart from the others."""
     by_role: dict[str, list[str]] = {}
-    beside = {bare(field) for field in fact.fields}
-    for field in fact.fields:
+    beside = {bare(field) for field in everywhere}
+    for field in everywhere:
         by_role.setdefault(role_of_column(field, beside), []).append(field)
-    reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if everywhere else _APART
-    topic, sources = fact.info.topic, []
+    reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if any(everywhere.values()) else _APART
+    sources = []
     for role, fields in by_role.items():
-        candidates = [] if reason else _candidates(topic, fields)
+        candidates = [] if reason else _candidates(topic, [f for f in fields if everywhere[f]])
+        candidates += [Candidate(topic, f, reason=_APART) for f in fields if not everywhere[f] and not reason]
         sources.append(Source(topic, TYPE, role, False, None, candidates=candidates, reason=reason))
     return sources
 
@@ -284,7 +288,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    if source.type == TYPE and _PLACE.search(candidate.path.lower()):
+    if source.type == TYPE and _PLACE.search("_".join(words_of(candidate.path))):
         return "a place on the map, and another run may be elsewhere"
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
     if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
@@ -319,7 +323,7 @@ def _wrapped(source: Source) -> None:
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
         jumps = (t for t in (math.tau, 360.0) if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
         turn = math.tau if angle else next(jumps, 0.0)
-        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path)
+        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path.lower())
         if angle or (turn and named):
             candidate.path = f"unwrap({candidate.path}{', 360' * (turn > 7)})"
             candidate.values = [_unwrapped(v, turn) for v in candidate.values]
@@ -356,6 +360,7 @@ def propose(
     states: Sequence[str] = (),
     controls: Sequence[str] = (),
     like: str = "",
+    table: TableLayout | None = None,
 ) -> Proposal:
     """Suggest states and controls of a machine from recordings of it.
 
@@ -378,6 +383,9 @@ def propose(
         The member of many that are alike, such as a joint, that the file is drawn up for; default the one whose command
         shows most. The file is for all members in which the same numbers move.
 
+    table : TableLayout, optional
+        Which columns of tables are time and run, or their step, for the file as well; default to look for them.
+
     Returns
     -------
     Proposal
@@ -388,12 +396,13 @@ def propose(
     BagError
         A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
-    bags = group_recordings(list(paths))
+    layout = table or TableLayout()
+    bags = group_recordings(list(paths), layout=layout)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
-    runs = run_column(bags)
-    if runs:
-        bags = group_recordings(list(paths), layout=TableLayout(runs=runs))
+    if not layout.runs and (runs := run_column(bags)):
+        layout = replace(layout, runs=runs)
+        bags = group_recordings(list(paths), layout=layout)
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
@@ -401,7 +410,7 @@ def propose(
         chosen, used = plant_signals(sources)
         if not chosen:
             raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
-        text = signals_file(bags, sources, chosen, used, "", runs=runs, plant=True)
+        text = signals_file(bags, sources, chosen, used, "", layout=layout, plant=True)
         return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
@@ -414,8 +423,8 @@ def propose(
         why = [f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]]
         reasons = "; ".join(dict.fromkeys([*why, *warnings[:3]]))
         nothing = f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})"
-        if any(s.reason == _APART for s in sources):
-            raise BagError(f"{nothing}; give recordings of one machine, with the same topics")
+        if any(_APART in s.reason for s in sources):
+            raise BagError(f"{nothing}; give recordings of one machine, with the same topics and columns")
         named = "name the topics of its states in `uncertain-lti init --states`"
         raise BagError(f"{nothing}; record the machine at work, and longer, or {named}")
     chosen, doubt = choose(measured, commands, like)
@@ -448,7 +457,7 @@ def propose(
     except ModuleNotFoundError as error:  # all but this needs no solver
         memories = []
         warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
-    text = signals_file(bags, sources, chosen, used, doubt, memories, members, runs)
+    text = signals_file(bags, sources, chosen, used, doubt, memories, members, layout)
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
 
 

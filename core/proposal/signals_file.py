@@ -29,7 +29,7 @@ from uncertain_lti.sampling.clock import coarse_ns, longest_pause
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.signals.values import CHOICES_TEXT
+from uncertain_lti.signals.values import CHOICES_TEXT, TableLayout
 
 _PARTS = re.compile(r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+|\d+")  # letters of any alphabet
 
@@ -152,10 +152,13 @@ _LONGEST_LINE = 1 << 20  # letters
 _ADDITIVE = f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give."
 
 
+_OPEN = TableLayout()
+
+
 def signals_file(
     bags: Sequence[Recording], sources: Sequence[Source], states: Sequence[Candidate], controls: Sequence[Candidate],
     doubt: str, memories: Sequence[str] = (), members: Mapping[str, Sequence[Candidate]] = MappingProxyType({}),
-    runs: str = "", plant: bool = False,
+    layout: TableLayout = _OPEN, plant: bool = False,
 ) -> str:  # fmt: skip
     """Write the text of the file."""
     every = {s.topic: s for s in sources}
@@ -180,8 +183,13 @@ def signals_file(
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
         lines += ["", "# Their header stamps do not move, or not all use one clock: times of arrival serve for all."]
         lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
-    if runs:
-        lines += ["", "# Each value of this column is a recording of its own.", "table:", f"  runs: {_quoted(runs)}"]
+    if table := layout.to_dict():
+        lines += [
+            "",
+            "# Columns of the time and of the runs, each value of which is a recording; or the s from row to row.",
+        ]
+        texts = {key: _number(v, exact=True) if key == "step" else _quoted(v) for key, v in table.items()}
+        lines += ["table:", *(f"  {key}: {text}" for key, text in texts.items())]
     if plant:
         lines += ["", "# Process data: every measurement is judged. fit takes the medians as steady states, where they"]
         lines.append("# see clearly smaller faults. scale: range, in recorded units.")

@@ -36,6 +36,7 @@ from uncertain_lti.recordings.table_times import (
     goes_forward,
     instants,
     may_be,
+    spread,
 )
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, of_quaternion
@@ -98,18 +99,25 @@ class Table(Recording):
             if cells and (_PACKED.fullmatch(cells[0]) or len(units) == 1 < len(set(cells)) and None not in units):
                 unread = f"column '{name}' left out, as no cell is a number alone, such as '{cells[0][:40]}'"
                 self._warnings.append(f"{file}: {unread}: write one in each, without unit or separator of thousands")
+        self.times = times[kept]
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
-            number, unit = _for_each_time(times[kept], {name: raw.columns[name][kept] for name in names})
+            of_rows = {name: raw.columns[name][kept] for name in names}
+            number, unit = _for_each_time(self.times, of_rows)
+            flow = number > 1 and not unit and (np.diff(self.times) >= 0).all() and _flows(of_rows.values(), number)
             each = f"are the {number} rows of a time one for each of {number} units? then "
             each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
             other = next((name for name in names if called_time(name) and goes_forward(raw.columns[name])), "")
+            if flow:
+                usual = float(np.median(np.diff(np.unique(self.times)))) * 1e-9
+                self.times, taken = spread(self.times), f"they are taken to come evenly in the {usual:g} s after it: "
+            else:
+                taken = f"only the first of such rows counts: {f'{each}write a file for each; else ' * (number > 1)}"
             self._warnings.append(
-                f"{path}: {equal} of {len(kept)} rows have the time of a row before, and only the first of such rows "
-                f"counts: {f'{each}write a file for each; else ' * (number > 1)}write times with more decimals"
+                f"{path}: {equal} of {len(kept)} rows have the time of a row before, and {taken}"
+                "write times with more decimals"
                 + f", or take column '{other}', `table: {{time: '{other}'}}`"
                 * bool(other)
             )
-        self.times = times[kept]
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
         fields = zip(once(map(field_name, names), "_"), names, strict=True)
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
@@ -245,6 +253,16 @@ def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> t
         if 2 <= len(names) <= 2 * number and len(np.unique(np.column_stack([times, which]), axis=0)) == len(times):
             return number, name
     return number, ""
+
+
+def _flows(columns: Iterable[Column], rows: int) -> bool:
+    """Whether most numbers change less from row to row than over the rows of a time, which are of one machine then."""
+    shares = []
+    for column in (c for c in columns if c.dtype.kind in "iuf" and c.ndim == 1):
+        values = column[np.isfinite(column)].astype(np.float64)
+        if len(values) > 2 * rows and (later := float(np.abs(values[rows:] - values[:-rows]).mean())) > 0:
+            shares.append(float(np.abs(np.diff(values)).mean()) / later)
+    return bool(shares) and float(np.median(shares)) < 0.5
 
 
 def _take_turns(cells: Sequence[object]) -> int:

@@ -86,6 +86,7 @@ class _Shape:
     skip: int
     names: tuple[str, ...]
     units: tuple[str, ...] = ()
+    note: str = ""
 
 
 def _read_csv(path: Path) -> RawTable:
@@ -105,11 +106,14 @@ def _read_csv(path: Path) -> RawTable:
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
     values = np.empty((0, 0))
     with suppress(ValueError, OverflowError), open(path, encoding=encoding, errors="replace", newline="") as text:
-        values = np.loadtxt(text, delimiter=shape.delimiter, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2)
+        apart = shape.delimiter.strip(" ") or None
+        values = np.loadtxt(text, delimiter=apart, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2)
     if values.shape[1] != len(names) or not len(values):
-        return replace(_read_cells(path, encoding, shape, names), units=units)
+        read = _read_cells(path, encoding, shape, names)
+        return replace(read, units=units, notes=[*filter(None, [shape.note]), *read.notes])
     exact = partial(_texts, path, encoding, shape, names)
-    return RawTable(dict(zip(names, np.ascontiguousarray(values.T), strict=True)), [], exact, units)
+    found = dict(zip(names, np.ascontiguousarray(values.T), strict=True))
+    return RawTable(found, [*filter(None, [shape.note])], exact, units)
 
 
 def _texts(path: Path, encoding: str, shape: _Shape, names: Sequence[str], name: str) -> Sequence[str]:
@@ -242,7 +246,9 @@ def once(names: Iterable[str], between: str) -> list[str]:
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     """Find the delimiter with which most lines have as many values as each other, and the first line of data."""
     best: tuple[float, int, int, str] | None = None  # how well it fits, cells, - first line, delimiter
-    for delimiter in _DELIMITERS if any(d in line for line in lines for d in _DELIMITERS) else " ":
+    for delimiter in (*_DELIMITERS, " "):
+        if delimiter == " " and best:
+            break  # within cells
         split = [_split(line, delimiter) for line in lines]
         fits: dict[int, float] = {}  # lines of each number of cells, as far as they hold values
         for cells in split:
@@ -259,19 +265,28 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     _, wide, begin, delimiter = best
     if wide > _MOST_COLUMNS:
         raise BagError(f"{path}: has {wide} columns, more than {_MOST_COLUMNS}; write those that are needed")
-    if delimiter == " ":
-        raise BagError(f"{path}: its cells are apart by spaces alone; write commas, semicolons or tabs between them")
+    in_spaces = [line.split() for line in lines[-begin:] if delimiter == " " and line.strip()]
+    if any(len(c) != wide or not all(_is_value(v) or v.lower() in _MISSING for v in c) for c in in_spaces):
+        raise BagError(
+            f"{path}: its cells are apart by spaces, and not all are numbers, or as many in each line; write commas, "
+            "semicolons or tabs between them, or record a bag in place of what `ros2 topic echo` prints"
+        )
     above = [_split(line.lstrip("#% "), delimiter) for line in lines[:-begin]]
     above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
     rows = [cells for line in lines[-begin:] if len(cells := _split(line, delimiter)) == wide]
     named = any(len(cells) == wide and 2 * len(set(cells) - {""}) > wide for cells in above)
     if not named and not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none of the names
         above = [[*cells, ""] if len(cells) == wide - 1 else cells for cells in above]
+    above = [filled if len(filled := [c for c in cells if c]) == wide else cells for cells in above]
+    last = next((cells for cells in reversed(above) if len(cells) > 1 and not any(map(_is_value, cells))), [])
     above = [cells for cells in above if len(cells) == wide]
     kinds = [len(set(cells) - {""}) for cells in above]
     lines_of_names = [i for i, kind in enumerate(kinds) if kind > 1]
     if not lines_of_names:
-        return _Shape(delimiter, -begin, tuple(f"column {i + 1}" for i in range(wide)))
+        unlike = (
+            f"its header names {len(last)} columns and its rows have {wide} cells, so no column has a name; mend it"
+        )
+        return _Shape(delimiter, -begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike * bool(last))
     chosen = next(
         (i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0]
     )  # above the names there may be groups of them

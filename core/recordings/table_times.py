@@ -28,7 +28,7 @@ NO_TIME = -(2**63)
 """Instant of a row without one."""
 
 _NAMES = (
-    r"(__|%)?time(_?stamp)?", r"t", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
+    r"(__|%)?time(_?stamp)?", r"ts?", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
     r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
     r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
@@ -37,7 +37,10 @@ _UNIT = {
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
-_DAY = re.compile(r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?")
+_DAY = re.compile(
+    r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?"
+    r"([+-]\d\d:?\d\d)?"
+)
 _CLOCK = re.compile(r"(\d{1,2}):(\d\d)(?::(\d\d(?:[.,]\d+)?))?$")
 _DOTTED = re.compile(r"([01]?\d|2[0-3])\.([0-5]\d)\.([0-5]\d)")  # 18.00.00
 _MINUTES = re.compile(r"(\d{1,2}):([0-5]\d[.,]\d+)")  # as Excel writes times with decimals
@@ -79,6 +82,9 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
 
     Returns (rows,): ns; `NO_TIME` where a row has none.
     """
+    if layout.step is not None:
+        rows = len(next(iter(table.columns.values()), ()))
+        return "", np.rint(np.arange(rows) * (layout.step * 1e9)).astype(np.int64), ""
     if layout.time is not None:
         column, words = find_column(path, layout.time, list(table.columns), "the time"), ""
     else:
@@ -103,9 +109,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
         doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
         if unit == "s" and not stated and (step := _coarse(values)):
-            doubt = (
-                f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `table: {{unit: us}}`"
-            )
+            doubt = f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `--table unit=us`"
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
         times = _of_numbers(where, table, column, UNITS[unit])
@@ -136,11 +140,30 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
     if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
         none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
+    none = "; ".join([*table.notes, none])
     raise BagError(
-        f"{path}: {none} is called time or looks like it; rename the one that is, or name it in a signals file, "
-        f"`table: {{time: COLUMN}}`; if none is, add one, in s (for rows at one step, its multiples); columns there: "
-        f"{shortlist(names, 50)}"
+        f"{path}: {none} is called time or looks like it; rename the one that is, or name it, `--table time=COLUMN`; "
+        "for rows at one step without a time say how many s it has, `--table step=0.01` (in a signals file "
+        f"`table: {{step: 0.01}}`); columns there: {shortlist(names, 50)}"
     )
+
+
+def spread(times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Times that several rows share, such as whole seconds, as if the rows of each came evenly until the next.
+
+    Beside a pause, and at both ends, they come as fast as usual.
+    """
+    first = np.flatnonzero(np.diff(times, prepend=times[0] - 1))
+    rows, gaps = np.diff(first, append=len(times)), np.diff(times[first])
+    usual, each = (int(np.median(gaps)), int(np.median(rows))) if len(gaps) else (0, 1)
+    gaps = np.append(gaps, usual + 1)  # both ends are beside a pause
+    ends, begins = gaps > usual, np.append(True, gaps[:-1] > usual)
+    span = np.minimum(gaps, usual)
+    steps = span / np.where(ends | begins, np.maximum(rows, each), rows)
+    late = np.where(begins & ~ends, span - rows * steps, 0.0)
+    which = np.repeat(np.arange(len(first)), rows)
+    place = np.arange(len(times)) - first[which]
+    return np.asarray(times + np.rint(late[which] + place * steps[which]).astype(np.int64))
 
 
 def _bare(name: str) -> str:
@@ -226,6 +249,8 @@ def _spelt(text: str) -> str:
         return text.replace(".", ":")
     if _ISO.match(text) or _CLOCK.match(text):
         return text
+    zone = found[1] if (found := re.search(r"\s([+-]\d\d:?\d\d)$", text)) else ""  # as .NET writes it
+    text = text.removesuffix(zone).rstrip()
     if half := _HALF.fullmatch(text):
         day, hour, minutes, seconds, letter = half.groups("00")
         of = int(hour) % 12 + 12 * (letter in "Pp") if int(hour) <= 12 else int(hour)
@@ -243,7 +268,7 @@ def _spelt(text: str) -> str:
         year, _, month, day, hour, minutes, rest = dated.groups()
         clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
         text = f"{year}-{int(month):02}-{int(day):02}{clock}"
-    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda zone: zone[1] or "Z", text)  # as browsers write it
+    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda gmt: gmt[1] or "Z", text) + zone  # as browsers write it
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
@@ -409,7 +434,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
         which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
         raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
     iso = iter(orders[taken[0]])
-    return [next(iso) if _DAY.fullmatch(cell) else cell for cell in cells], note
+    return [next(iso) + (match[7] or "") if (match := _DAY.fullmatch(cell)) else cell for cell in cells], note
 
 
 def _is_even(texts: Sequence[str]) -> bool:

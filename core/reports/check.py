@@ -250,7 +250,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
                     "longest_in_fit": longest,
                     "why": verdicts.why_frozen.get((start, i), ""),
                     "moving": [model.signals.signals[j].name for j in moving],
-                    "text": f"{name} {repeat_words(seconds, longest)} from {_at(_instant(transient, begin))}",
+                    "text": f"{name} {repeat_words(seconds, longest)} from {instant_text(_instant(transient, begin))}",
                 }
             )
     return sorted(found, key=lambda repeat: (repeat["k"], repeat["state"]))
@@ -518,14 +518,14 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
             unknown = data["unknown_regime"] / data["verdicts"]
             blocks.append(f"unknown regime: {unknown:.2%} of the verdicts, which nothing vouches for")
     blocks += [f"  {text}" for text in data["unknown"]]
-    blocks += [f"{j['text']} at {_at(j)}" for s in data["states"].values() if (j := s["jump"]) is not None]
+    blocks += [f"{j['text']} at {instant_text(j)}" for s in data["states"].values() if (j := s["jump"]) is not None]
     frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
     longest = {r["state"]: r for r in sorted(data["repeats"], key=lambda repeat: repeat["seconds"])}
     blocks += _first(frozen, "frozen repeat")
     rest = "as of a machine at rest: the model does not move it"
     moves = {name: f"while {shortlist(r['moving'], 3)} moved" if r["moving"] else rest for name, r in longest.items()}
     blocks += [f"warning: {r['text']}, {moves[name]}" for name, r in longest.items()]
-    told = [f"the alarm from {_at(like)} {like['text']}" for like in data["explained"] if like["text"]]
+    told = [f"the alarm from {instant_text(like)} {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
     if alarms := data["alarms"]:
         first, longest_alarm = alarms[0], max(alarms, key=lambda alarm: alarm["seconds"])
@@ -540,15 +540,15 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
 
 def _when(alarm: Mapping[str, Any]) -> str:
     """When an alarm was raised, and for how long."""
-    at, seconds = _at(alarm), alarm["seconds"]
+    at, seconds = instant_text(alarm), alarm["seconds"]
     last = f"for {number(seconds)} s" if seconds < 120 else f"for {lasting(seconds / 3600)}"
     return f"{at}{',' * at.endswith('on')} {last if seconds else 'for one verdict'}"
 
 
-def _at(instant: Mapping[str, Any]) -> str:
+def instant_text(instant: Mapping[str, Any], form: str = ".4f") -> str:
     """When a sample was, s from the first one; its day as well where that is another."""
     if instant["t"] < 86400 or instant["t_ns"] <= _DATED_NS:
-        return f"{instant['t']:.4f} s"
+        return f"{instant['t']:{form}} s"
     day = np.datetime64(instant["t_ns"], "ns").astype("datetime64[s]")
     return f"{day} UTC, {lasting(instant['t'] / 3600)} on"
 

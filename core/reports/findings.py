@@ -19,14 +19,24 @@ from typing import Any
 
 from uncertain_lti import __version__
 from uncertain_lti.base.files import sha256
-from uncertain_lti.base.text import finite_data, list_of, number, numbers_of, plural, shortened, shortlist, times
+from uncertain_lti.base.text import (
+    finite_data,
+    lasting,
+    list_of,
+    number,
+    numbers_of,
+    plural,
+    shortened,
+    shortlist,
+    times,
+)
 from uncertain_lti.identification.diagnosis import CONSTANT
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.check import UNVOUCHED, check_data
+from uncertain_lti.reports.check import UNVOUCHED, check_data, instant_text
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -141,7 +151,7 @@ def findings_text(facts: Mapping[str, Any]) -> str:
 def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     """One sentence, and whether there is something to look at."""
     judged, bad, state = recording["verdicts"], recording["violated"], recording["outcome"]
-    text = f"{plural(judged, 'verdict')} over {number(recording['seconds'])} s: "
+    text = f"{plural(judged, 'verdict')} over {lasting(recording['seconds'] / 3600)}: "
     if not judged:
         text = recording["reason"]
     elif not bad:
@@ -149,11 +159,11 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     else:
         states = {name: s["violations"] for name, s in recording["states"].items() if s["violations"]}
         most = sorted(states, key=lambda name: -states[name])[:3]
-        count, first = recording["episode_count"], recording["episodes"][0]["first"]["t"]
-        text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first:.8g} s; "
+        count, first = recording["episode_count"], instant_text(recording["episodes"][0]["first"], ".8g")
+        text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first}; "
         text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}"
     if alarms := recording["alarms"]:
-        text += f". The alarm was raised {times(len(alarms))}, first at {alarms[0]['t']:.8g} s"
+        text += f". The alarm was raised {times(len(alarms))}, first at {instant_text(alarms[0], '.8g')}"
     elif bad:
         text += ". The alarm was not raised"
     if judged and state == "unknown":

@@ -157,15 +157,18 @@ def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> in
 def coarse_ns(instants: Sequence[NDArray[np.int64]]) -> int | None:
     """Unit to which an even clock's stamps are rounded, so coarse that its steps differ; None if no such clock.
 
-    Stamps of even samples stay within rounding of a line; where samples are lost, or uneven, they leave it.
+    Stamps of even samples stay within rounding of a line; where samples are lost, or uneven, they leave it. There is no
+    such clock of recordings that each have a rate of their own.
 
     `instants` (messages,): of each recording, ns.
     """
-    steps = np.concatenate([np.empty(0, np.int64), *(np.diff(i) for i in instants)])
+    of_each = [np.diff(i) for i in instants if len(i) > 1]
+    steps = np.concatenate([np.empty(0, np.int64), *of_each])
     if len(steps) < _EVEN or steps.min() <= 0:
         return None
-    unit, usual = int(np.gcd.reduce(steps)), int(np.median(steps))
-    if usual > _COARSE * unit or (steps == usual).mean() > 0.99:
+    unit, usual, own = int(np.gcd.reduce(steps)), int(np.median(steps)), [int(np.median(each)) for each in of_each]
+    same = np.concatenate([each == middle for each, middle in zip(of_each, own, strict=True)])
+    if usual > _COARSE * unit or same.mean() > 0.99 or max(own) - min(own) > unit:
         return None
     count, line = np.arange(_EVEN + 1), []
     for each in instants:

@@ -239,17 +239,19 @@ class TableLayout:
 
     `time`: column of the time; None to look for one; `unit`: unit of a time column of numbers; None to take it from the
     column's name and size; `runs`: column whose values tell the recordings in one file apart; None where a file is one
-    recording.
+    recording; `step`: s from row to row, where no column is a time.
     """
 
     time: str | None = None
     unit: TimeUnit | None = None
     runs: str | None = None
+    step: float | None = None
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> TableLayout:
         """Build from the structure of a signals file or a model file."""
-        given = {k: v for k, v in checked_mapping(data, where, {"time", "unit", "runs"}).items() if v is not None}
+        keys = {"time", "unit", "step", "runs"}
+        given = {k: v for k, v in checked_mapping(data, where, keys).items() if v is not None}
         for key in {"time", "runs"} & given.keys():
             if isinstance(given[key], bool) or not isinstance(given[key], (str, int, float)) or not given[key]:
                 raise wrong(f"{where}: {key}", given[key], "the name of a column, in quotes")
@@ -257,8 +259,14 @@ class TableLayout:
         if (unit := given.get("unit", "s")) not in tuple(UNITS):  # which may be no text
             near = meant(str(unit), UNITS)
             raise SignalError(f"{where}: unit is {reprlib.repr(unit)}{near}; write one of {', '.join(UNITS)}")
+        if "step" in given:
+            given["step"] = checked_number(given["step"], f"{where}: step")
+            if not 1e-9 <= given["step"] < 1e9:
+                raise wrong(f"{where}: step", given["step"], "the s from row to row, such as 0.01")
+            if beside := sorted({"time", "unit"} & given.keys()):
+                raise SignalError(f"{where}: step is of rows without a time, and {beside[0]} of a time; take one away")
         return cls(**given)
 
-    def to_dict(self) -> dict[str, str]:
+    def to_dict(self) -> dict[str, Any]:
         """Return what `from_dict` takes, without what is left open."""
         return {key: value for key, value in asdict(self).items() if value is not None}

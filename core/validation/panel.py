@@ -322,7 +322,11 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     check_rate(rate)
     parts = [part for part in validation.parts if part.judged]
     if not parts:
-        raise FitError("no step of what was left out has a verdict, so no alarm can be learnt; record longer")
+        usual = [float(np.median(np.diff(p.transient.t))) for p in validation.parts if len(p.transient) > 1]
+        least, most = min(usual, default=0.0), max(usual, default=0.0)
+        rates = f"fit recordings of one rate: the steps of these are of {least:.3g} to {most:.3g} s"
+        remedy = rates if most > 2 * least else "record longer"
+        raise FitError(f"no step of what was left out has a verdict, so no alarm can be learnt; {remedy}")
     dt = float(np.median(np.concatenate([part.dt for part in parts])))
     lengths = sorted(part.judged for part in parts)
     apart = validation.what != "block" and int(unit_numbers(parts).max()) + 1 >= TELLING
