@@ -36,7 +36,7 @@ _MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|nan$", re.IGNORECASE)
 _WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
-_THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}$")
+_GROUPED = re.compile(r"[+-]?\d{1,3}(?P<by>[,. '’\u00a0\u202f])\d{3}(?:(?P=by)\d{3})*(?P<rest>(?!(?P=by))[.,]\d*)?$")
 _INSTANT = re.compile(
     r"\d{4}[-/]\d\d?[-/]\d\d?([T ]|$)|\d{1,2}:\d\d(:\d\d|$|\s*[AaPp])|\d{1,2}[./]\d{1,2}[./]\d{2,4}|"
     r"\d{1,2}-(\d{1,2}|[A-Za-z]{3})-\d{2,4}|\d{8}[T_ ]\d{6}"
@@ -191,8 +191,10 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
         with suppress(ValueError):
             return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
     numbers = np.full(len(plain), np.nan)
+    if by := _thousands(plain):
+        plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]
     # in quotes between commas they may part thousands, which nothing but other cells tells
-    decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _THOUSANDS.match(cell) for cell in plain)
+    decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _GROUPED.match(cell) for cell in plain)
     comma = missing = odd = 0
     first = ""
     for i, cell in enumerate(plain):
@@ -211,9 +213,20 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
             first = first or cell
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
         return np.array(plain, dtype=object), ""
-    if odd:
-        return numbers, left_out(odd, "number", first)
-    return numbers, "decimal commas read as points" * bool(comma)
+    read = [f"'{by}' between thousands taken out"] * bool(by) + ["decimal commas read as points"] * bool(comma)
+    return numbers, " and ".join([left_out(odd, "number", first)] * bool(odd) + read)
+
+
+def _thousands(cells: Sequence[str]) -> str:
+    """What parts thousands in a column, if cells tell (`1,234.5`, `1 234`, `1.234.567`) and none denies; else ""."""
+    points = any("." in cell and _NUMBER.match(cell) for cell in cells)
+    found = {
+        m["by"]
+        for m in map(_GROUPED.match, cells)
+        if m and (m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or (points and m["by"] == ","))
+    }
+    by = found.pop() if len(found) == 1 else ""
+    return by if all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
 
 
 def left_out(odd: int, what: str, first: str) -> str:
@@ -290,7 +303,8 @@ def _split(line: str, delimiter: str) -> list[str]:
 
 def _is_value(text: str) -> bool:
     """Whether a cell is a number or an instant, as names and units are not."""
-    return bool(_NUMBER.match(text) or _WITH_COMMA.match(text) or _INSTANT.match(text)) and text.lower() != "nan"
+    forms = _NUMBER, _WITH_COMMA, _GROUPED, _INSTANT
+    return any(form.match(text) for form in forms) and text.lower() != "nan"
 
 
 # --- others --------------------------------------------------------------------------------------------------
