@@ -158,6 +158,12 @@ def test_separators_of_thousands_are_read_where_cells_tell_them(cells, numbers, 
         assert len(bag.warnings) == 1 and "'x': " in bag.warnings[0]
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "utf-16-be", "utf-32", "utf-32-le", "utf-32-be"])
+def test_every_unicode_is_read_with_a_byte_order_mark_or_without(encoding, tmp_path):
+    bag = read_csv(tmp_path, "time,größe", [f"{k},{k % 4}.5" for k in range(9)], encoding)
+    assert not bag.warnings and bag.columns_by_field["größe"].tolist() == [k % 4 + 0.5 for k in range(9)]
+
+
 def test_a_minus_that_is_no_hyphen_is_one(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,x\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(9)), encoding="utf-8")

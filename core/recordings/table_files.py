@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 import zipfile
@@ -41,6 +42,10 @@ _INSTANT = re.compile(
     r"\d{4}[-/]\d\d?[-/]\d\d?([T ]|$)|\d{1,2}:\d\d(:\d\d|$|\s*[AaPp])|\d{1,2}[./]\d{1,2}[./]\d{2,4}|"
     r"\d{1,2}-(\d{1,2}|[A-Za-z]{3})-\d{2,4}|\d{8}[T_ ]\d{6}"
 )
+_WIDE = {  # by which of a text's first four bytes are not 0
+    **dict.fromkeys((b"\1\1\0\0", b"\0\0\1\1"), "utf-32"), b"\1\0\0\0": "utf-32-le", b"\0\0\0\1": "utf-32-be",
+    b"\1\0\1\0": "utf-16-le", b"\0\1\0\1": "utf-16-be",
+}  # fmt: skip
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
@@ -91,15 +96,17 @@ class _Shape:
 def _read_csv(path: Path) -> RawTable:
     with open(path, "rb") as stream:
         head = stream.read(_LOOK)
-    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    encoding = _WIDE.get(bytes(map(bool, head[:4])), "utf-8-sig")
+    if encoding == "utf-8-sig" and head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        encoding = "utf-16"
     try:
         head[:-4].decode(encoding)
     except UnicodeDecodeError as error:
-        if encoding != "utf-16" and error.start < len(head) - 8:
+        if encoding == "utf-8-sig" and error.start < len(head) - 8:
             encoding = "cp1252"  # of Windows
-    if encoding != "utf-16" and b"\0" in head:
+    if "\0" in (start := head.decode(encoding, errors="replace")):
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
-    lines = re.split(r"\r\n|\r|\n", head.decode(encoding, errors="replace"))[:_LOOK_LINES]
+    lines = re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES]
     shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
     names = _unique(shape.names)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
