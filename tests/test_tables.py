@@ -164,6 +164,15 @@ def test_every_unicode_is_read_with_a_byte_order_mark_or_without(encoding, tmp_p
     assert not bag.warnings and bag.columns_by_field["größe"].tolist() == [k % 4 + 0.5 for k in range(9)]
 
 
+@pytest.mark.parametrize(("names", "start"), [("time,x", 0), ("", 0), ("time,rpm,x", 100)])
+def test_milliseconds_behind_a_comma_are_of_their_time(names, start, tmp_path):
+    """They were a signal, and the times whole seconds; a number of three digits remains one."""
+    rows = [f"2026-11-22 13:24:{k:02},{start + 37 * k:03},{k}.5" for k in range(9)]
+    bag = read_csv(tmp_path, names, rows)
+    assert len(bag.columns_by_field) == 1 + (start > 0) and not bag.warnings
+    assert np.diff(bag.times).tolist() == [10**9 if start else 1_037_000_000] * 8
+
+
 def test_a_minus_that_is_no_hyphen_is_one(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,x\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(9)), encoding="utf-8")

@@ -46,6 +46,7 @@ _WIDE = {  # by which of a text's first four bytes are not 0
     **dict.fromkeys((b"\1\1\0\0", b"\0\0\1\1"), "utf-32"), b"\1\0\0\0": "utf-32-le", b"\0\0\0\1": "utf-32-be",
     b"\1\0\1\0": "utf-16-le", b"\0\1\0\1": "utf-16-be",
 }  # fmt: skip
+_CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
@@ -85,12 +86,16 @@ def read_table(path: Path) -> RawTable:
 
 @dataclass(frozen=True)
 class _Shape:
-    """How a CSV file is laid out: its delimiter, the lines before the data, and the names of its columns."""
+    """How a CSV file is laid out: its delimiter, the lines before the data, and the names of its columns.
+
+    `cut_times`: whether its commas part milliseconds from their time as well.
+    """
 
     delimiter: str
     skip: int
     names: tuple[str, ...]
     units: tuple[str, ...] = ()
+    cut_times: bool = False
 
 
 def _read_csv(path: Path) -> RawTable:
@@ -106,8 +111,12 @@ def _read_csv(path: Path) -> RawTable:
             encoding = "cp1252"  # of Windows
     if "\0" in (start := head.decode(encoding, errors="replace")):
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
+    whole, decimals = start.rpartition("\n")[0], [match[2] for match in _CUT_TIME.finditer(start)]
+    cut_times = any(three.startswith("0") for three in decimals)  # which numbers do not
+    cut_times = cut_times and len(_CUT_TIME.findall(whole)) == len(re.findall(r"\d:\d\d:\d\d", whole))
+    start = _CUT_TIME.sub(r"\1.", start) if cut_times else start
     lines = re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES]
-    shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
+    shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), cut_times=cut_times)
     names = _unique(shape.names)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
     values = np.empty((0, 0))
@@ -130,7 +139,8 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
     with open(path, encoding=encoding, errors="replace", newline="") as text:
         for _ in range(shape.skip):
             text.readline()
-        reader = csv.reader(text, delimiter=shape.delimiter, skipinitialspace=True)
+        lines = (_CUT_TIME.sub(r"\1.", line) for line in text) if shape.cut_times else text
+        reader = csv.reader(lines, delimiter=shape.delimiter, skipinitialspace=True)
         before = 0
         try:
             for cells in reader:
