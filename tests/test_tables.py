@@ -173,6 +173,13 @@ def test_milliseconds_behind_a_comma_are_of_their_time(names, start, tmp_path):
     assert np.diff(bag.times).tolist() == [10**9 if start else 1_037_000_000] * 8
 
 
+def test_columns_of_text_are_named(tmp_path, cli):
+    """They were not on the list of columns, which said nothing of them."""
+    bag = read_csv(tmp_path, "time,mode,x,state", [f"{k},{'am'[k % 2]},{k}.5,ok" for k in range(9)])
+    said = cli("topics", bag.path).out
+    assert "/table: text or instants, which are no signals: mode, state\n/table: x\n" in said
+
+
 def test_a_minus_that_is_no_hyphen_is_one(tmp_path):
     path = tmp_path / "a.csv"
     path.write_text("time,x\n" + "".join(f"{k},\u2212{k}.5\n" for k in range(9)), encoding="utf-8")

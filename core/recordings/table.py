@@ -126,7 +126,9 @@ class Table(Recording):
             say = "say so in the signals file, `table: {runs: COLUMN}`, or write a file for each"
             self._warnings.append(f"{path}: the rows are of {of} by turns: if they are units, {say}")
         kind = file.suffix[1:].lower()
-        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, reason, first, last)}
+        others = [name for name, column in self.columns_by_field.items() if column.dtype.kind in "OM"]
+        words = reason or f"text or instants, which are no signals: {', '.join(others)}" * bool(others)
+        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, words, first, last)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""
