@@ -173,6 +173,16 @@ def test_milliseconds_behind_a_comma_are_of_their_time(names, start, tmp_path):
     assert np.diff(bag.times).tolist() == [10**9 if start else 1_037_000_000] * 8
 
 
+@pytest.mark.parametrize("zone", ["", "+02:00"])
+def test_the_hour_that_comes_twice_is_told(zone, tmp_path):
+    times = [datetime(2026, 10, 25, 2, 0) + timedelta(minutes=k - 60 * (k >= 60)) for k in range(180)]
+    zones = [zone if k < 60 else zone.replace("2", "1") for k in range(180)]
+    bag = read_csv(
+        tmp_path, "time,x", [f"{t.isoformat()}{z},{k % 7}" for k, (t, z) in enumerate(zip(times, zones, strict=True))]
+    )
+    assert [" goes back by an hour" in warning for warning in bag.warnings] == [True] * (not zone)
+
+
 def test_columns_of_text_are_named(tmp_path, cli):
     """They were not on the list of columns, which said nothing of them."""
     bag = read_csv(tmp_path, "time,mode,x,state", [f"{k},{'am'[k % 2]},{k}.5,ok" for k in range(9)])

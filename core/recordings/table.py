@@ -51,6 +51,7 @@ _QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*([^\d\s]\S{0,7})")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
+_HOUR = 3_600 * 10**9  # ns
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
@@ -91,6 +92,9 @@ class Table(Recording):
         elif (older := np.count_nonzero(steps < 0)) > 0.1 * len(kept):
             remedy = f"sort the rows by '{time}', or name a column of runs in a signals file, `table: {{runs: COLUMN}}`"
             self._warnings.append(f"{path}: {older} of {len(kept)} rows are older than the row before: {remedy}")
+        elif older and raw.columns[time].dtype.kind in "OM" and (abs(steps + _HOUR) <= 2 * np.median(steps)).any():
+            autumn = "its time goes back by an hour, as at the end of summer time, and a new segment begins there"
+            self._warnings.append(f"{path}: {autumn}; write times in UTC, or with their zone")
         names = [name for name in raw.columns if name not in apart]
         for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
             cells = [str(cell).strip() for cell in raw.columns[name] if cell][:100]
