@@ -839,7 +839,9 @@ def test_cells_of_several_numbers_are_told(tmp_path):
     )
     said, of_unit = bag.warnings
     assert "column 'raw' left out" in said and "number alone, such as '1.00,2.54,590': write one in each" in said
-    assert "column 'inlet' left out, as no cell is a number alone, such as '20.5 °C'" in of_unit
+    assert "column 'inlet' left out, as most cells are no number alone, such as '20.5 °C'" in of_unit
+    bag = read_csv(tmp_path, "time,x", [f'{k},"{1000 + k:,}"' if k > 200 else f"{k},{k}" for k in range(500)])
+    assert "column 'x' left out" in bag.warnings[0] and "such as '1,2" in bag.warnings[0]
 
 
 def test_a_table_in_which_nothing_is_a_state_is_refused_with_what_was_left_out(tmp_path):

@@ -97,10 +97,13 @@ class Table(Recording):
             self._warnings.append(f"{path}: {autumn}; write times in UTC, or with their zone")
         names = [name for name in raw.columns if name not in apart]
         for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
-            cells = [str(cell).strip() for cell in raw.columns[name] if cell][:100]
+            cells = [str(cell).strip() for cell in raw.columns[name] if cell]
+            cells = cells[:: len(cells) // 100 + 1]
             units = {found and found[1] for found in map(_QUANTITY.fullmatch, cells)}
-            if cells and (_PACKED.fullmatch(cells[0]) or len(units) == 1 < len(set(cells)) and None not in units):
-                unread = f"column '{name}' left out, as no cell is a number alone, such as '{cells[0][:40]}'"
+            packed = list(filter(_PACKED.fullmatch, cells))
+            odd = cells if len(units) == 1 < len(set(cells)) and None not in units else packed
+            if 2 * len(odd) > len(cells):
+                unread = f"column '{name}' left out, as most cells are no number alone, such as '{odd[0][:40]}'"
                 self._warnings.append(f"{file}: {unread}: write one in each, without unit or separator of thousands")
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
             number, unit = _for_each_time(times[kept], {name: raw.columns[name][kept] for name in names})
