@@ -183,6 +183,15 @@ def test_the_hour_that_comes_twice_is_told(zone, tmp_path):
     assert [" goes back by an hour" in warning for warning in bag.warnings] == [True] * (not zone)
 
 
+def test_a_clock_in_three_columns_is_the_time(tmp_path):
+    """Such a table had no time, and so was refused."""
+    times = [datetime(2026, 11, 22, 23, 58) + timedelta(seconds=5 * k) for k in range(60)]
+    rows = [f"{t.hour},{t.minute},{t.second},{t.second % 7}.5" for t in times]
+    bag = read_csv(tmp_path, "H,MIN,SEC,x", [*rows[:9], "0,77,0,1.5", *rows[9:]])
+    assert list(bag.columns_by_field) == ["x"] and np.diff(bag.times).tolist() == [5 * 10**9] * 59
+    assert "column 'H:MIN:SEC [s]': it is put together" in bag.warnings[0] and "1 row without a time" in bag.warnings[1]
+
+
 def test_columns_of_text_are_named(tmp_path, cli):
     """They were not on the list of columns, which said nothing of them."""
     bag = read_csv(tmp_path, "time,mode,x,state", [f"{k},{'am'[k % 2]},{k}.5,ok" for k in range(9)])
@@ -948,9 +957,9 @@ def test_the_name_of_a_text_file_with_numbers_does_not_matter(suffix, tmp_path):
 
 
 def test_seconds_of_a_minute_are_no_time(tmp_path):
-    """Of a clock in three columns they alone were the time."""
+    """Of a clock in several columns they alone were the time."""
     rows = [f"{9 + k // 3600},{k // 60 % 60},{k % 60},{k % 7}" for k in range(0, 900, 2)]
-    refuses(BagError, "no column is called time", read_csv, tmp_path, "H,MIN,SEC,x", rows)
+    refuses(BagError, "no column is called time", read_csv, tmp_path, "AREA,MIN,SEC,x", rows)
     assert not read_csv(tmp_path, "SEC,x", (f"{0.1 * k:.1f},{k % 7}" for k in range(60))).warnings
 
 
