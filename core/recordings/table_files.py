@@ -37,7 +37,9 @@ _MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|nan$", re.IGNORECASE)
 _WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
-_GROUPED = re.compile(r"[+-]?\d{1,3}(?P<by>[,. '’\u00a0\u202f])\d{3}(?:(?P=by)\d{3})*(?P<rest>(?!(?P=by))[.,]\d*)?$")
+_GROUPED = re.compile(
+    r"[+-]?[1-9]\d{0,2}(?P<by>[,. '’\u00a0\u202f])\d{3}(?:(?P=by)\d{3})*(?P<rest>(?!(?P=by))[.,]\d*)?$"
+)
 _INSTANT = re.compile(
     r"\d{4}[-/]\d\d?[-/]\d\d?([T ]|$)|\d{1,2}:\d\d(:\d\d|$|\s*[AaPp])|\d{1,2}[./]\d{1,2}[./]\d{2,4}|"
     r"\d{1,2}-(\d{1,2}|[A-Za-z]{3})-\d{2,4}|\d{8}[T_ ]\d{6}"
@@ -236,11 +238,12 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
 
 def _thousands(cells: Sequence[str]) -> str:
     """What parts thousands in a column, if cells tell (`1,234.5`, `1 234`, `1.234.567`) and none denies; else ""."""
-    points = any("." in cell and _NUMBER.match(cell) for cell in cells)
+    alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)]
+    other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
     found = {
         m["by"]
         for m in map(_GROUPED.match, cells)
-        if m and (m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or (points and m["by"] == ","))
+        if m and (m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or m["by"] in other)
     }
     by = found.pop() if len(found) == 1 else ""
     return by if all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
