@@ -238,15 +238,14 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
 
 def _thousands(cells: Sequence[str]) -> str:
     """What parts thousands in a column, if cells tell (`1,234.5`, `1 234`, `1.234.567`) and none denies; else ""."""
-    alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)]
+    grouped = [m for m in map(_GROUPED.match, cells) if m]
+    alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)] if grouped else []
     other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
     found = {
-        m["by"]
-        for m in map(_GROUPED.match, cells)
-        if m and (m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or m["by"] in other)
+        m["by"] for m in grouped if m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or m["by"] in other
     }
     by = found.pop() if len(found) == 1 else ""
-    return by if all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
+    return by if by and all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
 
 
 def left_out(odd: int, what: str, first: str) -> str:
