@@ -127,8 +127,8 @@ class Bag(Recording):
     ) -> Columns:
         """Numbers at some paths of each topic, read block by block; messages that cannot be decoded are left out."""
         while True:
-            counts = {name: self.topics[name].count for name in topics}
-            reader = ColumnReader(self.described(topics), counts, paths)
+            parts = self.described(topics)  # which an index may have named wrongly
+            reader = ColumnReader(parts, {name: self.topics[name].count for name in topics}, paths)
             try:
                 columns = reader.run(progress)
             except IndexMismatchError:

@@ -137,8 +137,7 @@ class _Scanner:
             odd = count(self.odd_records, "record")
             self._warn(f"{odd} that cannot be read left out; the recorder or the disk damaged the file")
         if self.late:
-            why = "whose log time is past the year 2262 left out; the recorder's clock was wrong"
-            self._warn(f"{count(self.late, 'message')} {why}")
+            self._warn(f"{count(self.late, 'message')} past the year 2262 left out; the recorder's clock was wrong")
         if lost:
             self._warn(f"{count(lost, 'message')} of channels that are nowhere described left out")
         stated = self.summary.statistics.message_count if self.summary.statistics else 0

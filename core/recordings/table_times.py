@@ -185,8 +185,7 @@ def _of_parts(table: RawTable) -> str:
     good = ((clock >= 0) & (clock < [[24], [60], [60]])).all(axis=0)
     if good.mean() < 1 - ODD_SHARE:
         return ""
-    seconds = np.array([3600.0, 60.0, 1.0]) @ clock
-    seconds[~good] = np.nan
+    seconds = np.where(good, [3600.0, 60.0, 1.0] @ clock, np.nan)
     seconds[good] += 86_400 * np.cumsum(np.diff(seconds[good], prepend=0.0) < -43_200)
     called = f"{':'.join(name for (name,) in parts)} [s]"
     rest = {name: column for name, column in table.columns.items() if [name] not in parts}
