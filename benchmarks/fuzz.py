@@ -244,8 +244,7 @@ def compare_with_copy(path: Path) -> None:
     if not copy.exists():
         return
     bag, copied = Bag(path), Bag(copy)
-    in_time = [name for name, info in bag.topics.items() if info.last is None or info.last < 2**63]
-    one, other = ([(m.topic, m.log_time_ns, m.data) for m in b.raw_messages(in_time)] for b in (bag, copied))
+    one, other = ([(m.topic, m.log_time_ns, m.data) for m in b.raw_messages(bag.topics)] for b in (bag, copied))
     if sorted(one) != sorted(other):
         raise WrongError(f"{len(one)} messages were read, and the copy has {len(other)}, or others")
     with open(copy, "rb") as stream:

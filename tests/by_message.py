@@ -13,7 +13,6 @@ from array import array
 
 import numpy as np
 
-from uncertain_lti.recordings.bag_arrays import in_reach
 from uncertain_lti.recordings.message_reader import header_stamp_ns
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.reading import Stream, check_paths, refuse_absent
@@ -31,7 +30,6 @@ def read_stream_by_message(bag: Recording, signals: SignalMap) -> Stream:
         if all(path.absent(message).startswith("there is no '") for path in paths[where]):
             continue  # of another publisher
         order.append(where)
-        in_reach(bag.path, log_time)
         arrival.append(log_time)
         stamp.append(header_stamp_ns(message) or -1)
         values[where].extend([path.read(message) for path in paths[where]])

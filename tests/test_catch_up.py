@@ -120,6 +120,14 @@ def test_what_was_put_in_order_is_counted_and_told(engine: tuple[UncertainLTI, B
     assert "up to 0.599 s late" in session.caught_up and f"{session.reordered} messages" in session.caught_up
 
 
+def test_the_reason_while_messages_wait(engine: tuple[UncertainLTI, Bag]) -> None:
+    """It said that no sample could be judged, of which none had been taken."""
+    session, late = session_of(engine[0], Rule()), 2.0
+    for _, topic, log_time, data, sent_ns in sent(engine[1])[:40]:
+        session.accept(topic, log_time, data, late, sent_ns, late)
+    assert session.reason(late, 1.0) == "no verdict for more than 1 s: messages wait to be put in order"
+
+
 def test_the_numbers_of_the_rule_are_not_called_as_the_counts_are(engine: tuple[UncertainLTI, Bag]) -> None:
     """`violations` of a state in /diagnostics is a count, beside which `violations: 1` of the monitor read as one."""
     counts = session_of(engine[0], Rule(violations=2, window=5)).counts(0.0)

@@ -125,6 +125,8 @@ def test_control_lost_in_the_noise_is_named():
     (message,) = [m for m in messages(run(u=u, noise=1e-2)) if WORDS["weak"] in m]
     assert "'pump'" in message and "its standard error" in message
     assert not any(WORDS["weak"] in m for m in messages(run(u=u, noise=0.0, count=1500, seed=4)) if "'valve'" in m)
+    (message,) = [m for m in messages(run(u=u * [1e-5, 1.0], noise=1e-2)) if WORDS["weak"] in m]
+    assert "each of the controls 'valve', 'pump' moves too little" in message  # one note, however many
 
 
 @pytest.mark.parametrize("field", ["v", "lag(u, 1)"])
@@ -140,7 +142,8 @@ def test_a_control_that_acts_a_sample_later_is_not_called_weak_beside_that_sampl
 def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
     K = np.array([[2.0, 0.3], [0.1, 1.5]])
     found = messages(run(feedback=K, noise=0.0, u=np.zeros((1501, 2))))
-    assert sum(WORDS["feedback"] in m for m in found) == 2
+    (message,) = [m for m in found if WORDS["feedback"] in m]  # one note, however many
+    assert "the changes of each of the controls 'valve', 'pump' follow" in message
     own = 5 * steps(np.random.default_rng(6), 1501, held=6)
     topped = run(feedback=0.2 * np.eye(2), u=own, noise=0.0)  # steps of its own on top
     for healthy in (run(5, noise=0.0), topped, run(5, noise=0.0, at="both")):

@@ -314,7 +314,9 @@ def test_the_reason_names_what_is_expected_and_what_was_heard_where_no_message_n
     there = f"{STATE}: there is no 'a' in the message's names; names there: c, d"
     assert rig.session.reason(rig.now, TIMEOUT).startswith("no verdict for more than 1 s: nothing received on")
     rig.take(CONTROL, vector(rig.t_ns, 0.0, 0.0))
-    assert rig.session.reason(rig.now, TIMEOUT) == f"no verdict for more than 1 s: {there}"
+    assert rig.session.reason(rig.now, TIMEOUT) == (
+        f"no verdict for more than 1 s: a, b missing, stale or not finite; {there}"
+    )
     rig.send(20)
     rig.wait(2.0)
     silent = f"no verdict for more than 1 s: no message on {STATE}"

@@ -77,7 +77,7 @@ def test_what_a_process_refuses_is_one_error_here(tmp_path: Path) -> None:
         with pytest.raises(SignalError, match="run_a.mcap: there is no 'arm' in the message's names"):
             read_transients(paths, named, processes=process)
     late = save(tmp_path, {"/x": JOINT_STATE}, [("/x", 2**63 + 5, joint_state(1, [1.0]))], "late.mcap")
-    with pytest.raises(BagError, match="late.mcap: a message has a log time of 9223372036854775813 ns"):
+    with pytest.raises(BagError, match="late.mcap: no message can be read .1 message.* past the year 2262 left out"):
         read_transients([paths[0], late], SignalMap((Signal("x", "/x", "position[0]"),)), processes=2)
 
 

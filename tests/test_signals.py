@@ -236,6 +236,7 @@ def test_paths_by_the_grammar_lead_where_they_say(case: tuple[str, Any, float]) 
     assert FieldPath(text).read(message) == value
     assert FieldPath(f"  {text} ").read(message) == value
     assert FieldPath(f"unwrap({text})").read(message) == value
+    assert FieldPath(f"lag(unwrap({text}, 6.5), 2)").angle == FieldPath(f"unwrap( {text} )").angle == text
     assert FieldPath(text) == FieldPath(text) and hash(FieldPath(text)) == hash(FieldPath(text))
     assert FieldPath(text).absent(message) == ""
 

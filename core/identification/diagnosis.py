@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -233,15 +234,25 @@ def _weak(
     problem: Problem, sums: Moments, signals: Sequence[Signal], past: Collection[int], lacking: Collection[int]
 ) -> list[str]:
     """Controls whose effect is lost in the noise, unless another sample of the same field has it."""
-    found = lost(problem, sums, past)
-    seen = {(s.topic, s.inner) for j, s in enumerate(signals) if j >= problem.n and j not in found}
+    every, names = lost(problem, sums, past), [s.name for s in signals]
+    seen = {(s.topic, s.inner) for j, s in enumerate(signals) if j >= problem.n and j not in every}
+    found = {
+        j: effect
+        for j, effect in every.items()
+        if effect[0] not in lacking and (signals[j].topic, signals[j].inner) not in seen
+    }
+    state, certainty = max(found.values(), key=itemgetter(1), default=(0, 0.0))
+    larger = max(2.0, DETERMINED / max(0.4, min((least for _, least in found.values()), default=1.0)))
     return [
-        f"control '{signals[j].name}' moves too little to be distinguished from the noise: its strongest effect, on "
-        f"'{signals[state].name}', is {certainty:.2g} times its standard error; record it with larger or more steps "
-        f"({max(2.0, DETERMINED / max(certainty, 0.4)):.2g} times the amplitude), or leave it out"
-        for j, (state, certainty) in found.items()
-        if state not in lacking and (signals[j].topic, signals[j].inner) not in seen
-    ]
+        f"{_controls(found, names)} moves too little to be distinguished from the noise: the strongest effect, on "
+        f"'{names[state]}', is {certainty:.2g} times its standard error; record it with larger or more steps "
+        f"({larger:.2g} times the amplitude), or leave it out"
+    ] * bool(found)
+
+
+def _controls(found: Collection[int], names: Sequence[str]) -> str:
+    """One control, or each of several."""
+    return ("each of the controls " if len(found) > 1 else "control ") + ", ".join(f"'{names[j]}'" for j in found)
 
 
 def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], later: Sequence[int]) -> list[str]:
@@ -257,7 +268,7 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], lat
     n = problem.n
     basis = np.column_stack([now[:, :n], np.delete(before, later, axis=1), np.ones(len(before))])
     gram = basis.T @ basis
-    messages = []
+    found = {}
     for j in [j for j in range(n, problem.p) if j not in past and j not in later]:
         change = now[:, j] - before[:, j]
         change = change - change.mean()
@@ -265,14 +276,14 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], lat
         if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
             continue
         left, _ = unexplained(gram, (basis.T @ change)[:, None], np.array([size]))
-        explained = 1.0 - float(left[0]) / size
-        if explained > FED_BACK:
-            messages.append(
-                f"the changes of control '{names[j]}' follow from the states to {explained:.0%}: a feedback sets it, "
-                f"so the nominal matrices may mix it with the plant (the bounds hold for the same feedback only); "
-                f"record it with steps of its own"
-            )
-    return messages
+        if (explained := 1.0 - float(left[0]) / size) > FED_BACK:
+            found[j] = explained
+    least = min(found.values(), default=0.0)
+    return [
+        f"the changes of {_controls(found, names)} follow from the states to {least:.0%}: a feedback sets it, "
+        f"so the nominal matrices may mix it with the plant (the bounds hold for the same feedback only); "
+        f"record it with steps of its own"
+    ] * bool(found)
 
 
 def _coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[str]:
@@ -396,7 +407,7 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
         even = period * len(instants) > 0.5 * problem.N  # a coarse sensor is new often for a while, and then not at all
         if period >= 2 and even and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
             alone = len({other.topic for other in signals}) == 1
-            remedy = f"{'' if alone else 'make its topic the clock, or '}leave it out"
+            remedy = "leave it out" if alone else "make its topic the clock, or leave it out"
             remedy = "take `judged: true` away" if signal.judged else remedy
             messages.append(
                 f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
@@ -449,11 +460,8 @@ def _missing(problem: Problem, signals: Sequence[Signal]) -> dict[int, str]:
         if known is None or not known.follows(i):
             continue
         one, two = known.correlation[i].tolist()
-        entry = (
-            f"{{name: {signal.name}_before, topic: {signal.topic}, field: '{Memory('lag').of(signal.field)}'}}"
-            if signal.topic
-            else "the same column, one row later"
-        )
+        entry = f"{{name: {signal.name}_before, topic: {signal.topic}, field: '{Memory('lag').of(signal.field)}'}}"
+        entry = entry if signal.topic else "the same column, one row later"
         messages[i] = (
             f"what one step leaves unexplained of '{signal.name}' is correlated from sample to sample "
             f"(autocorrelation {one:.2f} at one sample, {two:.2f} at two): a state that moves it is not among the "
@@ -468,9 +476,8 @@ def _stretches(problem: Problem) -> Problem:
     if problem.N <= LOOKED_AT:
         return problem
     starts = np.linspace(0, problem.N - LOOKED_AT // STRETCHES, STRETCHES).astype(np.intp)
-    return replace(
-        problem.subset(np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES))), weights=np.ones(problem.n)
-    )
+    part = np.unique(starts[:, None] + np.arange(LOOKED_AT // STRETCHES))
+    return replace(problem.subset(part), weights=np.ones(problem.n))
 
 
 def _carried(

@@ -65,6 +65,7 @@ class Session(Stream):
         super().__init__(model, *args, **kwargs)
         self.days = Days(model)
         self._steady: dict[str, tuple[float, float, int]] = {}  # of topics: heard, longest pause before, pauses
+        self._at_verdict = Counter(self.sampler.counters), Counter(self.unreadable)
 
     def report(self, now: float, state_timeout: float, problems: Sequence[str] = ()) -> list[Report]:
         """Statuses of the monitor and of each state since the last call."""
@@ -76,7 +77,7 @@ class Session(Stream):
         return [monitor, *(self._report_state(i, period, self.without_verdict(now), state_timeout) for i in states)]
 
     def _report_monitor(self, period: Period, now: float, timeout: float, problems: Sequence[str]) -> Report:
-        without, never = self.without_verdict(now), [topic for topic in self.types if self.heard(topic) is None]
+        without, never = self.without_verdict(now), self._unheard()
         complaints, calm = list(problems), list[str]()
         lacking = self.lacking(period.counters)
         came_late = self.came_late(period.counters)
@@ -129,8 +130,7 @@ class Session(Stream):
                 complaints += [why for why in self.absent(self.model.signals) if why not in complaints]
             else:
                 complaints.insert(0, f"no verdict for {without:.1f} s" if self.verdicts else "no verdict yet")
-            if never:
-                complaints.insert(1, f"nothing ever received on {', '.join(never)}")
+            complaints[1:1] = never
         elif period.alarm:
             level = ERROR
             if self.monitor.alarm or not self.latched:
@@ -146,14 +146,42 @@ class Session(Stream):
     def reason(self, now: float, timeout: float) -> str:
         """What holds the alarm, or why there is no verdict, as published on ~/reason."""
         text = self.reasons.text
-        if self.without_verdict(now) <= timeout or "no verdict:" in text:
+        if self.judging(now, timeout) or self.without_verdict(now) <= timeout or "no verdict:" in text:
             return text
-        silent = [f"no message on {self.sampler.clock}"] if self.silent_for(now) > timeout else []
-        why = "; ".join([*silent, *self.absent(self.model.signals)]) or "no sample could be judged"
-        if never := [topic for topic in self.types if self.heard(topic) is None]:
-            why = f"nothing received on {', '.join(never)}"
-        said = f"no verdict for more than {timeout:g} s: {why}"
+        said = f"no verdict for more than {timeout:g} s: {self.why_none(now, timeout) or 'no sample could be judged'}"
         return f"{text}; {said}" if self.alarm else said
+
+    def judging(self, now: float, timeout: float) -> bool:
+        """Whether verdicts come; what `why_none` has is counted from the last time that they did."""
+        if judging := bool(self.verdicts) and self.without_verdict(now) <= timeout:
+            self._at_verdict = Counter(self.sampler.counters), Counter(self.unreadable)
+        return judging
+
+    def why_none(self, now: float, timeout: float) -> str:
+        """Why there are no verdicts, without numbers that change from one call to the next; or nothing."""
+        counters, unreadable = self._at_verdict
+        found, clock = self._unheard(), self.sampler.clock
+        if self.heard(clock) is not None and self.silent_for(now) > timeout / 2:
+            return "; ".join([f"no message on {clock}", *found, *self.absent(self.model.signals)])
+        since = self.sampler.counters - counters
+        if lacking := self.lacking(counters):
+            found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")
+            found += self.absent(lacking)
+        counted = {Status.GAP: "gaps", Status.RESET: "resets"}
+        kinds = Status.GAP, Status.RESET, Status.STEP, Status.MODE, Status.FROZEN
+        found += [why_not(kind, self.model) for kind in kinds if since[counted.get(kind, kind.value)]]
+        dropped = [status.value for status in Status if status.dropped and since[status.value]]
+        if dropped:
+            coarse = self.coarse_clock(since[Status.EQUAL.value])
+            found.append(f"messages on {clock} are dropped ({', '.join(dropped)}){coarse}")
+        found += [f"{topic}: a message {self.why_unreadable[topic]}" for topic in sorted(self.unreadable - unreadable)]
+        found = found or self.absent(self.model.signals)
+        return "; ".join(found or ["messages wait to be put in order"] * (self._catches_up is not None))
+
+    def _unheard(self) -> list[str]:
+        """Topics of which nothing has come since the start, in words."""
+        never = [topic for topic in self.types if self.heard(topic) is None]
+        return [f"nothing received on {', '.join(never)}"] * bool(never)
 
     def ceased(self, now: float, timeout: float) -> dict[str, str]:
         """Topics that came steadily and do no more, while their last values count for ever, and what is said of them.
@@ -336,7 +364,6 @@ class EventLog:
         """A session starts, with no sample."""
         self._alarm = self._named = session.alarm  # the latter: whether the start of this alarm was logged
         self._latest, self._unnamed = "", 0  # of alarms whose start was not: the line of the last one, their number
-        self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
         self._lasted, self._judged = 0.0, False
         self._cause = ("", now)  # why there are no verdicts, and since when
         self._matters = defaultdict[str, _Matter](_Matter, arming=_Matter(True))
@@ -437,45 +464,22 @@ class EventLog:
     def _look_at_verdicts(self, session: Session, now: float, timeout: float) -> None:
         without = session.without_verdict(now)
         matter = self._matters["verdicts"]
-        if session.verdicts and without <= timeout:
+        if session.judging(now, timeout):
             if matter.becomes("", now):
                 masked = f"; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else ""
                 first = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}{masked}"
                 again = f"judging again, after {self._lasted:.1f} s without a verdict"
                 self._log(OK, again if self._judged else first)
                 self._judged = True
-            self._counters, self._unreadable = Counter(session.sampler.counters), Counter(session.unreadable)
         elif without > timeout:
             self._lasted = without
-            why = self._why(session, now, timeout) or matter.logged or "no two samples have come one after the other"
+            why = session.why_none(now, timeout) or matter.logged or "no two samples have come one after the other"
             if why != self._cause[0]:
                 self._cause = (why, now)
             # another cause than the one logged may be that of the moment in which messages arrive again
             lasting = not matter.logged or now - self._cause[1] >= timeout
             if lasting and matter.becomes(why, now):
                 self._log(OK, f"no verdict {f'for {without:.1f} s' if session.verdicts else 'yet'}: {why}")
-
-    def _why(self, session: Session, now: float, timeout: float) -> str:
-        """Why there are no verdicts, without numbers that change from one call to the next; or nothing."""
-        never = [topic for topic in session.types if session.heard(topic) is None]
-        found = [f"nothing received on {', '.join(never)}"] if never else []
-        clock = session.sampler.clock
-        if clock not in never and session.silent_for(now) > timeout / 2:
-            return "; ".join([f"no message on {clock}", *found, *session.absent(session.model.signals)])
-        since = session.sampler.counters - self._counters
-        if lacking := session.lacking(self._counters):
-            found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")
-            found += session.absent(lacking)
-        counted = {Status.GAP: "gaps", Status.RESET: "resets"}
-        kinds = Status.GAP, Status.RESET, Status.STEP, Status.MODE, Status.FROZEN
-        found += [why_not(kind, session.model) for kind in kinds if since[counted.get(kind, kind.value)]]
-        dropped = [status.value for status in Status if status.dropped and since[status.value]]
-        if dropped:
-            coarse = session.coarse_clock(since[Status.EQUAL.value])
-            found.append(f"messages on {clock} are dropped ({', '.join(dropped)}){coarse}")
-        unreadable = session.unreadable - self._unreadable
-        found += [f"{topic}: a message {session.why_unreadable[topic]}" for topic in sorted(unreadable)]
-        return "; ".join(found)
 
 
 def _digits(value: float, by: float) -> int:

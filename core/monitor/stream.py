@@ -138,7 +138,7 @@ class Stream:
     _judged: cython.double
     _came: cython.double
     _quiet: cython.Py_ssize_t  # verdicts without an alarm since the last one with
-    _catches_up: Any
+    _catches_up: Any = cython.declare(object, visibility="readonly")
     _reads_condition: Any
 
     def __init__(

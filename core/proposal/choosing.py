@@ -40,6 +40,7 @@ from uncertain_lti.proposal.candidates import (
 from uncertain_lti.proposal.signals_file import set_own_scale, words_of
 from uncertain_lti.recordings.table import TOPIC, TYPE
 from uncertain_lti.recordings.table_times import field_name
+from uncertain_lti.signals.field_path import FieldPath
 
 SHORT_DELAY = 3
 """Samples within which a control shows that keeps a state from being noise."""
@@ -502,8 +503,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         source.reason = ""
     for candidate in free:
         set_own_scale(candidate)
-        name = field_name(re.sub(r"^unwrap\((.*?)(, \d+)?\)$", r"\1", candidate.path))
-        candidate.name, candidate.scale = name, candidate.scale or 1.0
+        candidate.name, candidate.scale = field_name(FieldPath(candidate.path).angle), candidate.scale or 1.0
         candidate.steady = 0.0  # what returns to its median would alarm on every change of load
     return states, [c for c in free if c in controls]
 

@@ -68,8 +68,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     if candidate.element:
         words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
         return [*words, *words_of(candidate.kind)] if several_kinds else words
-    inner = re.sub(rf"^(unwrap\()?({OF_QUATERNION})\(.*", r"\2", candidate.path)
-    inner = re.sub(rf"^(unwrap|{'|'.join(FUNCTIONS)})\(|(, \d+)?\)+$", "", inner)
+    inner = re.sub(rf"^({OF_QUATERNION})\(.*", r"\1", FieldPath(candidate.path).angle)
+    inner = re.sub(rf"^({'|'.join(FUNCTIONS)})\(|\)$", "", inner)
     words = [w for w in words_of(inner) if w not in _DULL]
     if all(len(w) == 1 or w.isdigit() for w in words):
         of_table = candidate.kind if "[" in candidate.path else ""  # whose topic says nothing

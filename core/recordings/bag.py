@@ -22,9 +22,9 @@ from typing import Any
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import natural
 from uncertain_lti.base.text import shortlist
-from uncertain_lti.recordings.bag_arrays import ColumnReader, IndexMismatchError, in_reach
+from uncertain_lti.recordings.bag_arrays import ColumnReader, IndexMismatchError
 from uncertain_lti.recordings.bag_files import listed_parts, not_one_recording, parts_of, stem_and_index, survey
-from uncertain_lti.recordings.mcap_records import LATEST, Block, Contents, count, messages
+from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages
 from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, undefined
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo, topic_facts
 from uncertain_lti.recordings.unreadable import changed, os_error
@@ -80,7 +80,6 @@ class Bag(Recording):
             remedy = "" if "`" in why else "; record or copy it again"
             raise BagError(f"{self.path}: no message can be read ({why}){remedy}")
         self._channels = [_channels(part) for part in self._contents]
-        self._too_late: dict[str, int] = {}  # topics with log times that cannot be kept -> the last one
         self.topics = self._topics()
 
     def walk(self) -> None:
@@ -128,8 +127,8 @@ class Bag(Recording):
     ) -> Columns:
         """Numbers at some paths of each topic, read block by block; messages that cannot be decoded are left out."""
         while True:
-            counts = {name: self.topics[name].count for name in topics}
-            reader = ColumnReader(self.path, self.described(topics), counts, paths)
+            parts = self.described(topics)  # which an index may have named wrongly
+            reader = ColumnReader(parts, {name: self.topics[name].count for name in topics}, paths)
             try:
                 columns = reader.run(progress)
             except IndexMismatchError:
@@ -142,7 +141,7 @@ class Bag(Recording):
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Facts about every topic; reads the recording once, and decodes one message of each topic."""
-        messages: Iterable[Any] = self.raw_messages(topic for topic in self.topics if topic not in self._too_late)
+        messages: Iterable[Any] = self.raw_messages()
         if progress is not None:
             messages = progress(messages, sum(info.count for info in self.topics.values()))
         facts = topic_facts(self.topics, messages)
@@ -216,19 +215,13 @@ class Bag(Recording):
         self._warnings += [f"{self.path}: {topic}: {note}" for note in sorted(notes) if note]
         first = min((tally.first for tally in tallies[chosen]), default=None)
         last = max((tally.last for tally in tallies[chosen]), default=None)
-        readable = not chosen[2]
-        if last is not None and last > LATEST:
-            self._too_late[topic] = last
-            readable, reason = False, f"a message has a log time of {last} ns, which is past the year 2262"
-        return TopicInfo(topic, type_name, counts[chosen], encoding, readable, reason, first, last)
+        return TopicInfo(topic, type_name, counts[chosen], encoding, not chosen[2], reason, first, last)
 
     def _require(self, topic: str, readable: bool = True) -> None:
         info = self.topics.get(topic)
         if info is None:
             there = shortlist(list(self.topics), _MOST_NAMES) or "none"
             raise BagError(f"{self.path}: there is no topic {topic}; topics there: {there}")
-        if topic in self._too_late:
-            in_reach(self.path, self._too_late[topic])
         if readable and not info.readable:
             raise BagError(f"{self.path}: topic {topic} cannot be decoded: {info.reason}; choose another topic")
 

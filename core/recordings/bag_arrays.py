@@ -15,7 +15,6 @@ import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -25,7 +24,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.mcap_records import CHUNK, LATEST, RECORD, Block, Contents, crc32, inflate, parse
+from uncertain_lti.recordings.mcap_records import CHUNK, RECORD, Block, Contents, crc32, inflate, parse
 from uncertain_lti.recordings.mcap_scan import most_records
 from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan, header_stamp_ns
@@ -75,28 +74,20 @@ class FieldReader:
         return failures
 
 
-def in_reach(path: Path, log_time: int) -> None:
-    """Check that a log time can be kept as a 64-bit integer."""
-    if log_time > LATEST:
-        late = f"a message has a log time of {log_time} ns, which is past the year 2262"
-        raise BagError(f"{path}: {late}; the recorder's clock was wrong, so record again")
-
-
 class ColumnReader:
     """Reads some paths of each topic of a recording.
 
-    `path`: of the recording; `parts`: its files, and the channels of each that count; `counts`: messages by topic;
+    `parts`: files of the recording, and the channels of each that count; `counts`: messages by topic;
     `paths`: of each topic; `undecoded`: topic -> how many messages are left out, and why one of them.
     """
 
     def __init__(
         self,
-        path: Path,
         parts: Sequence[tuple[Contents, dict[int, RecordedChannel]]],
         counts: Mapping[str, int],
         paths: Sequence[Sequence[FieldPath]],
     ) -> None:
-        self.path, self.parts, self.topics, self.paths = path, parts, list(counts), paths
+        self.parts, self.topics, self.paths = parts, list(counts), paths
         self.total = sum(counts.values())
         self.readers: dict[tuple[int, Definition], FieldReader] = {}
         self.undecoded: dict[str, tuple[int, str]] = {}
@@ -151,8 +142,6 @@ class ColumnReader:
             self.filled_of[where] = end = begin + int(kept[rows].sum())
             self.values[where][begin:end] = values[kept[rows]]
         log_time = batch.log_time[kept]
-        if len(log_time):
-            in_reach(self.path, int(log_time.max()))
         to = slice(self.filled, self.filled + len(log_time))
         self.topic[to], self.arrival[to], self.stamp[to] = topic[kept], log_time, stamp[kept]
         self.filled += len(log_time)
@@ -266,7 +255,7 @@ def _messages(data: bytearray, ends: Sequence[int], wanted: NDArray[np.bool_], c
         records = walk_records(data, begin, end, left if contents.indexed else end - begin)
         if contents.indexed:
             left -= records.number
-            if records.stop != end or records.short:
+            if records.stop != end or records.short or records.late:
                 raise IndexMismatchError
             for definition in records.definitions:
                 _hold_against(contents, data, *definition)

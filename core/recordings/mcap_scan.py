@@ -109,7 +109,7 @@ class _Scanner:
         self.warned = Counter[str]()  # warnings of each kind
         self.chunk_warnings: list[str] = []
         self.damaged = False
-        self.odd_records = 0
+        self.odd_records = self.late = 0
         self.records_left = most_records(size)  # in chunks
         self.bytes_left = most_inflated(size)
         self.definitions_left = _LARGEST_DEFINITIONS
@@ -136,10 +136,12 @@ class _Scanner:
         if self.odd_records:
             odd = count(self.odd_records, "record")
             self._warn(f"{odd} that cannot be read left out; the recorder or the disk damaged the file")
+        if self.late:
+            self._warn(f"{count(self.late, 'message')} past the year 2262 left out; the recorder's clock was wrong")
         if lost:
             self._warn(f"{count(lost, 'message')} of channels that are nowhere described left out")
         stated = self.summary.statistics.message_count if self.summary.statistics else 0
-        if stated > found.count:
+        if stated > found.count + self.late:
             self._warn(f"its summary counts {count(stated, 'message')}, {found.count} could be read")
         return found
 
@@ -222,6 +224,7 @@ class _Scanner:
         for opcode, start, stop in found.definitions:
             self._definition(opcode, records[start:stop])
         self.odd_records += found.short
+        self.late += found.late
 
     def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
         """Take a chunk, or leave it out; what little a cut leaves of a chunk's beginning is reported with the cut."""

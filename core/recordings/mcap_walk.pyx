@@ -33,6 +33,7 @@ class Records(NamedTuple):
     end: object
     definitions: list
     short: int
+    late: int
     number: int
     stop: int
 
@@ -40,7 +41,7 @@ class Records(NamedTuple):
 def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most, bint bare=False):
     """Whole records of block[begin:end], at most so many, until one that is cut or of opcode 0; if bare, until another."""
     cdef const uint8_t[::1] data = block
-    cdef Py_ssize_t at = begin, found = 0, number = 0, short = 0
+    cdef Py_ssize_t at = begin, found = 0, number = 0, short = 0, late = 0
     cdef Py_ssize_t room = min(most, (end - begin) // (HEAD + MESSAGE_HEAD))
     places, times, channels = np.empty((2, room), np.int64), np.empty(room, np.uint64), np.empty(room, np.uint16)
     cdef long[:, ::1] place = places
@@ -60,9 +61,10 @@ def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most, bint 
         elif data[at] == OPCODE_OF_MESSAGE:
             memcpy(&channel[found], &data[at + HEAD], 2)
             memcpy(&time[found], &data[at + HEAD + 6], 8)
+            late += time[found] >> 63  # times are kept with a sign
             place[0, found] = at + HEAD + MESSAGE_HEAD
             place[1, found] = at + HEAD + <Py_ssize_t>length
-            found += 1
+            found += 1 - (time[found] >> 63)
         at += HEAD + <Py_ssize_t>length
     begins, ends = places[0, :found], places[1, :found]
-    return Records(channels[:found], times[:found], begins, ends, definitions, short, number, at)
+    return Records(channels[:found], times[:found], begins, ends, definitions, short, late, number, at)

@@ -52,6 +52,7 @@ _QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*([^\d\s]\S{0,7})")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
+_HOUR = 3_600 * 10**9  # ns
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
@@ -92,12 +93,18 @@ class Table(Recording):
         elif (older := np.count_nonzero(steps < 0)) > 0.1 * len(kept):
             remedy = f"sort the rows by '{time}', or name a column of runs in a signals file, `table: {{runs: COLUMN}}`"
             self._warnings.append(f"{path}: {older} of {len(kept)} rows are older than the row before: {remedy}")
+        elif older and raw.columns[time].dtype.kind in "OM" and (abs(steps + _HOUR) <= 2 * np.median(steps)).any():
+            autumn = "its time goes back by an hour, as at the end of summer time, and a new segment begins there"
+            self._warnings.append(f"{path}: {autumn}; write times in UTC, or with their zone")
         names = [name for name in raw.columns if name not in apart]
         for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
-            cells = [str(cell).strip() for cell in raw.columns[name] if cell][:100]
+            cells = [str(cell).strip() for cell in raw.columns[name] if cell]
+            cells = cells[:: len(cells) // 100 + 1]
             units = {found and found[1] for found in map(_QUANTITY.fullmatch, cells)}
-            if cells and (_PACKED.fullmatch(cells[0]) or len(units) == 1 < len(set(cells)) and None not in units):
-                unread = f"column '{name}' left out, as no cell is a number alone, such as '{cells[0][:40]}'"
+            packed = list(filter(_PACKED.fullmatch, cells))
+            odd = cells if len(units) == 1 < len(set(cells)) and None not in units else packed
+            if 2 * len(odd) > len(cells):
+                unread = f"column '{name}' left out, as most cells are no number alone, such as '{odd[0][:40]}'"
                 self._warnings.append(f"{file}: {unread}: write one in each, without unit or separator of thousands")
         self.times = times[kept]
         if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
@@ -134,7 +141,9 @@ class Table(Recording):
             say = "say so in the signals file, `table: {runs: COLUMN}`, or write a file for each"
             self._warnings.append(f"{path}: the rows are of {of} by turns: if they are units, {say}")
         kind = file.suffix[1:].lower()
-        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, reason, first, last)}
+        others = [name for name, column in self.columns_by_field.items() if column.dtype.kind in "OM"]
+        words = reason or f"text or instants, which are no signals: {', '.join(others)}" * bool(others)
+        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, words, first, last)}
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""

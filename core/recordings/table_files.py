@@ -11,6 +11,7 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import re
 import zipfile
@@ -36,11 +37,18 @@ _MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?
 _TRUTH = {"true": 1.0, "false": 0.0, "yes": 1.0, "no": 0.0, "on": 1.0, "off": 0.0}
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?$|[+-]?inf(inity)?$|nan$", re.IGNORECASE)
 _WITH_COMMA = re.compile(r"[+-]?(\d+,\d*|,\d+)([eE][+-]?\d+)?$")
-_THOUSANDS = re.compile(r"[+-]?\d{1,3},\d{3}$")
+_GROUPED = re.compile(
+    r"[+-]?[1-9]\d{0,2}(?P<by>[,. '’\u00a0\u202f])\d{3}(?:(?P=by)\d{3})*(?P<rest>(?!(?P=by))[.,]\d*)?$"
+)
 _INSTANT = re.compile(
     r"\d{4}[-/]\d\d?[-/]\d\d?([T ]|$)|\d{1,2}:\d\d(:\d\d|$|\s*[AaPp])|\d{1,2}[./]\d{1,2}[./]\d{2,4}|"
     r"\d{1,2}-(\d{1,2}|[A-Za-z]{3})-\d{2,4}|\d{8}[T_ ]\d{6}"
 )
+_WIDE = {  # by which of a text's first four bytes are not 0
+    **dict.fromkeys((b"\1\1\0\0", b"\0\0\1\1"), "utf-32"), b"\1\0\0\0": "utf-32-le", b"\0\0\0\1": "utf-32-be",
+    b"\1\0\1\0": "utf-16-le", b"\0\1\0\1": "utf-16-be",
+}  # fmt: skip
+_CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
@@ -80,28 +88,38 @@ def read_table(path: Path) -> RawTable:
 
 @dataclass(frozen=True)
 class _Shape:
-    """How a CSV file is laid out: its delimiter, the lines before the data, and the names of its columns."""
+    """How a CSV file is laid out: its delimiter, the lines before the data, and the names of its columns.
+
+    `cut_times`: whether its commas part milliseconds from their time as well.
+    """
 
     delimiter: str
     skip: int
     names: tuple[str, ...]
     units: tuple[str, ...] = ()
     note: str = ""
+    cut_times: bool = False
 
 
 def _read_csv(path: Path) -> RawTable:
     with open(path, "rb") as stream:
         head = stream.read(_LOOK)
-    encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
+    encoding = _WIDE.get(bytes(map(bool, head[:4])), "utf-8-sig")
+    if encoding == "utf-8-sig" and head[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE):
+        encoding = "utf-16"
     try:
         head[:-4].decode(encoding)
     except UnicodeDecodeError as error:
-        if encoding != "utf-16" and error.start < len(head) - 8:
+        if encoding == "utf-8-sig" and error.start < len(head) - 8:
             encoding = "cp1252"  # of Windows
-    if encoding != "utf-16" and b"\0" in head:
+    if "\0" in (start := head.decode(encoding, errors="replace")):
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
-    lines = re.split(r"\r\n|\r|\n", head.decode(encoding, errors="replace"))[:_LOOK_LINES]
-    shape = _shape(path, lines if len(head) < _LOOK else lines[:-1] or lines)
+    whole, decimals = start.rpartition("\n")[0], [match[2] for match in _CUT_TIME.finditer(start)]
+    cut_times = any(three.startswith("0") for three in decimals)  # which numbers do not
+    cut_times = cut_times and len(_CUT_TIME.findall(whole)) == len(re.findall(r"\d:\d\d:\d\d", whole))
+    start = _CUT_TIME.sub(r"\1.", start) if cut_times else start
+    lines = re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES]
+    shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), cut_times=cut_times)
     names = _unique(shape.names)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
     values = np.empty((0, 0))
@@ -127,7 +145,8 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
     with open(path, encoding=encoding, errors="replace", newline="") as text:
         for _ in range(shape.skip):
             text.readline()
-        reader = csv.reader(text, delimiter=shape.delimiter, skipinitialspace=True)
+        lines = (_CUT_TIME.sub(r"\1.", line) for line in text) if shape.cut_times else text
+        reader = csv.reader(lines, delimiter=shape.delimiter, skipinitialspace=True)
         before = 0
         try:
             for cells in reader:
@@ -195,8 +214,10 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
         with suppress(ValueError):
             return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
     numbers = np.full(len(plain), np.nan)
+    if by := _thousands(plain):
+        plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]
     # in quotes between commas they may part thousands, which nothing but other cells tells
-    decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _THOUSANDS.match(cell) for cell in plain)
+    decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _GROUPED.match(cell) for cell in plain)
     comma = missing = odd = 0
     first = ""
     for i, cell in enumerate(plain):
@@ -215,9 +236,20 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
             first = first or cell
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
         return np.array(plain, dtype=object), ""
-    if odd:
-        return numbers, left_out(odd, "number", first)
-    return numbers, "decimal commas read as points" * bool(comma)
+    read = [f"'{by}' between thousands taken out"] * bool(by) + ["decimal commas read as points"] * bool(comma)
+    return numbers, " and ".join([left_out(odd, "number", first)] * bool(odd) + read)
+
+
+def _thousands(cells: Sequence[str]) -> str:
+    """What parts thousands in a column, if cells tell (`1,234.5`, `1 234`, `1.234.567`) and none denies; else ""."""
+    grouped = [m for m in map(_GROUPED.match, cells) if m]
+    alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)] if grouped else []
+    other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
+    found = {
+        m["by"] for m in grouped if m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or m["by"] in other
+    }
+    by = found.pop() if len(found) == 1 else ""
+    return by if by and all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
 
 
 def left_out(odd: int, what: str, first: str) -> str:
@@ -305,7 +337,8 @@ def _split(line: str, delimiter: str) -> list[str]:
 
 def _is_value(text: str) -> bool:
     """Whether a cell is a number or an instant, as names and units are not."""
-    return bool(_NUMBER.match(text) or _WITH_COMMA.match(text) or _INSTANT.match(text)) and text.lower() != "nan"
+    forms = _NUMBER, _WITH_COMMA, _GROUPED, _INSTANT
+    return any(form.match(text) for form in forms) and text.lower() != "nan"
 
 
 # --- others --------------------------------------------------------------------------------------------------

@@ -130,6 +130,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and may_be(table.columns[name])]
     if len(dated) == 1:
         return dated[0], ""
+    if parts := _of_parts(table):
+        return parts, "it is put together of these columns, a day more where it goes back"
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
     if first == ["column 1"] and names[1:2] != ["column 2"] and set(np.diff(table.columns["column 1"]).tolist()) == {1}:
         first = []  # the row numbers of a data frame, which alone have no name
@@ -192,6 +194,26 @@ def _days_beside(table: RawTable, column: str) -> str:
     first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts}
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
     return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
+
+
+def _of_parts(table: RawTable) -> str:
+    """Put hours, minutes and seconds together in place of their columns; what that is called, or nothing."""
+    parts = [
+        [n for n, c in table.columns.items() if re.fullmatch(_UNIT[unit], n.lower()) and c.dtype.kind in "iuf"][:1]
+        for unit in ("h", "min", "s")
+    ]
+    if not all(parts):
+        return ""
+    clock = np.array([table.columns[name] for (name,) in parts], dtype=np.float64)
+    good = ((clock >= 0) & (clock < [[24], [60], [60]])).all(axis=0)
+    if good.mean() < 1 - ODD_SHARE:
+        return ""
+    seconds = np.where(good, [3600.0, 60.0, 1.0] @ clock, np.nan)
+    seconds[good] += 86_400 * np.cumsum(np.diff(seconds[good], prepend=0.0) < -43_200)
+    called = f"{':'.join(name for (name,) in parts)} [s]"
+    rest = {name: column for name, column in table.columns.items() if [name] not in parts}
+    table.columns = {called: seconds} | rest
+    return called
 
 
 def _stands_still(column: Column) -> bool:

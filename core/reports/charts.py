@@ -89,7 +89,7 @@ class Columns:
             joined = broken if int(broken.sum()) <= most // 2 else np.zeros(count, dtype=bool)
             chosen = joined | (np.arange(count) % math.ceil(count / most * (1 if near is None else 2)) == 0)
             if near is not None:
-                onsets = np.flatnonzero(near[here] & ~np.concatenate([[False], near[here][:-1]]))
+                onsets = [begin for begin, _ in runs(near[here])]
                 onsets = onsets[:: math.ceil(len(onsets) / max(most // 20, 1)) or 1]
                 reach = min(most // (4 * max(len(onsets), 1)), 2000)
                 for onset in onsets:

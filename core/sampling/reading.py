@@ -302,7 +302,10 @@ def read_as_fitted_with_decisions(
     if signals.time[signals.clock] == "header" and not (stamps > 0).any():
         remedy = "fit it to such recordings, with time: log for that topic"
         raise SignalError(f"{bag.path}: no message of {signals.clock} has a stamp, and the model uses them; {remedy}")
-    return sample(stream, signals)
+    transient, decisions = sample(stream, signals)
+    if not len(transient):
+        raise BagError(f"{bag.path}: no message of {signals.clock} makes a sample; record stamps that go forward")
+    return transient, decisions
 
 
 def read_field(

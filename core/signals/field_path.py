@@ -215,17 +215,17 @@ class FieldPath:
 
     `text`: the path as a signals file writes it; `unwrap`: the turn by which the sampler is to unwrap it, 0 for none;
     `memory`: what the sampler is to take from earlier samples; `inner`: the path without that: whose earlier samples
-    they are.
+    they are; `angle`: that without `unwrap`.
     """
 
-    __slots__ = ("text", "unwrap", "memory", "inner", "function", "steps")
+    __slots__ = ("text", "unwrap", "memory", "inner", "angle", "function", "steps")
 
     def __init__(self, text: str) -> None:
         self.text = text
         self.unwrap = 0.0
         self.function: FieldFunction | None = None
         self.memory, self.inner = parse_memory(text)
-        inner = self.inner
+        inner = self.angle = self.inner
         functions: list[str] = []
         known = (*FUNCTIONS, "unwrap", *KINDS)
         while match := re.fullmatch(r"([A-Za-z_]\w*)\s*\((.*)\)", inner, re.DOTALL):
@@ -236,6 +236,7 @@ class FieldPath:
             inner = match[2].strip()
             if match[1] == "unwrap" and (stated := re.fullmatch(r"(.*),\s*([1-9][\d.]*)", inner, re.DOTALL)):
                 inner, self.unwrap = stated[1].strip(), float(stated[2])
+            self.angle = inner if functions == ["unwrap"] else self.angle
         if functions[:1] == ["unwrap"]:
             self.unwrap = self.unwrap or math.tau
             functions = functions[1:]
