@@ -64,12 +64,8 @@ UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
 
 CONSTANT = "never moved in what was fitted"
 """Words on controls that never moved: nothing is to be mended for the operation that was recorded."""
-_CODE, _NOISE, _BEFORE, _FEW = (
-    "a number that stands for no value",
-    "like noise from sample to sample",
-    "one sample earlier explains",
-    "as wide as the rest needs",
-)
+_CODE, _NOISE = "a number that stands for no value", "like noise from sample to sample"
+_BEFORE, _FEW = "one sample earlier explains", "as wide as the rest needs"
 _QUATERNION = re.compile(r"((?:.*\.)?(?:orientation|rotation|quaternion|quat|q)(?:\.|_?))[xyzw]")
 _REMEDIES = (  # words of a message on the state, or on any signal; what narrows the bounds
     (_FEW, True, "look at the few samples that carry the width, named above"),
@@ -234,13 +230,9 @@ def _weak(
     problem: Problem, sums: Moments, signals: Sequence[Signal], past: Collection[int], lacking: Collection[int]
 ) -> list[str]:
     """Controls whose effect is lost in the noise, unless another sample of the same field has it."""
-    every, names = lost(problem, sums, past), [s.name for s in signals]
-    seen = {(s.topic, s.inner) for j, s in enumerate(signals) if j >= problem.n and j not in every}
-    found = {
-        j: effect
-        for j, effect in every.items()
-        if effect[0] not in lacking and (signals[j].topic, signals[j].inner) not in seen
-    }
+    every, names, of = lost(problem, sums, past), [s.name for s in signals], [(s.topic, s.inner) for s in signals]
+    seen = {of[j] for j in range(problem.n, len(of)) if j not in every}
+    found = {j: effect for j, effect in every.items() if effect[0] not in lacking and of[j] not in seen}
     state, certainty = max(found.values(), key=itemgetter(1), default=(0, 0.0))
     larger = max(2.0, DETERMINED / max(0.4, min((least for _, least in found.values()), default=1.0)))
     return [
@@ -526,9 +518,8 @@ def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
     moving = np.ptp(problem.z[:, :n], axis=0) > 0
     slow = float(np.median(problem.dt)) * FASTEST >= 1.0
-    remedy = (
-        "its level is judged, how it moves needs faster rows" if slow else "leave it out, or record the machine at work"
-    )
+    remedy = "its level is judged, how it moves needs faster rows"
+    remedy = remedy if slow else "leave it out, or record the machine at work"
     return {
         i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "
         f"variance at the next; {remedy}"
@@ -594,11 +585,8 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
         return f"'{state}' jumps without moving, as said above"
     if noise := [m for m in named if _NOISE in m]:
         return f"'{state}' moves like noise: {noise[0].rpartition('; ')[2]}"
-    found = [
-        remedy.format(state)
-        for words, own, remedy in _REMEDIES
-        if any(words in m for m in (named if own else messages))
-    ]
+    about = [(remedy.format(state), words, named if own else messages) for words, own, remedy in _REMEDIES]
+    found = [remedy for remedy, words, told in about if any(words in m for m in told)]
     return ", or ".join(dict.fromkeys([*found, *(["try --additive noise"] if additive == "none" else [])]))
 
 
