@@ -833,6 +833,8 @@ def test_rows_of_whole_seconds_come_evenly_and_those_of_units_do_not(tmp_path):
     bag = read_csv(tmp_path, "time,x,y", (f"{math.floor(s)},{math.sin(s):.6f},{s % 7:.3f}" for s in t))
     assert np.abs(np.diff(bag.times) * 1e-9 - np.diff(t)).max() < 0.06 and np.abs(bag.times * 1e-9 - t).max() < 0.06
     assert "taken to come evenly in the 1 s after it" in bag.warnings[0]
+    polled = read_csv(tmp_path, "time,x,y", (f"{k // 4},{k // 4 % 9},{(k - 2) // 4 % 7}" for k in range(400)))
+    assert np.unique(polled.times).size == 100  # of four rows, each of which has one new number
     units = read_csv(
         tmp_path, "time,x,y", (f"{k // 20},{k % 20 + k // 20 / 9},{k % 20 * 3 - k // 20}" for k in range(400))
     )

@@ -265,13 +265,17 @@ def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> t
 
 
 def _flows(columns: Iterable[Column], rows: int) -> bool:
-    """Whether most numbers change less from row to row than over the rows of a time, which are of one machine then."""
-    shares = []
+    """Whether most numbers change less from row to row than over the rows of a time, which are of one machine then.
+
+    Where none changes twice in a time, the rows of it are one sample, written number by number.
+    """
+    shares, changes = [], 0.0
     for column in (c for c in columns if c.dtype.kind in "iuf" and c.ndim == 1):
         values = column[np.isfinite(column)].astype(np.float64)
         if len(values) > 2 * rows and (later := float(np.abs(values[rows:] - values[:-rows]).mean())) > 0:
             shares.append(float(np.abs(np.diff(values)).mean()) / later)
-    return bool(shares) and float(np.median(shares)) < 0.5
+            changes = max(changes, rows * float(np.mean(np.diff(values) != 0)))
+    return changes >= 2 and float(np.median(shares)) < 0.5
 
 
 def _take_turns(cells: Sequence[object]) -> int:
