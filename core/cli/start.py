@@ -152,6 +152,8 @@ def start(options: argparse.Namespace) -> Result:
     page_target(page, model, [])
     parts: dict[str, Any] = {"signals": signals, "model": model, "report": page}
     if os.path.exists(signals):
+        if options.table:
+            raise SignalError(f"{signals} is there and is used as it is; write under `table` in it what --table says")
         options.say(f"signals: as {signals} has them")
     else:
         group_recordings(options.check or [], layout=_layout(options))
