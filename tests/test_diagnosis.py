@@ -185,10 +185,10 @@ def test_state_of_a_slower_topic_is_named_with_its_period(period):
         return message.rsplit("; ")[-1]
 
     topic = "/b"
-    assert said_of() == "make its topic the clock, or leave it out"
+    assert said_of() == "make its topic the clock, list it as a control, or leave it out"
     assert said_of(judged=True) == "take `judged: true` away"  # of a control
     topic = "/a"  # as of a table
-    assert said_of() == "leave it out"
+    assert said_of() == "list it as a control, or leave it out"
 
 
 @pytest.mark.parametrize(("lag", "noise"), [(1, 1e-2), (7, 1e-4)])

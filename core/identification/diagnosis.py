@@ -399,7 +399,7 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
         even = period * len(instants) > 0.5 * problem.N  # a coarse sensor is new often for a while, and then not at all
         if period >= 2 and even and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
             alone = len({other.topic for other in signals}) == 1
-            remedy = "leave it out" if alone else "make its topic the clock, or leave it out"
+            remedy = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
             remedy = "take `judged: true` away" if signal.judged else remedy
             messages.append(
                 f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
