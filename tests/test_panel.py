@@ -24,6 +24,7 @@ from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.reports.check import check_data
 from uncertain_lti.reports.findings import findings
+from uncertain_lti.validation import monitor_fit
 from uncertain_lti.validation.detectable import _alarming
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
@@ -439,6 +440,22 @@ def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smalle
     assert not kept.operating_point.x_s.any() and "centred" not in kept.fit_summary["alarm"]
     near = [run(seed, 0.0) for seed in range(6)]
     assert np.allclose(fit(near).operating_point.x_s, 0.0, atol=0.5)
+
+
+def test_ways_that_state_the_same_problem_are_fitted_once(runs, monkeypatch):
+    """With steps of one length, noise and disturbance are one term."""
+    asked, given = [], monitor_fit.fit
+
+    def noted(transients, **options):
+        asked.append((options["criterion"], options["additive"]))
+        return given(transients, **options)
+
+    monkeypatch.setattr(monitor_fit, "fit", noted)
+    late = [Transient(run.t * (1.0 + run.t), run.x, run.u, name=run.name) for run in runs]
+    for some, options, there in ((runs, {}, False), (late, {}, True), (runs, {"additive": "both"}, True)):
+        asked.clear()
+        fit(some, **options)
+        assert (("lp", "both") in asked) is there and ("qp", "both") in asked
 
 
 def test_groups_are_left_out_whole(runs):

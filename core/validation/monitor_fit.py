@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit, update
+from uncertain_lti.identification.assembly import is_constant
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, Transitions
@@ -154,9 +155,12 @@ def _promising(
         seen = _seen(model, transients, _COMPARED)
         return learn(seen, seen.parts).figure
 
-    best, least = ways[0], figure(first)
+    best, least, dt = ways[0], figure(first), first.sampling
+    one_length = is_constant(np.array([dt.dt_min, dt.dt_median, dt.dt_max]))
     for way in ways[1:]:
         asked = {**shared, **way}
+        if one_length and asked["additive"] == "both" and {**way, "additive": "noise"} in ways:  # the same problem
+            continue
         if asked.pop("centred", False):
             asked["operating_point"] = _medians(transients)
         try:
