@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each
+from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each, return_memory
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.assembly import assemble, median_step
@@ -51,6 +51,7 @@ from uncertain_lti.signals.values import Additive, Criterion
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""
+_LARGE = 1_000_000  # numbers in the recordings from which on a fit leaves much memory behind
 
 
 def fit(
@@ -231,6 +232,8 @@ def fit_fleet(
 
     `remember`: what the model's file keeps, of the model and `WorkingSet.nearest`.
     """
+    if large := fleet.N * fleet.p > _LARGE:
+        return_memory()
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
         engine = WorkingSet(fleet, structure, progress=progress)
     sums = engine.sums
@@ -312,6 +315,8 @@ def fit_fleet(
         facts["rank"], facts["messages"] = words
     if transients:
         model = with_repeats(model, seen)
+    if large:
+        return_memory()
     return model.replace(fit_summary=facts, residuals=residuals, memory=kept)
 
 
