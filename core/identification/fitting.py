@@ -29,7 +29,7 @@ from uncertain_lti.identification.diagnosis import describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
-from uncertain_lti.identification.memory import Recording, remembered
+from uncertain_lti.identification.memory import Recording, elements_of, remembered
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
@@ -74,10 +74,12 @@ def fit(
     seek_carriers: bool = False,
     alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
+    near: UncertainLTI | None = None,
 ) -> UncertainLTI:
     """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out.
 
-    `drop_horizons`: a horizon that the recordings cannot carry is left out with a message, not refused.
+    `drop_horizons`: a horizon that the recordings cannot carry is left out with a message, not refused; `near`: a fit
+    to nearly the same transitions, from which one of many unknowns a row starts.
     """
     transients = listed_transients(transients)
     check_criterion(criterion)
@@ -167,6 +169,7 @@ def fit(
             transients=transients,
             discarded=len(discarded),
             seek_carriers=seek_carriers,
+            near=near if scheduled is None else None,
             remember=partial(_memory, problem, transients, fleet) if keeps else None,
         )
     facts = {
@@ -226,6 +229,7 @@ def fit_fleet(
     transients: Sequence[Transient] = (),
     discarded: int = 0,
     seek_carriers: bool = False,
+    near: UncertainLTI | None = None,
     remember: Callable[[UncertainLTI, list[Index]], dict[str, Any] | None] | None = None,
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
@@ -235,7 +239,7 @@ def fit_fleet(
     if large := fleet.N * fleet.p > _LARGE:
         return_memory()
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
-        engine = WorkingSet(fleet, structure, progress=progress)
+        engine = WorkingSet(fleet, structure, progress, None if near is None else elements_of(near, fleet.columns))
     sums = engine.sums
     n, low, high = fleet.n, sums.low, sums.high
     largest_values = np.maximum(-low, high)
