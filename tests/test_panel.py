@@ -446,6 +446,19 @@ def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smalle
     assert np.allclose(fit(near).operating_point.x_s, 0.0, atol=0.5)
 
 
+def test_the_promising_way_is_fitted_again_from_its_fit_to_all(monkeypatch):
+    started, given = [], monitor_fit.fit
+
+    def noted(transients, near=None, **options):
+        model = given(transients, near=near, **options)
+        started.append(near is not None and bool((near.A == model.A).all()))
+        return model
+
+    monkeypatch.setattr(monitor_fit, "fit", noted)
+    fit(far_from_0())
+    assert started == [False, False, False, True]
+
+
 def test_ways_of_machines_too_large_to_leave_out_are_compared_on_some_states(monkeypatch):
     far = far_from_0()
     sizes, given = [], monitor_fit.fit

@@ -84,7 +84,7 @@ def fit_monitored(
     if centred:
         options["operating_point"] = _medians(transients)
     model = fit(transients, progress=progress, **options)
-    of_the_fit_alone = ("schedule", "transient_weights", "describe_data", "seek_carriers")
+    of_the_fit_alone = ("schedule", "transient_weights", "describe_data", "seek_carriers", "near")
     left = {name: value for name, value in options.items() if name not in of_the_fit_alone}
     if options.get("transient_weights") is not None:
         why = "transient_weights are for all recordings, so none can be left out"
@@ -147,11 +147,11 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
     way = judged or ways[0]
     taken = fit_monitored(transients, **{**alone, **way})
     if len(ways) > 1 and not judged and taken.panel is not None and taken.panel.vouched:
-        best = _promising(transients, ways, alone, taken.model)
-        other = fit_monitored(transients, **{**alone, **best}) if best is not way else taken
+        best, model = _promising(transients, ways, alone, taken.model)
+        other = fit_monitored(transients, near=model, **{**alone, **best}) if best is not way else taken
         if other.panel is not None and other.panel.figure < CLEARLY * taken.panel.figure:
             way, taken = best, other
-    return fit_monitored(transients, **{**options, **way}) if options.get("horizons") else taken
+    return fit_monitored(transients, near=taken.model, **{**options, **way}) if options.get("horizons") else taken
 
 
 def _on_some_states(
@@ -184,7 +184,7 @@ def _on_some_states(
         )
         for t in transients
     ]
-    return _promising(some, ways, {**options, "operating_point": point})
+    return _promising(some, ways, {**options, "operating_point": point})[0]
 
 
 def _promising(
@@ -192,12 +192,12 @@ def _promising(
     ways: Sequence[Mapping[str, Any]],
     options: Mapping[str, Any],
     first: UncertainLTI | None = None,
-) -> Mapping[str, Any]:
-    """The way whose panel sees clearly smaller jumps on what was fitted; `first`: fitted in the first way."""
+) -> tuple[Mapping[str, Any], UncertainLTI | None]:
+    """The way whose panel sees clearly smaller jumps on what was fitted, and that fit; `first`: in the first way."""
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
     one_length = is_constant(np.concatenate([t.transitions().dt for t in transients]))
-    best, least = ways[0], np.inf
+    best, least = (ways[0], first), np.inf
     for way in ways:
         asked = {**shared, **way}
         if one_length and asked["additive"] == "both" and {**way, "additive": "noise"} in ways:  # the same problem
@@ -211,7 +211,7 @@ def _promising(
         except (FitError, ModelError):
             continue
         if size < CLEARLY * least:
-            best, least = way, size
+            best, least = (way, model), size
     return best
 
 
