@@ -193,6 +193,22 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
         refuses(ValueError, "fit the recording", judge.judge_rows, *samples, k, [0.1], two, marks)
 
 
+def test_judges_share_the_pairs_that_were_seen_and_numbers_alone_need_none() -> None:
+    rng, count = np.random.default_rng(0), 50
+    one, point, seen = rng.random((2, 4)), (np.zeros(3), np.ones(3), -np.ones(3), np.ones(3)), np.ones((3, 4, 4), bool)
+    judge = arithmetic.Judge(one, one, np.ones(2), *point, 1.0, np.array([True, True]), seen)
+    samples = rng.random((count, 2)), rng.random((count, 1)), np.zeros((count, 0))
+    given, alone = ([np.zeros((count, 2)) for _ in range(5)] for _ in range(2))
+    marks = np.zeros((2, count), np.uint8)
+    k, dt = np.arange(count - 1), np.full(count - 1, 0.1)
+    judge.judge_rows(*samples, k, dt, given, marks[0])
+    judge.judge_rows(*samples, k, dt, alone, None)
+    np.testing.assert_array_equal(given, alone)
+    seen[:] = False
+    judge.judge_rows(*samples, k, dt, given, marks[1])
+    assert (marks[0] & arithmetic.OUTSIDE == 0).all() and (marks[1][1:] & arithmetic.OUTSIDE > 0).all()
+
+
 # --- repeats ------------------------------------------------------------------------------------------------------
 
 

@@ -44,6 +44,28 @@ def test_no_fit_is_above_its_optimum(first):
     assert compared >= 7
 
 
+@pytest.mark.parametrize("criterion", ["qp", "lp"])
+def test_a_fit_of_many_unknowns_starts_from_one_that_is_near(criterion, monkeypatch):
+    """And (10) takes in what is next to its bounds before it is outside."""
+    rng = np.random.default_rng(1)
+    x, u = np.zeros((3001, 3)), rng.normal(size=(3001, 75))
+    gain = rng.normal(size=(3, 75))
+    for k in range(3000):
+        x[k + 1] = 0.9 * x[k] + 0.1 * gain @ u[k] + 0.02 * rng.uniform(-1, 1, 3)
+    run = Transient(0.1 * np.arange(3001), x, u)
+    near, part = fit(run, criterion, additive="noise"), run.replace(slice(0, 2500))
+    alone, started = (fit(part, criterion, additive="noise", near=of) for of in (None, near))
+    monkeypatch.setattr("uncertain_lti.identification.programmes.VERY_MANY", 1000)
+    slow = fit(part, criterion, additive="noise")
+    of = [model.fit_summary["solver"] for model in (started, alone, slow)]
+    assert of[0]["rounds"] <= 3 * (2 if criterion == "lp" else 1) < of[1]["rounds"]
+    assert (min(of[1]["working_set"]) > max(of[2]["working_set"])) == (criterion == "qp")
+    for model in (started, slow):
+        assert np.allclose(model.fit_summary["objective"], alone.fit_summary["objective"], rtol=1e-7)
+        assert np.allclose(model.A, alone.A, atol=1e-6)
+        assert model.fit_summary[KEY] <= 1e-6
+
+
 @pytest.mark.parametrize("seed", [9, 98, 108])
 def test_with_knots_where_the_first_centre_contains_every_sample(seed):
     """Of `python benchmarks/optimum.py --knots`: the simplex method starts from no sample at all in some row."""

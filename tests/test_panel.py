@@ -24,6 +24,7 @@ from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.reports.check import check_data
 from uncertain_lti.reports.findings import findings
+from uncertain_lti.validation import monitor_fit
 from uncertain_lti.validation.detectable import _alarming
 from uncertain_lti.validation.intervals import rate_interval
 from uncertain_lti.validation.left_out import validate
@@ -423,11 +424,11 @@ def test_recordings_that_do_not_repeat_one_another_are_named(runs):
     assert loud["outcome"] == "alarm" and loud["reason"] == f"the model is {alarm['headline']}"
 
 
-def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smaller_jumps():
+def far_from_0(at: float = 50.0) -> list[Transient]:
     """Far from 0, widths that grow with |x| are constants; errors of a rate are least near the usual state."""
     rng = np.random.default_rng(5)
 
-    def run(seed: int, at: float) -> Transient:
+    def run(seed: int) -> Transient:
         base = plant(seed)
         x = np.array(base.x)
         for k in range(len(x) - 1):
@@ -435,7 +436,11 @@ def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smalle
             x[k + 1] = x[k] + DT * (rate * x[k] + np.array([1.0, 0.5]) * base.u[k])
         return Transient(base.t, x + at, base.u + at, name=base.name)
 
-    far = [run(seed, 50.0) for seed in range(6)]
+    return [run(seed) for seed in range(6)]
+
+
+def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smaller_jumps():
+    far = far_from_0()
     model = fit(far)
     assert model.fit_summary["alarm"]["centred"] and model.fit_summary["criterion"] == "qp"
     assert np.allclose(model.operating_point.x_s, np.median(np.concatenate([t.x for t in far]), axis=0))
@@ -443,8 +448,54 @@ def test_deviations_are_measured_from_the_medians_where_that_sees_clearly_smalle
     kept = fit(far, "lp", additive="noise")
     assert model.fit_summary["alarm"]["figure"] < 0.9 * kept.fit_summary["alarm"]["figure"]
     assert not kept.operating_point.x_s.any() and "centred" not in kept.fit_summary["alarm"]
-    near = [run(seed, 0.0) for seed in range(6)]
+    near = far_from_0(0.0)
     assert np.allclose(fit(near).operating_point.x_s, 0.0, atol=0.5)
+
+
+def test_the_promising_way_is_fitted_again_from_its_fit_to_all(monkeypatch):
+    started, given = [], monitor_fit.fit
+
+    def noted(transients, near=None, **options):
+        model = given(transients, near=near, **options)
+        started.append(near is not None and bool((near.A == model.A).all()))
+        return model
+
+    monkeypatch.setattr(monitor_fit, "fit", noted)
+    fit(far_from_0())
+    assert started == [False, False, False, True]
+
+
+def test_ways_of_machines_too_large_to_leave_out_are_compared_on_some_states(monkeypatch):
+    far = far_from_0()
+    sizes, given = [], monitor_fit.fit
+
+    def noted(transients, **options):
+        sizes.append(transients[0].x.shape[1])
+        return given(transients, **options)
+
+    monkeypatch.setattr(monitor_fit, "LIMIT", 10.0)
+    every = fit(far)
+    monkeypatch.setattr(monitor_fit, "STATES", 1)
+    monkeypatch.setattr(monitor_fit, "fit", noted)
+    model = fit(far)
+    assert sizes == [1, 1, 1, 2] and model.alarm == every.alarm
+    assert model.fit_summary["alarm"]["centred"] and (model.A == every.A).all()
+
+
+def test_ways_that_state_the_same_problem_are_fitted_once(runs, monkeypatch):
+    """With steps of one length, noise and disturbance are one term."""
+    asked, given = [], monitor_fit.fit
+
+    def noted(transients, **options):
+        asked.append((options["criterion"], options["additive"]))
+        return given(transients, **options)
+
+    monkeypatch.setattr(monitor_fit, "fit", noted)
+    late = [Transient(run.t * (1.0 + run.t), run.x, run.u, name=run.name) for run in runs]
+    for some, options, there in ((runs, {}, False), (late, {}, True), (runs, {"additive": "both"}, True)):
+        asked.clear()
+        fit(some, **options)
+        assert (("lp", "both") in asked) is there and ("qp", "both") in asked
 
 
 def test_groups_are_left_out_whole(runs):

@@ -224,7 +224,7 @@ def test_promise_is_largest_for_the_signal_that_bends_the_plant():
 
 def test_the_public_fit_takes_what_the_identification_takes():
     inner, outer = inspect.signature(fitting.fit).parameters, inspect.signature(uncertain_lti.fit).parameters
-    chosen = {"criterion", "drop_horizons", "horizons", "widths", "alarm_rule"}  # here what they are chosen by
+    chosen = {"criterion", "drop_horizons", "horizons", "widths", "alarm_rule", "near"}  # here what they are chosen by
     assert [outer[name] for name in inner if name not in chosen] == [inner[n] for n in inner if n not in chosen]
     assert set(outer) - set(inner) == {"alarm", "false_alarms", "groups"}
 

@@ -11,10 +11,11 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from typing import Any, TypeVar
 
@@ -76,6 +77,12 @@ def one_thread_each() -> Iterator[None]:
     """BLAS keeps to the thread that calls it: on small arrays, from several threads, its own only wait for another."""
     with _libraries().limit(limits=1, user_api="blas"):
         yield
+
+
+def return_memory() -> None:
+    """Give back what is freed, of which the C library keeps hundreds of MB after the threads of a large fit."""
+    with suppress(OSError, AttributeError):  # another C library
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @cache

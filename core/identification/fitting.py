@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each
+from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each, return_memory
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.assembly import assemble, median_step
@@ -29,7 +29,7 @@ from uncertain_lti.identification.diagnosis import describe
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
-from uncertain_lti.identification.memory import Recording, remembered
+from uncertain_lti.identification.memory import Recording, elements_of, remembered
 from uncertain_lti.identification.optimum import optimum
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
@@ -51,6 +51,7 @@ from uncertain_lti.signals.values import Additive, Criterion
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""
+_LARGE = 1_000_000  # numbers in the recordings from which on a fit leaves much memory behind
 
 
 def fit(
@@ -73,10 +74,12 @@ def fit(
     seek_carriers: bool = False,
     alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
+    near: UncertainLTI | None = None,
 ) -> UncertainLTI:
     """`uncertain_lti.fit` with a schedule that is known: nothing is chosen here by what is left out.
 
-    `drop_horizons`: a horizon that the recordings cannot carry is left out with a message, not refused.
+    `drop_horizons`: a horizon that the recordings cannot carry is left out with a message, not refused; `near`: a fit
+    to nearly the same transitions, from which one of many unknowns a row starts.
     """
     transients = listed_transients(transients)
     check_criterion(criterion)
@@ -166,6 +169,7 @@ def fit(
             transients=transients,
             discarded=len(discarded),
             seek_carriers=seek_carriers,
+            near=near if scheduled is None else None,
             remember=partial(_memory, problem, transients, fleet) if keeps else None,
         )
     facts = {
@@ -225,14 +229,17 @@ def fit_fleet(
     transients: Sequence[Transient] = (),
     discarded: int = 0,
     seek_carriers: bool = False,
+    near: UncertainLTI | None = None,
     remember: Callable[[UncertainLTI, list[Index]], dict[str, Any] | None] | None = None,
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
 
     `remember`: what the model's file keeps, of the model and `WorkingSet.nearest`.
     """
+    if large := fleet.N * fleet.p > _LARGE:
+        return_memory()
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
-        engine = WorkingSet(fleet, structure, progress=progress)
+        engine = WorkingSet(fleet, structure, progress, None if near is None else elements_of(near, fleet.columns))
     sums = engine.sums
     n, low, high = fleet.n, sums.low, sums.high
     largest_values = np.maximum(-low, high)
@@ -312,6 +319,8 @@ def fit_fleet(
         facts["rank"], facts["messages"] = words
     if transients:
         model = with_repeats(model, seen)
+    if large:
+        return_memory()
     return model.replace(fit_summary=facts, residuals=residuals, memory=kept)
 
 

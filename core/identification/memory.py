@@ -96,7 +96,9 @@ class Boxes:
 
     def after(self, columns: Columns, before: UncertainLTI, model: Any, widths: Array) -> Boxes:
         """With the room that another model leaves at least, whose largest widths are `widths` (n,)."""
-        theta, d = (new - old for new, old in zip(_elements(model, columns), _elements(before, columns), strict=True))
+        theta, d = (
+            new - old for new, old in zip(elements_of(model, columns), elements_of(before, columns), strict=True)
+        )
         ones, even = np.ones(len(self.source)), [-1] * len(columns.nominal)
         nearer, farther = (
             np.maximum(np.maximum(self.low, -self.high), 0.0),
@@ -300,7 +302,7 @@ def _root(gram: Array) -> Array:
     return np.asarray(scale[:, None] * np.linalg.cholesky(gram / np.outer(scale, scale) + 1e-9 * np.eye(len(gram))))
 
 
-def _elements(model: Any, columns: Columns) -> tuple[Array, Array]:
+def elements_of(model: Any, columns: Columns) -> tuple[Array, Array]:
     """Elements as `Columns.arrays` takes them."""
     theta = [model.A.T, model.B.T, *(getattr(model, term.nominal)[None] for term in columns.nominal)]
     d = [model.dA.T, model.dB.T, *(getattr(model, term.half)[None] for term in columns.half)]

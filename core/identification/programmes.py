@@ -190,8 +190,10 @@ class Programmes:
         return [None] if last is None or last.active is None or len(last.active) != count else [last.active, None]
 
     def quadratic(self) -> str:
-        """Solve (10) on the working set."""
+        """Solve (10) on the working set; of many unknowns, with what is next to join it."""
         row = self.row
+        if row.r + row.q >= VERY_MANY:
+            row.widen_pool((row.r + row.q) // 2, np.inf)
         answer, solver = self._solve(
             "quadratic",
             lambda factor, ridge: row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge),
@@ -248,8 +250,7 @@ class Programmes:
 
     def linear(self) -> str:
         """Solve (11) on the working set, by the simplex method."""
-        row = self.row
-        box = self.box
+        row, box = self.row, self.box
         if box is not None and self._simplex is None:
             self._set_unit()
         G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
@@ -391,10 +392,8 @@ class Programmes:
         for value, direction in zip(values.tolist(), directions.T, strict=True):
             if value > 1e-13 or not free[np.abs(direction) > COLLINEAR].all():
                 return float(value)
-            if (
-                np.abs(row.plain_phi @ (direction if row.basis is None else row.basis @ direction)).max(initial=0.0)
-                > COLLINEAR
-            ):
+            along = direction if row.basis is None else row.basis @ direction
+            if np.abs(row.plain_phi @ along).max(initial=0.0) > COLLINEAR:
                 return float(value)
         return 1.0
 

@@ -289,8 +289,12 @@ class Row:
         """Something is left to solve for."""
         return self.r + self.q > 0
 
-    def start(self) -> None:
-        """Start from least squares, with no half-width."""
+    def start(self, near: tuple[Array, Array] | None = None) -> None:
+        """Start from least squares, with no half-width, or from elements of the row that are near the optimum."""
+        if near is not None:
+            self.phi_columns.put(self.theta, near[0][self.free_phi])
+            self.psi_columns.put(self.d, near[1][self.free_psi])
+            return
         answer = np.linalg.lstsq(self.centre + 1e-12 * np.eye(self.r), self.target, rcond=None)[0].astype(np.float64)
         self.store(np.concatenate([np.clip(answer, self.lower[: self.r], self.upper[: self.r]), np.zeros(self.q)]))
 
@@ -417,11 +421,11 @@ class Row:
         width = 0.0 if room is None else float(np.quantile(room[those], share))
         return wanted, min(width, wanted) if width > 1e-6 else 0.0
 
-    def widen_pool(self, most: int | None = None) -> bool:
-        """Let the most violated held samples join the working set."""
+    def widen_pool(self, most: int | None = None, below: float | None = None) -> bool:
+        """Let the most violated held samples join the working set, or those nearest to that, of slack below this."""
         slack = self.slack()
         slack[self.pool] = np.inf
-        outside = np.flatnonzero(slack < -self.tolerance)
+        outside = np.flatnonzero(slack < (-self.tolerance if below is None else below))
         most = most or max(JOIN, 2 * (self.r + self.q))
         if len(outside) > most:
             outside = outside[np.argpartition(slack[outside], most)[:most]]

@@ -77,7 +77,8 @@ class WorkingSet:
     unknowns change (the size of a sample is linear in |z|), so while they change less than the slack that was
     brought, no other sample can leave its bounds, and the proof of optimality needs no further pass.
 
-    `fleet`: the data; `structure`: as in `fit`; `progress`: called with one line of text per pass.
+    `fleet`: the data; `structure`: as in `fit`; `progress`: called with one line of text per pass; `near`: elements,
+    (r, n) and (q, n), of a fit to nearly the same data, where rows of _MANY unknowns start.
     """
 
     def __init__(
@@ -85,8 +86,10 @@ class WorkingSet:
         fleet: Fleet,
         structure: Structure | None = None,
         progress: Callable[[str], None] | None = None,
+        near: tuple[Array, Array] | None = None,
     ) -> None:
         self.fleet = fleet
+        self._near = near
         self.progress = progress or (lambda text: None)
         self.whole = fleet.N <= 2 * SUBSAMPLE
         self._stride = 1 if self.whole else fleet.N // SUBSAMPLE
@@ -406,11 +409,13 @@ class WorkingSet:
             done += len(rows)
 
     def _start(self, rows: list[Row]) -> None:
-        """Begin with the first samples and those furthest from least squares."""
+        """Begin with the first samples and those furthest from least squares, or those next to bounds that are near."""
+        many = max(row.r + row.q for row in rows) >= _MANY
+        near = self._near if many else None
         for row in rows:
             self._hold(row, self._first[row.i])
-            row.start()
-        if not self.whole and max(row.r + row.q for row in rows) >= _MANY:
+            row.start(near and (near[0][:, row.i], near[1][:, row.i]))
+        if not self.whole and many:
             share = _FURTHEST / self.fleet.N
             reach = np.zeros(self.fleet.n)
             reach[[row.i for row in rows]] = [float(np.quantile(row.slack(), share)) for row in rows]
@@ -419,7 +424,7 @@ class WorkingSet:
             for row, (samples, _) in zip(rows, found, strict=True):
                 self._hold(row, Samples.join([self._first[row.i], samples], self.fleet.p))
         for row in rows:
-            row.widen_pool(most=4 * (row.r + row.q))
+            row.widen_pool(4 * (row.r + row.q), None if near is None else np.inf)
 
     def _each(self, rows: list[Row], settle: Settle) -> None:
         """Settle rows on all cores, though PIQP holds the lock; with full weights, all at once."""

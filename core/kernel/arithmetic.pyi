@@ -84,7 +84,7 @@ class Judge:
         k: NDArray[np.intp],
         dt: Array,
         numbers: Sequence[Array | None],
-        marks: NDArray[np.uint8],
+        marks: NDArray[np.uint8] | None,
     ) -> None: ...
     def advance(self, runs: Array, z: Array, dt: Array, a: int, b: int, first: int, last: int) -> None: ...
 

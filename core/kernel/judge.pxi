@@ -119,15 +119,16 @@ cdef class Judge:
         cdef arrays.array room = doubles(np.ones(p + self.total + n + n * _TOGETHER))  # beyond z the regressors are 1
         cdef arrays.array cell = array("i", bytes(4 * (size or 1) * _TOGETHER))
         cdef bytes flags = np.asarray(counted, dtype=np.uint8).tobytes()
-        cdef bytes cells = b"" if occupied is None else np.ascontiguousarray(occupied, dtype=np.uint8).tobytes()
-        self._keep = [numbers, room, cell, flags, cells]
+        seen = np.ascontiguousarray([False] if occupied is None else occupied, dtype=bool).reshape(-1)
+        cdef const unsigned char[::1] cells = seen.view(np.uint8)  # no copy: of many signals it is large
+        self._keep = [numbers, room, cell, flags, seen]
         self.steady = numbers.data.as_doubles
         self.scale, self.least = self.steady + self.total, self.steady + 2 * self.total
         self.greatest, self.per_unit = self.least + size, self.least + 2 * size
         self.phi = room.data.as_doubles
         self.z, self.end = self.phi + p, self.phi + p + self.total
         self.rates = self.end + n
-        self.cell, self.counted, self.occupied = cell.data.as_ints, flags, cells
+        self.cell, self.counted, self.occupied = cell.data.as_ints, flags, &cells[0]
         for i, position in enumerate(positions):
             self.positions[i] = position
 
@@ -154,14 +155,15 @@ cdef class Judge:
         `x, u, s`: states, controls and further scheduling signals of its samples, recorded units; `k` (K,): samples
         that the transitions begin with, increasing; `dt` (K,): s; `numbers`: of each kind that a `Judgement` holds an
         array (samples, n), or None if nobody reads it; what it holds without a verdict has no meaning; `marks`
-        (samples,): take the bits above.
+        (samples,): take the bits above; None if nobody reads them, of which the domain takes the time.
         """
+        cdef bint marked = marks is not None
         cdef const double[:, :] states = x
         cdef const double[:, :] controls = u
         cdef const double[:, :] others = s
         cdef const Py_ssize_t[::1] begins = np.ascontiguousarray(k, dtype=np.intp)
         cdef const double[::1] steps = np.ascontiguousarray(dt, dtype=np.float64)
-        cdef unsigned char[::1] flags = marks
+        cdef unsigned char[::1] flags = marks if marked else np.empty(len(x), np.uint8)
         cdef double[:, ::1] values
         cdef double* to[5]
         cdef Py_ssize_t i, j, q, at, low, n = self.n, p = self.elements.p, count = begins.shape[0]
@@ -212,9 +214,10 @@ cdef class Judge:
                     memcpy(&scheduling[i, 0], &normal[self.positions[i], 0], tiles.count * sizeof(double))
                 while tiles.take():
                     tiles.sizes(p, psi)
-                    self.leave_domain(tiles.phi, _TOGETHER, tiles.many, out)
+                    if marked:
+                        self.leave_domain(tiles.phi, _TOGETHER, tiles.many, out)
                     for q in range(tiles.many):
-                        flags[begins[low + tiles.index[q]] + 1] = self.marks_of(tiles.regimes[q], out[q])
+                        flags[begins[low + tiles.index[q]] + 1] = self.marks_of(tiles.regimes[q], marked and out[q])
                     for i in range(n):
                         tiles.bounds(self.elements, i, psi, centre, half)
                         if expected != centre:

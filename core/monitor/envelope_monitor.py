@@ -458,7 +458,6 @@ class EnvelopeMonitor:
         """Arrays of some kinds of numbers, None of the others, that `Judge.judge_rows` fills in on all cores."""
         count = len(transient)
         numbers = [np.empty((count, self.model.n)) if kind in kinds else None for kind in range(UTILISATION + 1)]
-        marks = np.empty(count, dtype=np.uint8) if marks is None else marks
         pieces = len(steps.k) * (self.model.n + self.model.m) // _PIECE + 1
         ends = np.linspace(0, len(steps.k), pieces + 1).astype(int).tolist()
         judges = [self.model.judge_of(self.rule.margin, self._counted) for _ in ends[1:]]  # each has room of its own

@@ -144,7 +144,7 @@ def leave_out(
                     kept.append(None if weight is None else weight[a : b - 1])
         chosen = kept if own[0] is not None else weights
         try:
-            model = fit(pieces, weights=chosen, describe_data=False, **options)  # type: ignore[arg-type]
+            model = fit(pieces, weights=chosen, describe_data=False, near=full, **options)  # type: ignore[arg-type]
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
         model, level = model.with_residuals_of(full), Reach(model, pieces).level

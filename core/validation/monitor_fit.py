@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit, update
+from uncertain_lti.identification.assembly import is_constant
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, Transitions
@@ -35,6 +36,8 @@ FOLDS = 5
 """Fits without a part of the recordings, groups or, of a single recording, blocks, for an alarm or any other choice."""
 LIMIT, _MOST = 4e9, 2e7
 """Elements of all left-out problems together up to which parts are left out: some minutes; utilisations kept."""
+STATES = 20
+"""States of a machine too large to be left out, about, on which ways to fit are compared, if it has twice as many."""
 _SHOWN, _COMPARED = 1_000_000, 200_000  # transitions that a panel is learnt from, and ways to fit are compared on
 
 
@@ -81,17 +84,12 @@ def fit_monitored(
     if centred:
         options["operating_point"] = _medians(transients)
     model = fit(transients, progress=progress, **options)
-    names, _ = resolve_groups(transients, groups)
-    units = len(set(names)) if names else len(transients)
-    of_the_fit_alone = ("schedule", "transient_weights", "describe_data", "seek_carriers")
+    of_the_fit_alone = ("schedule", "transient_weights", "describe_data", "seek_carriers", "near")
     left = {name: value for name, value in options.items() if name not in of_the_fit_alone}
-    kept = float(model.fit_summary["transitions"]) * model.n
-    size = kept * (model.n + model.m)
     if options.get("transient_weights") is not None:
         why = "transient_weights are for all recordings, so none can be left out"
         return Monitored(model, None, None, why, centred)
-    if min(units if units > 1 else FOLDS, FOLDS) * size > LIMIT or kept > _MOST:
-        why = f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
+    if why := _too_large(transients, groups):
         seen = _seen(model, transients, _SHOWN)
         return Monitored(*_armed(seen, seen.parts, false_alarms), None, why, centred)
     try:
@@ -102,6 +100,17 @@ def fit_monitored(
         if false_alarms is not None:
             raise FitError(f"no alarm can be learnt for a rate: {error}") from None
         return Monitored(model, None, None, str(error), centred)
+
+
+def _too_large(transients: Sequence[Transient], groups: Sequence[Any] | str | None) -> str:
+    """Why no part of the recordings is left out, as that would take too long; "" if some are."""
+    names, _ = resolve_groups(transients, groups)
+    units = len(set(names)) if names else len(transients)
+    kept = float(sum(np.count_nonzero(t.usable) for t in transients)) * transients[0].x.shape[1]
+    size = kept * (transients[0].x.shape[1] + transients[0].u.shape[1])
+    if min(units if units > 1 else FOLDS, FOLDS) * size <= LIMIT and kept <= _MOST:
+        return ""
+    return f"learnt on fitted data, as leaving out takes {FOLDS} fits of a problem of {size:.2g} elements"
 
 
 def monitored_like(
@@ -131,40 +140,78 @@ def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str
     `ways`: options of `fit_monitored`, from the simplest on; `options`: further ones, for all. Where the recordings do
     not repeat one another the simplest is kept: nothing shows there that another holds. The others are compared on what
     was fitted, and the best of them with the first on what was left out, all by their envelopes of one step: horizons
-    are fitted to the way that is taken.
+    are fitted to the way that is taken. Of a machine too large to be left out some of the states are compared.
     """
     alone = {name: value for name, value in options.items() if name not in ("horizons", "widths", "drop_horizons")}
-    way, taken = ways[0], fit_monitored(transients, **{**alone, **ways[0]})
-    if len(ways) > 1 and taken.panel is not None and taken.panel.vouched:
-        best = _promising(transients, ways, taken.model, alone)
-        other = fit_monitored(transients, **{**alone, **best}) if best is not way else taken
+    judged = _on_some_states(transients, ways, alone)
+    way = judged or ways[0]
+    taken = fit_monitored(transients, **{**alone, **way})
+    if len(ways) > 1 and not judged and taken.panel is not None and taken.panel.vouched:
+        best, model = _promising(transients, ways, alone, taken.model)
+        other = fit_monitored(transients, near=model, **{**alone, **best}) if best is not way else taken
         if other.panel is not None and other.panel.figure < CLEARLY * taken.panel.figure:
             way, taken = best, other
-    return fit_monitored(transients, **{**options, **way}) if options.get("horizons") else taken
+    return fit_monitored(transients, near=taken.model, **{**options, **way}) if options.get("horizons") else taken
+
+
+def _on_some_states(
+    transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], options: Mapping[str, Any]
+) -> Mapping[str, Any] | None:
+    """The promising way by about STATES of the states, each fitted with the others, as which they are now controls.
+
+    None where all are compared: of few states, where parts are left out, or something is given for each of them.
+    """
+    first, n = transients[0], transients[0].x.shape[1]
+    given = ("weights", "transient_weights", "structure", "operating_point")
+    known = options.get("schedule") or (first.signals is not None and first.signals.structure)
+    if len(ways) < 2 or n < 2 * STATES or known or any(options.get(name) is not None for name in given):
+        return None
+    if not _too_large(transients, options.get("groups")):
+        return None
+    kept, of = np.arange(0, n, n // STATES), point_of(first)
+    rest = np.setdiff1d(np.arange(n), kept)
+    point = replace(
+        of, x_s=of.x_s[kept], X=of.X[kept], u_s=np.append(of.u_s, of.x_s[rest]), U=np.append(of.U, of.X[rest])
+    )
+    names, others = ([first.state_names[i] for i in some] for some in (kept, rest))
+    some = [
+        t.replace(
+            x=t.x[:, kept],
+            u=np.hstack([t.u, t.x[:, rest]]),
+            signals=None,
+            state_names=names,
+            control_names=[*t.control_names, *others],
+        )
+        for t in transients
+    ]
+    return _promising(some, ways, {**options, "operating_point": point})[0]
 
 
 def _promising(
-    transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], first: UncertainLTI, options: Mapping[str, Any]
-) -> Mapping[str, Any]:
-    """The way whose panel sees clearly smaller jumps on what was fitted; `first`: fitted in the first way."""
+    transients: Sequence[Transient],
+    ways: Sequence[Mapping[str, Any]],
+    options: Mapping[str, Any],
+    first: UncertainLTI | None = None,
+) -> tuple[Mapping[str, Any], UncertainLTI | None]:
+    """The way whose panel sees clearly smaller jumps on what was fitted, and that fit; `first`: in the first way."""
     named = ("describe_data", "seek_carriers", "groups", "false_alarms")
     shared = {name: value for name, value in options.items() if name not in named}
-
-    def figure(model: UncertainLTI) -> float:
-        seen = _seen(model, transients, _COMPARED)
-        return learn(seen, seen.parts).figure
-
-    best, least = ways[0], figure(first)
-    for way in ways[1:]:
+    one_length = is_constant(np.concatenate([t.transitions().dt for t in transients]))
+    best, least = (ways[0], first), np.inf
+    for way in ways:
         asked = {**shared, **way}
+        if one_length and asked["additive"] == "both" and {**way, "additive": "noise"} in ways:  # the same problem
+            continue
         if asked.pop("centred", False):
             asked["operating_point"] = _medians(transients)
         try:
-            size = figure(fit(transients, describe_data=False, **asked))
+            model = first if first and way is ways[0] else fit(transients, describe_data=False, **asked)
+            seen = _seen(model, transients, _COMPARED)
+            size = learn(seen, seen.parts).figure
         except (FitError, ModelError):
             continue
         if size < CLEARLY * least:
-            best, least = way, size
+            best, least = (way, model), size
     return best
 
 

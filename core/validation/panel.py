@@ -171,7 +171,9 @@ class Evidence:
         thresholds = np.concatenate(self.thresholds(rules, self.widths.shape[1], what))
         reached = self.peaks[(self.peaks > _NOTHING).any(axis=1)] / thresholds
         third = float(min(np.sort(reached.max(axis=1))[::-1][:3], default=0.0))
-        parts, levels = [part for part, _ in shown], [(sizes / thresholds).max(axis=1) for _, sizes in shown]
+        parts = [part for part, _ in shown]
+        pieces = [np.array_split(sizes, len(sizes) // WORTH_THREADS + 1) for _, sizes in shown]
+        levels = [np.concatenate([(some / thresholds).max(axis=1) for some in each]) for each in pieces]
         counts, near = (
             by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
             for factor in (self.factor, min(self.factor, max(0.95 * third, NEARBY * self.factor)))
@@ -301,7 +303,8 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> Array:
     alarm = Alarm(rules, model, np.ones(model.n, dtype=bool))
     values = np.zeros((part.judged, len(alarm.names)))
     alarm.over(part.spans, part.dt, np.zeros(part.judged, dtype=bool), part.rows, values=values)
-    sizes = np.minimum(np.nan_to_num(np.abs(values, out=values), copy=False), LARGEST, out=values)
+    sizes = np.minimum(np.abs(values, out=values), LARGEST, out=values)
+    sizes[np.isnan(sizes)] = 0.0
     squared = np.repeat([rule.kind != "mean" for rule in rules], [len(rule.thresholds(model.n)) for rule in rules])
     return np.asarray(np.sqrt(sizes, out=sizes, where=squared))
 
@@ -409,9 +412,15 @@ def _gathered(
     numbers = [len(rule.thresholds(n)) for rule in rules]
     ends = np.cumsum(numbers).tolist()
 
+    same = {id(part.utilisation) for part in left}
+    others = [part for part in fitted if id(part.utilisation) not in same]  # twice the same has the same median
+
     def top_and_median(rule: StatisticRule, columns: slice) -> tuple[Array, Array]:  # of one: of many states, much
-        every = np.concatenate([*(of[:, columns] for of in sizes), *(sizes_of([rule], part) for part in fitted)])
-        return every.max(axis=0), np.median(every, axis=0, overwrite_input=True)
+        every = [*(of[:, columns] for of in sizes), *(sizes_of([rule], part) for part in others)]
+        medians = [
+            np.median(np.concatenate(of), overwrite_input=True) for of in zip(*(of.T for of in every), strict=True)
+        ]
+        return np.max([of.max(axis=0, initial=0.0) for of in every], axis=0), np.array(medians)
 
     given = [(rule, slice(end - count, end)) for rule, count, end in zip(rules, numbers, ends, strict=True)]
     count = sum(part.judged for part in (*left, *fitted))

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, runs
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import BEYOND, outside_domain
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -175,17 +175,20 @@ def judge(
     judged = verdicts.judged & ~verdicts.withheld.any(axis=1)
     steps = transient.transitions()
     steps = steps.take(judged[steps.k + 1])
+    spans = runs(judged)
+    kept = slice(*spans[0]) if len(spans) == 1 else judged  # of one run no copies: of many states most of the memory
     resets = np.flatnonzero(back_and_restarts(transient.t_ns)[1])
     places = [model.steps.index(horizon.steps) if horizon.steps in model.steps else -1 for horizon in full.horizons]
-    longer, longer_residual = (
-        np.pad(values[judged], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)[:, places]
-        for values in (verdicts.longer_utilisation, verdicts.longer_residual)
-    )
-    outside, outside_domain = verdicts.flags[judged] == 1.0, verdicts.outside_domain
-    utilisation, residual = verdicts.utilisation[judged], verdicts.residual[judged]
-    width = verdicts.upper[judged]
-    width -= verdicts.lower[judged]
-    del verdicts  # of many states most of the memory
+    longer, longer_residual = np.full((2, len(steps.dt), len(places), model.n), np.nan)
+    for j, place in enumerate(places):
+        if place >= 0:
+            longer[:, j] = verdicts.longer_utilisation[kept, place]
+            longer_residual[:, j] = verdicts.longer_residual[kept, place]
+    outside, outside_domain = verdicts.flags[kept] == 1.0, verdicts.outside_domain
+    utilisation, residual = verdicts.utilisation[kept], verdicts.residual[kept]
+    width = verdicts.upper[kept]
+    width -= verdicts.lower[kept]
+    del verdicts  # with what is not kept
     whole, own = width, np.full((len(model.horizons) + 1, model.n), np.nan)  # the last for a horizon that it lacks
     if full is not model:
         _, half = full.columns_centre_and_half(full.normalised_columns(steps), steps.dt)
