@@ -16,7 +16,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from enum import Enum
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -183,6 +183,8 @@ class _File:
             else:
                 self._part.unlink()
         except OSError as error:
+            with suppress(OSError):  # or the interpreter tries again, and says so
+                self._stream.close()
             raise BagError(f"{self._part}: cannot be finished: {error.strerror}; what is in it can be read") from None
 
     @property
