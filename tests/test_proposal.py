@@ -358,6 +358,15 @@ def test_commands_that_come_now_and_then(tmp_path):
     assert fitted([path], proposal).fit_summary["transitions"] > 500
 
 
+def test_commands_at_a_rate_in_one_recording_and_now_and_then_in_the_next(tmp_path):
+    """Those of the second, 0.74 s apart, hold until the next one; only the first has many."""
+    now_and_then = [m for k, m in enumerate(driven(seed=1)) if m.topic == "/plant/state" or (k // 2) % 37 == 0]
+    paths = [save(tmp_path / f"{k}.mcap", m, {}) for k, m in enumerate([driven(count=3000), now_and_then])]
+    proposal = propose(paths)
+    assert "max_hold" not in yaml.safe_load(proposal.text)["controls"][0]
+    assert fitted(paths, proposal).fit_summary["transitions"] == 2999 + 399
+
+
 @pytest.mark.parametrize("still", [False, True])
 def test_clocks_that_disagree_or_stand_still_are_not_gone_by(tmp_path, still):
     """Stamps a day behind the log, and a command without any; a driver that stamps with the time of its start."""
