@@ -367,20 +367,28 @@ def test_commands_at_a_rate_in_one_recording_and_now_and_then_in_the_next(tmp_pa
     assert fitted(paths, proposal).fit_summary["transitions"] == 2999 + 399
 
 
-@pytest.mark.parametrize("still", [False, True])
-def test_clocks_that_disagree_or_stand_still_are_not_gone_by(tmp_path, still):
-    """Stamps a day behind the log, and a command without any; a driver that stamps with the time of its start."""
-    messages = []
-    for m in driven(("/odd", "/plant/cmd")):
-        if m.topic == "/odd":
+def stamped(messages, stamp):
+    """The state as a point with such stamps of log times."""
+    for m in messages:
+        if m.topic == "/plant/state":
             point = message("geometry_msgs/msg/Point", x=float(np.frombuffer(m.data[-8:])[0]), y=0.0, z=0.0)
-            stamp = header(10**18 if still else m.log_time - 86_400 * 10**9)
-            data = cdr("geometry_msgs/msg/PointStamped", header=stamp, point=point)
+            data = cdr("geometry_msgs/msg/PointStamped", header=header(stamp(m.log_time)), point=point)
             m = Message("/plant/state", m.log_time, data, m.log_time)
-        messages.append(m)
-    path, proposal = proposed(tmp_path, messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
+        yield m
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [[lambda log: log - 86_400 * 10**9], [lambda log: 10**18], [lambda log: log, lambda log: 0]],
+    ids=["a day behind the log, and a command without any", "the start of the driver", "not in the second recording"],
+)
+def test_stamps_that_cannot_be_used_give_way_to_times_of_arrival(tmp_path, stamps):
+    types, paths = {"/plant/state": "geometry_msgs/msg/PointStamped"}, []
+    for number, stamp in enumerate(stamps):
+        paths.append(save(tmp_path / f"{number}.mcap", list(stamped(driven(seed=number), stamp)), types))
+    proposal = propose(paths)
     assert yaml.safe_load(proposal.text)["topics"] == {"/plant/state": {"time": "log"}, "/plant/cmd": {"time": "log"}}
-    assert fitted([path], proposal).fit_summary["transitions"] > 300
+    assert fitted(paths, proposal).fit_summary["transitions"] > 300 * len(paths)
 
 
 def test_topics_and_names_that_yaml_would_misread(tmp_path):

@@ -184,7 +184,10 @@ def signals_file(
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
-        lines += ["", "# Their header stamps do not move, or not all use one clock: times of arrival serve for all."]
+        lines += [
+            "",
+            "# Not all header stamps move, are in each recording or of one clock: times of arrival serve for all.",
+        ]
         lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
     if table := layout.to_dict():
         lines += [

@@ -127,16 +127,16 @@ def times_of(stream: Stream, signals: SignalMap) -> Times:
 
 
 def resolved_by(recordings: Sequence[Times], signals: SignalMap) -> SignalMap:
-    """Resolve clock, max_gap and time sources over all recordings; by default stamps, where most messages have one."""
+    """Resolve clock, max_gap and time sources; by default stamps, where most messages of every recording have one."""
     sources: dict[str, str] = {}
     instants: dict[str, list[NDArray[np.int64]]] = {}
     for topic in signals.topics:
-        stamped, counted = (sum(times[topic][k] for times in recordings) for k in (0, 1))
+        share = min((times[topic][0] / times[topic][1] for times in recordings if times[topic][1]), default=0.0)
         chosen = signals.time.get(topic)
-        if chosen == "header" and not stamped:
-            none = "time is header, and no message has a stamp; write log, or leave it out"
+        if chosen == "header" and not share:
+            none = "time is header, and no message of a recording has a stamp; write log, or leave it out"
             raise SignalError(f"{signals.source}: topics: {topic}: {none}")
-        sources[topic] = chosen or ("header" if 2 * stamped > counted else "log")
+        sources[topic] = chosen or ("header" if share > 0.5 else "log")
         stamps = sources[topic] == "header"
         instants[topic] = [times[topic][2] if stamps else times[topic][3] for times in recordings]
     return resolve(signals, instants, sources)
