@@ -358,8 +358,8 @@ _REFERENCE = re.compile(
 
 
 _STATE = re.compile(
-    r"(state|odom|pose|twist|imu|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
-    r"depth|pressure|temperature|power|attitude|estimat|log|response|data$|(^|_)mag(net|_|$)|compass|transform)"
+    r"(state|odom|pose|twist|imu|uwb|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
+    r"depth|pressure|temperature|power|attitude|estimat|log|loc$|response|data$|(^|_)mag(net|_|$)|compass|transform)"
 )
 
 
