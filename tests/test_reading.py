@@ -132,6 +132,17 @@ def test_stamps_that_one_recording_lacks_are_used_of_none(tmp_path):
     refuses(SignalError, "time is header, and no message of a recording has", read_transients, paths, by_stamp)
 
 
+@pytest.mark.parametrize(("stop", "said"), [(20, True), (90, False)])
+def test_a_clock_topic_that_falls_silent_is_told(tmp_path, stop, said):
+    sent = [("/x", 10**8 * k, joint_state(10**8 * k, [k])) for k in range(1, stop)]
+    sent += [("/u", 10**8 * k, joint_state(10**8 * k, [k])) for k in range(1, 95)]
+    path = save(tmp_path, dict.fromkeys(("/x", "/u"), JOINT_STATE), sent, "a.mcap")
+    (run,) = read_transients(path, SignalMap(states=(Signal("x", "/x", "position[0]"),)))
+    assert [f"the last message of /x comes {9.4 - (stop - 1) / 10:.3g} s before" in note for note in run.notes] == [
+        True
+    ] * said
+
+
 # --- real recordings against a plain reader -------------------------------------------------------------------
 
 VICON = "/vicon/Group466CF/Group466CF/pose"

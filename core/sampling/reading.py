@@ -168,7 +168,7 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
     m, bag = len(signals.controls), stream.bag
     cut: dict[str, Any] = {"signals": signals, "max_gap": signals.max_gap, "min_step": signals.min_step}
     read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts}
-    notes = (*bag.warnings, *lags_in_words(stream, signals))
+    notes = (*bag.warnings, *lags_in_words(stream, signals), *_silence(bag, signals.clock or ""))
     transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], name=os.fspath(bag.path), notes=notes, **cut, **read)
     return transient, Decisions(*decisions)
 
@@ -193,6 +193,16 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
             of = "each sample has the control that had come, not the one of its instant"
             said.append(f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {by}: {of}")
     return said
+
+
+def _silence(bag: Recording, clock: str) -> Iterator[str]:
+    """Says that the clock topic stops long before the recording does."""
+    ends = [(info.first, info.last) for info in bag.topics.values() if info.first is not None and info.last is not None]
+    first, last = min(first for first, _ in ends), max(last for _, last in ends)
+    quiet = last - (bag.topics[clock].last or last)
+    if quiet > max(10**9, (last - first) // 20):
+        stops = f"the last message of {clock} comes {quiet * 1e-9:.3g} s before the recording ends"
+        yield f"{bag.path}: {stops}, and nothing is judged after it; has the sensor or its driver stopped?"
 
 
 def read_transients(
