@@ -960,6 +960,22 @@ def joints(still=""):
     return messages
 
 
+def test_the_angle_of_a_wheel_is_no_state_beside_its_rate(tmp_path):
+    """It grows with the way, beyond what any recording fitted; that of a steered wheel does not."""
+    messages, names, turned = [], ["wheel_left_joint", "steering_wheel"], np.zeros(2)
+    for m in driven():
+        if m.topic == "/plant/state":
+            rate = float(np.frombuffer(m.data[-8:])[0]) * np.array([1.0, -0.5])
+            turned = turned * [1.0, 0.9] + 0.02 * rate
+            of = {"name": names, "position": turned, "velocity": rate, "effort": np.empty(0)}
+            data = cdr(JOINT, header=header(m.log_time), **of)
+            m = Message("/joint_states", m.log_time, data, m.log_time)
+        messages.append(m)
+    _, proposal = proposed(tmp_path, messages, {"/joint_states": JOINT})
+    assert "position[wheel_left_joint]: grows with the way" in proposal.text
+    assert "position[steering_wheel]: grows" not in proposal.text
+
+
 @pytest.mark.parametrize(("still", "members"), [("", ("left", "right", "arm")), ("right", ("left", "arm"))])
 def test_the_file_is_for_all_that_move_alike(tmp_path, still, members):
     path, proposal = proposed(tmp_path, joints(still), {"/joint_states": JOINT, "/joint_commands": JOINT})
