@@ -149,6 +149,19 @@ def test_the_definitions_in_the_file_come_first(tmp_path):
         assert Bag(path).topics["/c"].type == "own_msgs/msg/Command"
 
 
+def test_a_topic_of_ros_1_without_its_slash_is_the_same_topic(tmp_path):
+    """`rosbag record scan` writes `scan`, `rosbag record -a` writes `/scan`."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    with Ros1Writer(tmp_path / "a.bag") as writer:
+        for topic in ("scan", "/cmd"):
+            connection = writer.add_connection(topic, "std_msgs/msg/Float64", typestore=store)
+            writer.write(
+                connection, 5, store.serialize_ros1(store.types["std_msgs/msg/Float64"](2.5), connection.msgtype)
+            )
+    assert set(Bag(tmp_path / "a.bag").topics) == {"/scan", "/cmd"}
+    assert [m.data for _, _, m in Bag(tmp_path / "a.bag").messages(["/scan"])] == [2.5]
+
+
 # --- damaged and hostile --------------------------------------------------------------------------------------
 
 

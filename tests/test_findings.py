@@ -122,6 +122,15 @@ def test_no_verdict_is_no_good_news():
     assert "Nothing left" not in html_report(model, verdicts, facts)
 
 
+def test_samples_without_a_verdict_are_told_with_their_reason():
+    """Half the samples of a stuck sensor were called gaps and missing values."""
+    x = np.arange(8.0)[:, None] * [1e-3, 1e-3]
+    x[5, 0] = math.nan
+    verdicts = [EnvelopeMonitor(model := by_hand()).check(Transient(np.arange(8.0), x, np.zeros((8, 1))))]
+    (told,) = (r["text"] for r in findings(model, "m", verdicts)["rely"]["reasons"] if "no verdict" in r["text"])
+    assert told.endswith("have no verdict (2 missing)")
+
+
 def test_the_headline_is_no_better_than_the_model():
     """Quiet by bounds that hold everything is no good news, and the page does not say so in green."""
     verdicts = [EnvelopeMonitor(by_hand()).check(Transient([0.0, 0.1], np.zeros((2, 2)), np.zeros((2, 1))))]

@@ -281,6 +281,16 @@ def test_a_recording_of_silence_is_said_and_leaves_no_file(world: World, tmp_pat
     assert not list(tmp_path.glob("*.mcap*"))
 
 
+def test_a_topic_that_is_waited_for_in_vain_is_named_alone(world: World, tmp_path: Path) -> None:
+    """Of `/there /missing` both were said to be silent."""
+    world.publisher(Float64, "/there")
+    process = world.command("record", "/there", "/missing", "--output", tmp_path / "x.mcap")
+    process.says("waiting for /missing")
+    process.signal(signal.SIGINT)
+    assert process.wait() == 2 and "/missing: not there, and was waited for" in process.output
+    assert "/there" not in process.output.rpartition("record: ")[2]
+
+
 def test_a_domain_without_ports_is_refused_by_the_commands_too(command, tmp_path, monkeypatch):
     monkeypatch.setenv("ROS_DOMAIN_ID", "233")
     status, said = command("record", "/a", "--output", tmp_path / "x.mcap")

@@ -358,20 +358,37 @@ def test_commands_that_come_now_and_then(tmp_path):
     assert fitted([path], proposal).fit_summary["transitions"] > 500
 
 
-@pytest.mark.parametrize("still", [False, True])
-def test_clocks_that_disagree_or_stand_still_are_not_gone_by(tmp_path, still):
-    """Stamps a day behind the log, and a command without any; a driver that stamps with the time of its start."""
-    messages = []
-    for m in driven(("/odd", "/plant/cmd")):
-        if m.topic == "/odd":
+def test_commands_at_a_rate_in_one_recording_and_now_and_then_in_the_next(tmp_path):
+    """Those of the second, 0.74 s apart, hold until the next one; only the first has many."""
+    now_and_then = [m for k, m in enumerate(driven(seed=1)) if m.topic == "/plant/state" or (k // 2) % 37 == 0]
+    paths = [save(tmp_path / f"{k}.mcap", m, {}) for k, m in enumerate([driven(count=3000), now_and_then])]
+    proposal = propose(paths)
+    assert "max_hold" not in yaml.safe_load(proposal.text)["controls"][0]
+    assert fitted(paths, proposal).fit_summary["transitions"] == 2999 + 399
+
+
+def stamped(messages, stamp):
+    """The state as a point with such stamps of log times."""
+    for m in messages:
+        if m.topic == "/plant/state":
             point = message("geometry_msgs/msg/Point", x=float(np.frombuffer(m.data[-8:])[0]), y=0.0, z=0.0)
-            stamp = header(10**18 if still else m.log_time - 86_400 * 10**9)
-            data = cdr("geometry_msgs/msg/PointStamped", header=stamp, point=point)
+            data = cdr("geometry_msgs/msg/PointStamped", header=header(stamp(m.log_time)), point=point)
             m = Message("/plant/state", m.log_time, data, m.log_time)
-        messages.append(m)
-    path, proposal = proposed(tmp_path, messages, {"/plant/state": "geometry_msgs/msg/PointStamped"})
+        yield m
+
+
+@pytest.mark.parametrize(
+    "stamps",
+    [[lambda log: log - 86_400 * 10**9], [lambda log: 10**18], [lambda log: log, lambda log: 0]],
+    ids=["a day behind the log, and a command without any", "the start of the driver", "not in the second recording"],
+)
+def test_stamps_that_cannot_be_used_give_way_to_times_of_arrival(tmp_path, stamps):
+    types, paths = {"/plant/state": "geometry_msgs/msg/PointStamped"}, []
+    for number, stamp in enumerate(stamps):
+        paths.append(save(tmp_path / f"{number}.mcap", list(stamped(driven(seed=number), stamp)), types))
+    proposal = propose(paths)
     assert yaml.safe_load(proposal.text)["topics"] == {"/plant/state": {"time": "log"}, "/plant/cmd": {"time": "log"}}
-    assert fitted([path], proposal).fit_summary["transitions"] > 300
+    assert fitted(paths, proposal).fit_summary["transitions"] > 300 * len(paths)
 
 
 def test_topics_and_names_that_yaml_would_misread(tmp_path):
@@ -941,6 +958,22 @@ def joints(still=""):
             messages.append(Message(topic, t, joint_state(t, values, names), t))
         x = x + (0.1 * (u - x) + 1e-3 * rng.standard_normal(3)) * moves
     return messages
+
+
+def test_the_angle_of_a_wheel_is_no_state_beside_its_rate(tmp_path):
+    """It grows with the way, beyond what any recording fitted; that of a steered wheel does not."""
+    messages, names, turned = [], ["wheel_left_joint", "steering_wheel"], np.zeros(2)
+    for m in driven():
+        if m.topic == "/plant/state":
+            rate = float(np.frombuffer(m.data[-8:])[0]) * np.array([1.0, -0.5])
+            turned = turned * [1.0, 0.9] + 0.02 * rate
+            of = {"name": names, "position": turned, "velocity": rate, "effort": np.empty(0)}
+            data = cdr(JOINT, header=header(m.log_time), **of)
+            m = Message("/joint_states", m.log_time, data, m.log_time)
+        messages.append(m)
+    _, proposal = proposed(tmp_path, messages, {"/joint_states": JOINT})
+    assert "position[wheel_left_joint]: grows with the way" in proposal.text
+    assert "position[steering_wheel]: grows" not in proposal.text
 
 
 @pytest.mark.parametrize(("still", "members"), [("", ("left", "right", "arm")), ("right", ("left", "arm"))])

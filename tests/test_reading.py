@@ -100,7 +100,7 @@ def test_recordings_become_what_the_rules_say(tmp_path_factory, case, compressio
     if silent:
         refuses(BagError, f"{path}: {silent[0]} has no message", read_transients, path, signals)
     elif unstamped:
-        with pytest.raises(SignalError, match=f"topics: {unstamped[0]}: time is header, and no message has a stamp"):
+        with pytest.raises(SignalError, match=f"topics: {unstamped[0]}: time is header, and no message of a rec"):
             read_transients(path, signals)
     elif len(set(instants)) < 2 or not any(s.dt > 0 for s in reference.samples):
         try:
@@ -114,6 +114,33 @@ def test_recordings_become_what_the_rules_say(tmp_path_factory, case, compressio
         same(transient, reference)
         assert transient.signals == signals
         assert transient.sources == (str(path),) and transient.name == str(path)
+
+
+def test_stamps_that_one_recording_lacks_are_used_of_none(tmp_path):
+    """All samples of the second were dropped, and its controls at the arrival raised ValueError."""
+    signals = SignalMap(states=(Signal("x", "/x", "position[0]"),), controls=(Signal("u", "/u", "position[0]"),))
+    for name, stamped in ("a", 1), ("b", 0):
+        sent = [
+            (t, 10**7 * k + 1, joint_state(10**7 * k * stamped, [k + stamped]))
+            for k in range(1, 9)
+            for t in ("/x", "/u")
+        ]
+        save(tmp_path, dict.fromkeys(("/x", "/u"), JOINT_STATE), sent, f"{name}.mcap")
+    runs = read_transients(paths := sorted(tmp_path.iterdir()), signals)
+    assert [len(run) for run in runs] == [8, 8] and runs[0].signals.time == {"/x": "log", "/u": "log"}
+    by_stamp = replace(signals, time={"/x": "header"})
+    refuses(SignalError, "time is header, and no message of a recording has", read_transients, paths, by_stamp)
+
+
+@pytest.mark.parametrize(("stop", "said"), [(20, True), (90, False)])
+def test_a_clock_topic_that_falls_silent_is_told(tmp_path, stop, said):
+    sent = [("/x", 10**8 * k, joint_state(10**8 * k, [k])) for k in range(1, stop)]
+    sent += [("/u", 10**8 * k, joint_state(10**8 * k, [k])) for k in range(1, 95)]
+    path = save(tmp_path, dict.fromkeys(("/x", "/u"), JOINT_STATE), sent, "a.mcap")
+    (run,) = read_transients(path, SignalMap(states=(Signal("x", "/x", "position[0]"),)))
+    assert [f"the last message of /x comes {9.4 - (stop - 1) / 10:.3g} s before" in note for note in run.notes] == [
+        True
+    ] * said
 
 
 # --- real recordings against a plain reader -------------------------------------------------------------------

@@ -153,6 +153,7 @@ def test_a_control_acts_as_it_was_recorded_at_the_departure_or_at_the_arrival_of
     assert both.transitions().u.tolist() == [[0, 5, 6], [1, 6, 7], [2, 7, 8]]
     assert both.control_names == ("u1", "u2", "u2 at arrival") and both.ends == ("departure", "departure", "arrival")
     again = Transient(t, x, u).controls_at("both")
+    assert Transient(t[:0], x[:0], u[:0]).controls_at("arrival").u.shape == (0, u.shape[1])
     assert again.transitions().u.tolist() == [[0, 1, 5, 6], [1, 2, 6, 7], [2, 3, 7, 8]]
     assert again.controls_at("both").ends == again.ends == again.replace(slice(0, 2)).ends
     for at, words in (("end", "at is 'end'; it must be departure"), ({"v": "both"}, "there is no control 'v'")):

@@ -62,14 +62,11 @@ def run(args: argparse.Namespace) -> Result:
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
         topics = list(dict.fromkeys(resolved_name(life.node, topic) for topic in args.topics))
         types = _wait_for(life, topics, args.wait, args.progress.note)
-        subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics if topic in types]
-        if subscriptions:
-            (args.progress.note if args.json else args.say)(
-                f"recording {', '.join(topics)} to {output}; stop with Ctrl-C"
-            )
-            stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
-            with stage as step:
-                _record(life, subscriptions, file, args.duration, step, args.progress.note)
+        subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics]
+        (args.progress.note if args.json else args.say)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
+        stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
+        with stage as step:
+            _record(life, subscriptions, file, args.duration, step, args.progress.note)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
@@ -90,9 +87,9 @@ def resolved_name(node: Node, topic: str) -> str:
 
 
 def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable[[str], None]) -> dict[str, str]:
-    """Type of each topic, as soon as all are there; {} when a signal came first."""
+    """Type of each topic, as soon as all are there."""
     there: dict[str, list[str]] = {}
-    missing: list[str] = []
+    missing = list(topics)
 
     def found() -> bool:
         there.clear()
@@ -107,9 +104,10 @@ def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable
     if not life.until(found, min(1.0, limit)) and life.alive and limit > 1.0:
         note(f"waiting for {', '.join(missing)}")
         life.until(found, limit - 1.0)
-    if missing and life.alive:
-        raise BagError(f"{', '.join(missing)}: not there after {limit:g} s; start what publishes it")
-    return {topic: there[topic][0] for topic in topics} if life.alive else {}
+    if missing:
+        since = f" after {limit:g} s" if life.alive else ", and was waited for, so nothing is recorded"
+        raise BagError(f"{', '.join(missing)}: not there{since}; start what publishes it")
+    return {topic: there[topic][0] for topic in topics}
 
 
 def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSubscription:

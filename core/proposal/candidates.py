@@ -100,7 +100,7 @@ class Source:
     can be used; `offset`: median of log time less header stamp, s; None without a stamp; `arrival` (messages,): log
     times per recording, ns; `stamp` (messages,): header stamps per recording, ns; negative for none; `candidates`: its
     numbers; `reason`: why none of them is proposed; empty otherwise; `halting`: its header stamps mostly repeat the one
-    before; `unreadable`: its messages cannot be read.
+    before, or are not in every recording; `unreadable`: its messages cannot be read.
     """
 
     topic: str
@@ -358,8 +358,8 @@ _REFERENCE = re.compile(
 
 
 _STATE = re.compile(
-    r"(state|odom|pose|twist|imu|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
-    r"depth|pressure|temperature|power|attitude|estimat|log|response|data$|(^|_)mag(net|_|$)|compass|transform)"
+    r"(state|odom|pose|twist|imu|uwb|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
+    r"depth|pressure|temperature|power|attitude|estimat|log|loc$|response|data$|(^|_)mag(net|_|$)|compass|transform)"
 )
 
 

@@ -144,11 +144,12 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
 
 _WITHIN = "answers within a step; add it if it has a memory of its own"
 _BESIDE = (
-    (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist above"),
+    (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist beside it"),
     (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", f"an acceleration {_WITHIN}"),
+    (r"^velocity\[.*wheel", r"^position\[(?!.*steer).*wheel", "grows with the way; its rate of change is beside it"),
     (r"^(position|velocity)\[", r"^effort\[", f"an effort {_WITHIN}"),
 )
-"""What is left out beside what, and why: of a pose and its twist the pose, of a joint the effort."""
+"""What is left out beside what, and why: of pose and twist the pose, of a wheel the angle, of a joint the effort."""
 
 
 def prefer_rates(source: Source) -> None:
@@ -273,7 +274,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
             continue
         source.reason = "the controls do not show in it"
         if source in shown:
-            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}"
+            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"

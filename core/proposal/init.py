@@ -127,6 +127,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     for bag in bags:
         _read(bag, [s for s in sources if s.candidates], progress)
     for source in sources:
+        source.halting |= len({bool((stamp > 0).any()) for stamp in source.stamp}) > 1
         if source.candidates and not source.rate > 0:
             source.reason, source.candidates = "no time passes between its messages", []
         elif source.candidates:

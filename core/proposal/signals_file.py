@@ -131,11 +131,14 @@ def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
     """Greatest age of a command that comes at a steady rate and ends, or pauses, before the states do."""
     if source.topic == clock.topic:  # it comes with the states
         return None, ""
-    steps = np.concatenate([np.empty(0), *(np.diff(a) for a in source.arrival)]) * 1e-9
-    steps = steps[steps > 0]
-    if not len(steps):
+    runs = [run[run > 0] for a in source.arrival if len(run := np.diff(a) * 1e-9) and run.any()]
+    if not runs:
         return None, ""
-    usual, long = float(np.median(steps)), float(np.percentile(steps, 99))
+    steps = np.concatenate(runs)
+    usual, long = (
+        max(float(np.median(run)) for run in runs),
+        float(np.percentile(steps, 99)),
+    )  # of the slowest recording
     if long > 4 * usual:
         return None, "comes now and then, and holds until the next one"
     pauses = float(steps.max()) > 10 * usual
@@ -143,7 +146,7 @@ def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
         pauses |= len(mine) > 0 and len(theirs) > 0 and (theirs[-1] - mine[-1]) * 1e-9 > 10 * usual
     if not pauses:
         return None, ""
-    limit = max(5 * usual, 2 * long)
+    limit = max(5 * usual, 2 * long, 1.0 / clock.rate)
     power = 10.0 ** math.floor(math.log10(limit))
     return next(f * power for f in (1, 2, 5, 10) if f * power >= limit), "s; older ones have ended"
 
@@ -181,7 +184,10 @@ def signals_file(
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
-        lines += ["", "# Their header stamps do not move, or not all use one clock: times of arrival serve for all."]
+        lines += [
+            "",
+            "# Not all header stamps move, are in each recording or of one clock: times of arrival serve for all.",
+        ]
         lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
     if table := layout.to_dict():
         lines += [

@@ -211,7 +211,10 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
         found.numbers[connection.id] = number
         metadata = {"offered_qos_profiles": qos[connection.id]} if qos.get(connection.id) else {}
         stored = encodings.get(connection.id) or "cdr"
-        found.channels[number] = Channel(number, connection.topic, stored, metadata, schema)
+        topic = (
+            connection.topic if found.magic == _DATABASE else f"/{connection.topic.lstrip('/')}"
+        )  # `rosbag record scan`
+        found.channels[number] = Channel(number, topic, stored, metadata, schema)
     if borrowed:
         lacks = "the file does not hold the definitions of all its types"
         found.warnings.append(f"{found.path}: {lacks}; those of {borrowed} are used")

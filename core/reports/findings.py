@@ -310,7 +310,8 @@ def _recording_reasons(
     for text in drift_in_words(model, recordings):
         yield CARE, "drift", text
     if silent > WITHOUT_VERDICT:
-        yield CARE, "recordings", f"{_percent(silent)} of the samples have no verdict (gaps, missing values)"
+        why = shortlist([reason for r in recordings for reason in r["no_verdict"]], 4)
+        yield CARE, "recordings", f"{_percent(silent)} of the samples have no verdict ({why})"
 
 
 def _percent(share: float) -> str:

@@ -127,16 +127,16 @@ def times_of(stream: Stream, signals: SignalMap) -> Times:
 
 
 def resolved_by(recordings: Sequence[Times], signals: SignalMap) -> SignalMap:
-    """Resolve clock, max_gap and time sources over all recordings; by default stamps, where most messages have one."""
+    """Resolve clock, max_gap and time sources; by default stamps, where most messages of every recording have one."""
     sources: dict[str, str] = {}
     instants: dict[str, list[NDArray[np.int64]]] = {}
     for topic in signals.topics:
-        stamped, counted = (sum(times[topic][k] for times in recordings) for k in (0, 1))
+        share = min((times[topic][0] / times[topic][1] for times in recordings if times[topic][1]), default=0.0)
         chosen = signals.time.get(topic)
-        if chosen == "header" and not stamped:
-            none = "time is header, and no message has a stamp; write log, or leave it out"
+        if chosen == "header" and not share:
+            none = "time is header, and no message of a recording has a stamp; write log, or leave it out"
             raise SignalError(f"{signals.source}: topics: {topic}: {none}")
-        sources[topic] = chosen or ("header" if 2 * stamped > counted else "log")
+        sources[topic] = chosen or ("header" if share > 0.5 else "log")
         stamps = sources[topic] == "header"
         instants[topic] = [times[topic][2] if stamps else times[topic][3] for times in recordings]
     return resolve(signals, instants, sources)
@@ -168,7 +168,7 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
     m, bag = len(signals.controls), stream.bag
     cut: dict[str, Any] = {"signals": signals, "max_gap": signals.max_gap, "min_step": signals.min_step}
     read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts}
-    notes = (*bag.warnings, *lags_in_words(stream, signals))
+    notes = (*bag.warnings, *lags_in_words(stream, signals), *_silence(bag, signals.clock or ""))
     transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], name=os.fspath(bag.path), notes=notes, **cut, **read)
     return transient, Decisions(*decisions)
 
@@ -193,6 +193,16 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
             of = "each sample has the control that had come, not the one of its instant"
             said.append(f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {by}: {of}")
     return said
+
+
+def _silence(bag: Recording, clock: str) -> Iterator[str]:
+    """Says that the clock topic stops long before the recording does."""
+    ends = [(info.first, info.last) for info in bag.topics.values() if info.first is not None and info.last is not None]
+    first, last = min(first for first, _ in ends), max(last for _, last in ends)
+    quiet = last - (bag.topics[clock].last or last)
+    if quiet > max(10**9, (last - first) // 20):
+        stops = f"the last message of {clock} comes {quiet * 1e-9:.3g} s before the recording ends"
+        yield f"{bag.path}: {stops}, and nothing is judged after it; has the sensor or its driver stopped?"
 
 
 def read_transients(

@@ -219,7 +219,7 @@ class Transient:
         for column, name, end, asked in zip(self.u.T, self.control_names, self.ends, wanted, strict=True):
             for one in ("departure", "arrival") if asked == "both" else (asked,):
                 later = one == "arrival" != end
-                columns.append(np.append(column[1:], math.nan) if later else column)
+                columns.append(np.append(column, math.nan)[1:] if later else column)
                 names.append(name + ARRIVAL if asked == "both" and later else name)
                 ends.append(one)
         self.u, self.control_names, self.ends = np.column_stack(columns), tuple(names), tuple(ends)
