@@ -43,7 +43,7 @@ other recording is outside of any envelope, the more the narrower it is."""
 PAYS = 0.8
 """Width of a horizon, or size of the jumps seen with a memory or with controls at the arrival, over those without, from
 which on it is worth having."""
-_OF_HORIZONS = 50_000  # transitions that horizons are chosen on, at most
+_OF_HORIZONS = 20_000  # transitions that horizons are chosen on, at most
 PIECE = 200
 """Transitions of a piece of a larger recording."""
 
