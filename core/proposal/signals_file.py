@@ -135,10 +135,8 @@ def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
     if not runs:
         return None, ""
     steps = np.concatenate(runs)
-    usual, long = (
-        max(float(np.median(run)) for run in runs),
-        float(np.percentile(steps, 99)),
-    )  # of the slowest recording
+    usual = max(float(np.median(run)) for run in runs)  # of the slowest recording
+    long = float(np.percentile(steps, 99))
     if long > 4 * usual:
         return None, "comes now and then, and holds until the next one"
     pauses = float(steps.max()) > 10 * usual
@@ -184,16 +182,12 @@ def signals_file(
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
-        lines += [
-            "",
-            "# Not all header stamps move, are in each recording or of one clock: times of arrival serve for all.",
-        ]
+        lines += ["", "# Not all header stamps move, are in each recording and of one clock: times of arrival"]
+        lines.append("# serve for all.")
         lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
     if table := layout.to_dict():
-        lines += [
-            "",
-            "# Columns of the time and of the runs, each value of which is a recording; or the s from row to row.",
-        ]
+        lines += ["", "# Columns of the time and of the runs, each value of which is a recording; or the"]
+        lines.append("# seconds from row to row.")
         texts = {key: _number(v, exact=True) if key == "step" else _quoted(v) for key, v in table.items()}
         lines += ["table:", *(f"  {key}: {text}" for key, text in texts.items())]
     if plant:

@@ -211,9 +211,8 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
         found.numbers[connection.id] = number
         metadata = {"offered_qos_profiles": qos[connection.id]} if qos.get(connection.id) else {}
         stored = encodings.get(connection.id) or "cdr"
-        topic = (
-            connection.topic if found.magic == _DATABASE else f"/{connection.topic.lstrip('/')}"
-        )  # `rosbag record scan`
+        name = connection.topic  # of ROS 1 without a slash, where `rosbag record scan` wrote it
+        topic = name if found.magic == _DATABASE else f"/{name.lstrip('/')}"
         found.channels[number] = Channel(number, topic, stored, metadata, schema)
     if borrowed:
         lacks = "the file does not hold the definitions of all its types"
