@@ -51,7 +51,7 @@ from uncertain_lti.signals.values import Additive, Criterion
 
 SMALL = 1e-4
 """Optimality gap from which on it is worth a word."""
-_LARGE = 1_000_000  # numbers in the recordings from which on a fit leaves much memory behind
+_LARGE = 100_000_000  # numbers that all rows go through, from which on a fit leaves much memory behind
 
 
 def fit(
@@ -236,7 +236,7 @@ def fit_fleet(
 
     `remember`: what the model's file keeps, of the model and `WorkingSet.nearest`.
     """
-    if large := fleet.N * fleet.p > _LARGE:
+    if large := fleet.N * fleet.p * fleet.n > _LARGE:
         return_memory()
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
         engine = WorkingSet(fleet, structure, progress, None if near is None else elements_of(near, fleet.columns))

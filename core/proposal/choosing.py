@@ -447,9 +447,7 @@ HELD = 0.8
 """Share of an analyser's changes that come after the same number of rows, two or more."""
 GATED = 0.99
 """Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
-_WEATHER = re.compile(
-    r"(^|_)(outdoor|outside|ambient|weather|wea(bus|sta)_)(?!.*(coil|damper|fan|flow|pump|unit|valve))"
-)
+_WEATHER = re.compile(r"(^|_)(outdoor|outside|ambient|wea(ther|bus_|sta_))(?!.*(coil|damper|fan|flow|pump|unit|valve))")
 _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
 
 
@@ -511,11 +509,12 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
 
 def _drop_errors(pool: Sequence[Candidate]) -> None:
     """Leave out the error of a controller, which jumps with its set point."""
-    some = [values[:: 1 + len(values) // 1000] for values in (np.concatenate(c.values) for c in pool)]
-    for k in (k for k, c in enumerate(pool) if not {"err", "error"}.isdisjoint(words_of(c.path))):
-        for i, j in permutations({*range(len(pool))} - {k}, 2):
-            if np.nanmax(np.abs(some[i] - some[j] - some[k])) < 1e-3 * np.ptp(pool[k].finite):
-                pool[k].reason = f"is {pool[i].path} less {pool[j].path}"
+    errors = [c for c in pool if not {"err", "error"}.isdisjoint(words_of(c.path))]
+    some = {c: (values := np.concatenate(c.values))[:: 1 + len(values) // 1000] for c in pool if errors}
+    for error in errors:
+        for a, b in permutations([c for c in pool if c is not error], 2):
+            if np.nanmax(np.abs(some[a] - some[b] - some[error])) < 1e-3 * np.ptp(error.finite):
+                error.reason = f"is {a.path} less {b.path}"
 
 
 def _is_set(candidate: Candidate, called: bool) -> bool:

@@ -120,7 +120,7 @@ def _read_csv(path: Path) -> RawTable:
     start = _CUT_TIME.sub(r"\1.", start) if cut_times else start
     lines = re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES]
     shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), cut_times=cut_times)
-    names = _unique(shape.names)
+    names, notes = _unique(shape.names), [shape.note] * bool(shape.note)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
     values = np.empty((0, 0))
     with suppress(ValueError, OverflowError), open(path, encoding=encoding, errors="replace", newline="") as text:
@@ -128,10 +128,10 @@ def _read_csv(path: Path) -> RawTable:
         values = np.loadtxt(text, delimiter=apart, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2)
     if values.shape[1] != len(names) or not len(values):
         read = _read_cells(path, encoding, shape, names)
-        return replace(read, units=units, notes=[*filter(None, [shape.note]), *read.notes])
+        return replace(read, units=units, notes=notes + read.notes)
     exact = partial(_texts, path, encoding, shape, names)
     found = dict(zip(names, np.ascontiguousarray(values.T), strict=True))
-    return RawTable(found, [*filter(None, [shape.note])], exact, units)
+    return RawTable(found, notes, exact, units)
 
 
 def _texts(path: Path, encoding: str, shape: _Shape, names: Sequence[str], name: str) -> Sequence[str]:

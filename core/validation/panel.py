@@ -545,10 +545,7 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
     if panel.asked is not None and not panel.limit <= panel.asked:
         more = panel.needed_hours - evidence.hours
         remedy = f"{lasting(more)} more without an alarm would" if more > 0 else "record more"
-        higher = (
-            f"the thresholds are {share:.0%} higher, as the parts differ; "
-            if (share := evidence.factor - 1) > 0
-            else ""
-        )
+        share = evidence.factor - 1.0
+        higher = f"the thresholds are {share:.0%} higher, as the parts differ; " * (share > 0.0)
         found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {higher}{remedy}")
     return found
