@@ -275,6 +275,8 @@ def fit_fleet(
     found = optimum(engine, criterion, build, [s.name for s in signals.states], method)
     nearest = engine.nearest() if remember is not None else []
     del engine  # with the samples that its rows hold
+    if large:
+        return_memory()
     model, judged, solution = found.envelope, found.judged, found.solution
     facts: dict[str, Any] = {
         "criterion": criterion,

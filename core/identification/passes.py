@@ -283,15 +283,13 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[S
         found.append(_near(candidate, block, columns, chosen, distance, offset))
         kept += np.bincount(found[-1].row, minlength=n)
         if (kept > 2 * candidate.most).any():
-            near = _Near.join(found)
-            each, reach = _least(near, n, candidate.most, reach)
-            found, kept = [near[np.sort(np.concatenate(each))]], np.array([len(some) for some in each])
-            halves = shifted()
+            each, reach = _least(found, n, candidate.most, reach)
+            found = [_Near.join([near[np.sort(np.concatenate(some))] for near, some in zip(found, each, strict=True)])]
+            kept, halves = np.bincount(found[0].row, minlength=n), shifted()
     samples = [Samples.join([], p)] * n
     if found:
-        near = _Near.join(found)
-        each, reach = _least(near, n, candidate.most, reach)
-        samples = [near.samples[some] for some in each]
+        each, reach = _least(found, n, candidate.most, reach)
+        samples = [Samples.beside([near.samples[a[i]] for near, a in zip(found, each, strict=True)]) for i in range(n)]
     held = reach if candidate.limit is None else np.minimum(reach, candidate.room)
     return list(zip(samples, held.tolist(), strict=True))
 
@@ -310,8 +308,6 @@ class _Near:
     @classmethod
     def join(cls, parts: Sequence[_Near]) -> _Near:
         """One after the other."""
-        if len(parts) == 1:
-            return parts[0]
         return cls(
             np.concatenate([part.row for part in parts]),
             Samples.beside([part.samples for part in parts]),
@@ -345,17 +341,23 @@ def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, r
     return _Near(row, samples, slack / (size * candidate.scale[row]))
 
 
-def _least(near: _Near, rows: int, most: int, reach: Array) -> tuple[list[Index], Array]:
-    """Positions of the samples of least slack, at most this many per row, and the slack below which none is missing."""
+def _least(found: Sequence[_Near], rows: int, most: int, reach: Array) -> tuple[list[list[Index]], Array]:
+    """Of each part and row the samples of least slack, at most this many per row, and the slack below which none lacks.
+
+    The samples are not put together for it: of many signals they are hundreds of MB.
+    """
     each, reach = [], reach.copy()
+    starts = np.cumsum([0, *(len(near.row) for near in found[:-1])])
+    of, slack = (np.concatenate([getattr(near, name) for near in found]) for name in ("row", "slack"))
     for i in range(rows):
-        own = np.flatnonzero(near.row == i)
+        own = np.flatnonzero(of == i)
         if len(own) > most:
-            order = np.argpartition(near.slack[own], most)
-            reach[i] = near.slack[own[order[most]]]
+            order = np.argpartition(slack[own], most)
+            reach[i] = slack[own[order[most]]]
             own = np.sort(own[order[:most]])
-        each.append(own)
-    return each, reach
+        parts = np.split(own, np.searchsorted(own, starts[1:]))
+        each.append([part - start for part, start in zip(parts, starts, strict=True)])
+    return [list(part) for part in zip(*each, strict=True)], reach
 
 
 @dataclass(frozen=True)

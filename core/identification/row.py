@@ -359,9 +359,11 @@ class Row:
         psi = self.columns.psi(samples.z, samples.dt, samples.s)
         size = self.size_unit @ psi
         size[size == 0.0] = 1.0
-        phi = ((self.phi_columns.take(self.columns.phi(samples.z, samples.s)) * self.unit_phi[:, None]) / size).T
-        psi = ((self.psi_columns.take(psi) * self.unit_psi[:, None]) / size).T
-        return _Held(samples.z, samples.dt, samples.s, phi, psi, size)
+        phi, psi = self.phi_columns.take(self.columns.phi(samples.z, samples.s)), self.psi_columns.take(psi)
+        for rows, unit in ((phi, self.unit_phi), (psi, self.unit_psi)):  # copies, of many unknowns large ones
+            rows *= unit[:, None]
+            rows /= size
+        return _Held(samples.z, samples.dt, samples.s, phi.T, psi.T, size)
 
     def along(self, pool: Index) -> Array:
         """Regressors of the nominal unknowns of some samples, in the row's coordinates, (K, r)."""

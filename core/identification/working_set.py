@@ -19,7 +19,7 @@ from time import perf_counter
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array, Index, on_cores, one_by_one
+from uncertain_lti.base.arrays import Array, Index, on_cores, one_by_one, return_memory
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.base.text import plural
@@ -466,6 +466,7 @@ class WorkingSet:
                 for row in rows:
                     self._nearest_of[row.i] = row.nearest(_NEAREST)
                     self.programmes[row.i].release(self.keeps)
+                return_memory()
 
     def _prove(self, settle: Settle, rows: list[Row]) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
