@@ -20,9 +20,12 @@ import itertools
 import os
 import re
 import struct
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import lru_cache
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, ClassVar
 from urllib.parse import quote
@@ -86,7 +89,7 @@ class Foreign(Contents):
         asked = block.channels if channels is None else channels
         pieces: list[bytes] = []
         try:
-            with _reader(self.path, self.magic) as reader:
+            with _reader(self.path, self.magic) if self.magic == _DATABASE else _among(self.path, block) as reader:
                 wanted = [connection for connection in reader.connections if self.numbers[connection.id] in asked]
                 for connection, time, data in reader.messages(wanted, block.start, block.end + 1) if wanted else ():
                     number = self.numbers[connection.id]
@@ -95,6 +98,8 @@ class Foreign(Contents):
                         pieces.append(message_record(number, len(pieces), time, time, message))
         except Exception as error:  # a library raises whatever the bytes lead it to
             raise changed(self.path, f" ({one_line(error)})") from None
+        if block is self.blocks[-1]:
+            _indexed.cache_clear()  # of millions of messages it is a GB
         return b"".join(pieces)
 
     def _definition(self, number: int) -> Definition:
@@ -131,6 +136,29 @@ def _reader(path: Path, magic: bytes) -> Iterator[Any]:
         yield reader
     finally:
         reader.close()
+
+
+@contextmanager
+def _among(path: Path, block: Block) -> Iterator[Any]:
+    """A reader of a ROS 1 bag that has no others than the messages of a block to look through."""
+    state = path.stat()
+    reader, indexes = _indexed(path, state.st_mtime_ns, state.st_size)
+    time = attrgetter("time")
+    reader.indexes = {
+        of: rows[bisect_left(rows, block.start, key=time) : bisect_right(rows, block.end, key=time)]
+        for of, rows in indexes.items()
+    }
+    yield reader
+
+
+@lru_cache(maxsize=1)
+def _indexed(path: Path, *_state: int) -> tuple[Any, Any]:
+    """A reader and its index, which takes longer to read than a block of messages."""
+    from rosbags.rosbag1 import Reader
+
+    reader = Reader(path)
+    reader.open()
+    return reader, reader.indexes
 
 
 def _scan(path: Path) -> Foreign:
