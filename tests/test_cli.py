@@ -23,7 +23,7 @@ from engine_bag import SIGNALS, engine_bag
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.progress import Progress
-from uncertain_lti.cli.main import main
+from uncertain_lti.cli.main import build_parser, main
 from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.plants.leibov import STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
@@ -415,3 +415,12 @@ def test_completion(tmp_path, cli):
     ask = "COMP_WORDS=(uncertain-lti fit --crit); COMP_CWORD=2; _shtab_uncertain_lti; echo ${COMPREPLY[@]}"
     done = subprocess.run(["bash", "-c", f"source {tmp_path}/script; {ask}"], capture_output=True, text=True)
     assert done.stdout.split() == ["--criterion"]
+
+
+def test_a_short_name_for_the_output_of_every_command():
+    """`-o` names the file to write wherever `--output` does."""
+    parser = build_parser(every=True)
+    commands = next(action.choices for action in parser._actions if isinstance(action.choices, dict))
+    taken = {name: command._option_string_actions for name, command in commands.items()}
+    writing = {name for name, options in taken.items() if "--output" in options}
+    assert {"init", "fit", "report", "record"} <= writing == {name for name in taken if "-o" in taken[name]}

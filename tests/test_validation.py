@@ -224,6 +224,18 @@ def test_blocks_keep_their_distance():
     assert "not independent" in validation.to_dict()["scenario"]["words"]
 
 
+def test_a_clock_that_begins_anew_parts_the_runs_of_a_recording():
+    """What is left out of five runs, each from 0 s on, takes neighbours of its own run with it, and no other run."""
+    t = np.tile(np.arange(100) * 0.1, 5)
+    rng = np.random.default_rng(0)
+    run = Transient(t, 0.1 * rng.normal(size=(500, 1)), rng.normal(size=(500, 1)))
+    assert remaining_spans(run, 230, 270, 2.0) == [(0, 211), (289, 500)]
+    assert remaining_spans(run, 205, 295, 2.0) == [(0, 200), (300, 500)]
+    found = validate(run, blocks=5, additive="noise")
+    assert sum(part.judged for part in found.parts) == 495 and found.gap > 0.0
+
+
+
 @pytest.mark.parametrize(("middle", "gap"), [(50, 6.0), (8, 4.0)])
 def test_the_guard_is_three_of_the_slowest_time_constants_or_half_of_the_shortest_block(middle, gap):
     zeros, run = np.zeros((3, 1)), Transient(np.arange(101.0), np.zeros((101, 3)), np.zeros((101, 1)))

@@ -294,7 +294,7 @@ class Command:
         if self.run is not None:
             for option in self.options:
                 name, changes = (option, {}) if isinstance(option, str) else option
-                parser.add_argument(name, **OPTIONS[name] | changes)
+                parser.add_argument(name, *["-o"] * (name == "--output"), **OPTIONS[name] | changes)
             parser.set_defaults(run=self.run)
         elif every or self.name == chosen:
             with nullcontext() if self.name == chosen else suppress(ModuleNotFoundError, UncertainLTIError):

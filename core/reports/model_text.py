@@ -34,7 +34,7 @@ MOST_SHOWN = 20
 def recording_text(transient: Transient) -> str:
     """One recording: what was read, and what of it is not used."""
     usable, left = int(transient.usable.sum()), ", ".join(unused(transient))
-    span = float(np.ptp(transient.t_ns)) * 1e-9 if len(transient) else 0.0
+    span = float(np.maximum(np.diff(transient.t_ns), 0).sum()) * 1e-9  # the clock may begin anew
     text = f"{plural(len(transient), 'sample')} over {span:.4g} s, {plural(usable, 'usable transition')}"
     return f"{transient.name}: {text}{f' ({left})' * bool(left)}"
 

@@ -56,7 +56,7 @@ def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
 def guard_interval(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
     """Three of the slowest stable time constants of the model, at most half of the shortest block."""
     stable = [-v.real for v in model.eigenvalues().ravel() if v.real < 0]
-    shortest = min(float(t.t[stop - 1] - t.t[start]) for t, start, stop in cuts)
+    shortest = min(float(np.maximum(np.diff(t.t[start:stop]), 0.0).sum()) for t, start, stop in cuts)
     return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
 
 
@@ -65,9 +65,13 @@ def remaining_spans(transient: Transient, start: int, stop: int, gap: float) -> 
     if (start, stop) == (0, len(transient)):
         return []
     t = transient.t
-    before = int(np.count_nonzero(t[: start + 1] <= t[start] - gap))
-    after = stop - 1 + int(np.count_nonzero(t[stop - 1 :] < t[stop - 1] + gap))
-    return [(0, min(before, start + 1)), (min(after, len(t)), len(t))]
+    before = start + 1 - _within(-t[start::-1], gap)
+    return [(0, before), (stop - 1 + _within(t[stop - 1 :], gap), len(t))]
+
+
+def _within(t: Array, gap: float) -> int:
+    """How many samples are less than the gap after the first and of its run: a clock that steps back begins another."""
+    return int(np.argmax(np.append((t >= t[0] + gap) | (np.diff(t, prepend=t[0]) < 0.0), True)))
 
 
 def leave_out(
