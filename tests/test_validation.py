@@ -235,7 +235,6 @@ def test_a_clock_that_begins_anew_parts_the_runs_of_a_recording():
     assert sum(part.judged for part in found.parts) == 495 and found.gap > 0.0
 
 
-
 @pytest.mark.parametrize(("middle", "gap"), [(50, 6.0), (8, 4.0)])
 def test_the_guard_is_three_of_the_slowest_time_constants_or_half_of_the_shortest_block(middle, gap):
     zeros, run = np.zeros((3, 1)), Transient(np.arange(101.0), np.zeros((101, 3)), np.zeros((101, 1)))

@@ -49,7 +49,9 @@ _DISCOVERY = 1.5  # s in which the programs of a domain find each other
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `uncertain-lti demo`."""
-    parser.add_argument("--output", metavar="FOLDER", default="demo-output", help="where model and figure are written")
+    parser.add_argument(
+        "--output", "-o", metavar="FOLDER", default="demo-output", help="where model and figure are written"
+    )
     parser.add_argument("--rate", type=speed, default=4.0, metavar="R", help="speed of the player (default 4)")
     parser.add_argument("--json", action="store_true", help="print what came out as JSON")
 
