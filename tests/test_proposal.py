@@ -318,6 +318,30 @@ def test_a_topic_of_unknown_name_is_taken_where_no_state_answers_and_its_bursts_
     assert "step: constant\nmax_gap: 0." in proposal.text
 
 
+def test_bursts_are_those_of_the_times_that_count(tmp_path):
+    """Header stamps that mostly stand still came evenly; by the times of arrival half of the samples were gaps."""
+    rng, messages, yaw = np.random.default_rng(4), [], 0.0
+    for k in range(1600):
+        yaw += 0.05 * rng.normal() - 0.05 * yaw
+        stamped = pose("/base/pose", at(k // 4 * 4), yaw)
+        messages.append(Message(stamped.topic, at(k // 8 * 8) + 1000 * (k % 8), stamped.data))
+    _, proposal = proposed(tmp_path, messages, {"/base/pose": POSE})
+    assert "/base/pose: {time: log}" in proposal.text and "step: constant\nmax_gap: 0." in proposal.text
+
+
+def test_a_reading_that_flickers_is_no_switch_and_a_demand_a_command(tmp_path):
+    """Two sensors that flicker in their last digit were the controls, and the current that is asked for no signal."""
+    rng, rows, speed = np.random.default_rng(5), [], 0.0
+    asked = np.repeat(rng.normal(size=40), 30).tolist()
+    for k, current in enumerate(asked):
+        rows.append([0.05 * k, speed, current, 621 + k % 2, 0.30 * current + 0.7 * speed, f"{0.05 * k:.2e}"])
+        speed += 0.1 * (current - speed) + 0.01 * rng.normal()
+    path = csv(tmp_path / "a.csv", ["time", "speed", "I_req", "adc_7", "V_bat", "way"], rows)
+    proposal = propose([path])
+    assert signals_of(proposal)[1] == [("/table", "I_req")], proposal.text
+    assert "way: grows as a clock or a counter does" in proposal.text  # of three digits
+
+
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     def extra(k, x, u):
         t = at(k)
@@ -1081,20 +1105,21 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         analyser = rng.normal() if k % 5 == 0 else analyser
         pressure = 2 * flow + 3 * rng.normal()
         rows.append([60 * k, level, rng.normal(), pressure, on[k], flow, 0, valve, analyser, level, int(k == 700)])
+        rows[-1] += [622 + int(rng.integers(2)), rng.random()]
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
-    path = csv(tmp_path / "plant.csv", names, rows)
+    path = csv(tmp_path / "plant.csv", [*names, "Flicker", "elapsed"], rows)
     proposal = propose([path])
-    assert [c.name for c in proposal.states] == ["Level1", "Temp"], proposal.text
+    assert [c.name for c in proposal.states] == ["Level1", "Temp", "Flicker"], proposal.text
     why = {c.name: c.why for c in proposal.controls}
     assert why["S_PU1"] == "switched between 0, 1" and why["F_PU1"] == "0 whenever S_PU1 is off"
     assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
-                  "Level1_again: moves with Level1"):  # fmt: skip
+                  "Level1_again: moves with Level1", "elapsed: a time that a computer took"):  # fmt: skip
         assert re.search(words, proposal.text), words
     assert not any(c.steady for c in [*proposal.states, *proposal.controls]), "fit decides what to count from"
     model = fitted([path], proposal)
-    assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0
+    assert model.state_names == ("Level1", "Temp", "Flicker", "XMV_1") and model.fit_summary["violations"] == 0
     noise = [message for message in model.fit_summary["messages"] if "'Temp' moves like noise" in message]
     assert noise and "leave it out" not in noise[0] and "its level is judged" in noise[0]  # as the proposal has it
     assert "its level is judged, how it moves needs faster rows" in remedies(noise, "noise", "Temp")

@@ -82,6 +82,7 @@ _RUN = re.compile(
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch"}  # words in the name of one
 _CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
+_TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
 _COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
@@ -289,6 +290,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
+    if source.type == TYPE and (not _TAKEN.isdisjoint(words_of(candidate.path)) or candidate.path.lower() == "dt"):
+        return "a time that a computer took, by its name, and no signal of the machine"
     if source.type == TYPE and _PLACE.search("_".join(words_of(candidate.path))):
         return "a place on the map, and another run may be elsewhere"
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
@@ -311,9 +314,9 @@ def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
     follows = bool(((y - slope * x) ** 2).sum() < (0.002 * np.ptp(finite)) ** 2 * len(finite))
     if np.mean(np.diff(finite) == 1) > 0.9 or (follows and any(abs(slope / 1000**k - 1) < 1e-3 for k in range(4))):
         return True
-    if (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+    if (np.diff(finite) < 0).any():
         return False
-    return follows or bool((finite == np.rint(finite)).all())
+    return follows or bool(len(np.unique(finite)) >= 0.5 * len(finite) and (finite == np.rint(finite)).all())
 
 
 def _wrapped(source: Source) -> None:
