@@ -342,6 +342,22 @@ def test_a_reading_that_flickers_is_no_switch_and_a_demand_a_command(tmp_path):
     assert "way: grows as a clock or a counter does" in proposal.text  # of three digits
 
 
+def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_told_and_no_signals(tmp_path):
+    """Of an engine's log at two rates no transition was left, and its gearbox was the command, which stood still."""
+    rng, rows, speed = np.random.default_rng(6), [], 1000.0
+    for k, throttle in enumerate(np.repeat(rng.uniform(0, 50, 40), 30).tolist()):
+        slow = ["", ""] if k % 2 else [throttle, f"{throttle + rng.normal():.3f}"]
+        rows.append([f"{0.02 * k:.2f}", speed, 3, *slow, f"{0.019 * k**1.01:.3f}"])
+        speed += 0.1 * (1000 + 40 * throttle - speed) + rng.normal()
+    path = csv(tmp_path / "a.csv", ["time", "rpm", "drivetrain_gear", "dbw_target", "tps", "Test (Sec)"], rows)
+    proposal = propose([path])
+    assert signals_of(proposal) == ([("/table", "rpm")], []), proposal.text
+    (warning,) = proposal.warnings
+    assert re.search("a number of (dbw_target, tps|tps, dbw_target); where it holds.* fill the empty cells", warning)
+    assert "Test_Sec: grows as a clock" in proposal.text
+    assert fitted([path], proposal).fit_summary["violations"] == 0
+
+
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     def extra(k, x, u):
         t = at(k)

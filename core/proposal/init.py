@@ -80,12 +80,13 @@ _RUN = re.compile(
 )  # name of a column that says which run a row is of
 
 
-_CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch"}  # words in the name of one
+_CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
 _CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
 _TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
 _COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
+_FILL = "fill the empty cells with the number above"
 
 
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
@@ -277,8 +278,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return f"always {finite[0] + 0.0:.6g}"
     if source.type != TYPE and np.ptp(finite) < DUST:
         return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
-    if len(finite) < 0.5 * len(values):
-        what = "rows only, so fill its empty cells with the number above" if source.type == TYPE else "messages only"
+    in_a_row = sum(np.count_nonzero(np.isfinite(v[:-1]) & np.isfinite(v[1:])) for v in candidate.values)
+    if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
+        what = f"rows only, so {_FILL}" if source.type == TYPE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
     counts = np.unique(finite, return_counts=True)[1]
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
@@ -410,6 +412,9 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
+    if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
+        few = "few rows, or no two in a row, have a number of"
+        warnings.append(f"{few} {shortlist(rare, 4)}; where it holds until the next one, {_FILL}")
     if not (states or controls or like) and is_plant(sources):  # names are those of the columns
         chosen, used = plant_signals(sources)
         if not chosen:
