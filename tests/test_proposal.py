@@ -358,6 +358,19 @@ def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_told_and_no_sig
     assert fitted([path], proposal).fit_summary["violations"] == 0
 
 
+def test_words_of_a_switch_are_read_where_they_are_truths_and_told_where_not(tmp_path):
+    """A heater that Excel wrote as WAHR and FALSCH and a fan with words of its own were lost without a word."""
+    rows, heat = [], 20.0
+    for k in range(600):
+        on, fan = k // 40 % 2, ("low", "high", "off")[k // 70 % 3]
+        rows.append([0.1 * k, f"{heat:.4f}", ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3]])
+        heat += 0.05 * (20 + 30 * on - heat)
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "heat", "heater", "fan", "fault_label"], rows)])
+    assert signals_of(proposal) == ([("/table", "heat")], [("/table", "heater")]), proposal.text
+    (said,) = [warning for warning in proposal.warnings if "words" in warning]
+    assert said.startswith("columns of words are no signals: fan (high, low, off);")
+
+
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     def extra(k, x, u):
         t = at(k)

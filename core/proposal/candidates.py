@@ -443,12 +443,17 @@ TWO_VALUES = "takes two values only"
 """Why a measurement is no state; in a table it may be a switch."""
 
 
+def is_label(name: str) -> bool:
+    """Whether a column says by its name what people hold of a row."""
+    return _LABEL.search(name.lower()) is not None
+
+
 def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> list[str]:
     """Leave out columns of tables that are labels by their names; a warning for each that does not stay the same."""
     columns: dict[str, Counter[object]] = {}
     for table in (bag for bag in bags if isinstance(bag, Table)):
         for name, column in table.columns_by_field.items():
-            if _LABEL.search(name.lower()):
+            if is_label(name):
                 values = [v for v in column.ravel().tolist() if v not in ("", None) and v == v]
                 columns.setdefault(name, Counter()).update(values)
     warnings = []

@@ -38,6 +38,7 @@ from uncertain_lti.proposal.candidates import (
     at_rest,
     bare,
     earlier,
+    is_label,
     role_by_name,
     role_of_column,
     set_aside_labels,
@@ -86,6 +87,8 @@ _TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
 _COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
+MOST_WORDS = 8
+"""Words of a column that is switched, at most."""
 _FILL = "fill the empty cells with the number above"
 
 
@@ -160,6 +163,17 @@ def run_column(bags: Sequence[Recording]) -> str:
     tables = [bag for bag in bags if isinstance(bag, Table)]
     names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
     return next((name for name in names if all(_tells_runs(table, name) for table in tables)), "")
+
+
+def _in_words(bags: Sequence[Recording], runs: str | None) -> list[str]:
+    """Columns of tables in which a few words change, as of a switch, with the words."""
+    found: dict[str, set[str]] = {}
+    for table in (bag for bag in bags if isinstance(bag, Table)):
+        for name, column in table.columns_by_field.items():
+            if column.dtype.kind == "O" and name != runs and not is_label(name):
+                found.setdefault(name, set()).update(str(cell) for cell in set(column.tolist()) if cell)
+    few = {name: sorted(words) for name, words in found.items() if 1 < len(words) <= MOST_WORDS}
+    return [f"{name} ({shortlist(words, 3)})" for name, words in few.items()]
 
 
 def _tells_runs(table: Table, name: str) -> bool:
@@ -412,6 +426,8 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
+    if words := _in_words(bags, layout.runs):
+        warnings.append(f"columns of words are no signals: {shortlist(words, 4)}; write numbers in place of them")
     if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
         few = "few rows, or no two in a row, have a number of"
         warnings.append(f"{few} {shortlist(rare, 4)}; where it holds until the next one, {_FILL}")
