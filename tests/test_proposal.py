@@ -1154,6 +1154,17 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     assert "its level is judged, how it moves needs faster rows" in remedies(noise, "noise", "Temp")
 
 
+def test_a_measurement_that_begins_at_0_with_its_command_is_a_state(tmp_path):
+    """Of a heater that was off in its first row alone nothing was left that is measured."""
+    rows, heat = [(0, 0, 0.0)], 800.0
+    for k in range(1, 900):
+        u = 1829 + 300 * (k // 90 % 3)
+        rows.append((k, u, f"{heat:.2f}"))
+        heat += 0.05 * (0.4 * u - heat)
+    path = csv(tmp_path / "heater.csv", ["T", "U", "Y"], rows)
+    assert signals_of(propose([path])) == ([("/table", "Y")], [("/table", "U")])
+
+
 def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_and_set_points_as_controls(tmp_path):
     """A drive at 20 rows a second: a label beside it, an end switch, a brake, a set point that its speed follows."""
     rng = np.random.default_rng(3)

@@ -541,7 +541,7 @@ def _gated(candidate: Candidate, switch: Candidate) -> bool:
     """Whether a column is 0 when a switch is at its least value, and nearly only then."""
     for values, on in zip(candidate.values, switch.values, strict=True):
         off = on == np.nanmin(np.concatenate(switch.values))
-        if np.mean((values == 0) == off) < GATED or not (values[off] == 0).any():
+        if np.mean((values == 0) == off) < GATED or np.count_nonzero(values[off] == 0) < FEWEST:
             return False
     return True
 
