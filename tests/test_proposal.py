@@ -371,6 +371,24 @@ def test_words_of_a_switch_are_read_where_they_are_truths_and_told_where_not(tmp
     assert said.startswith("columns of words are no signals: fan (high, low, off);")
 
 
+@pytest.mark.parametrize(
+    "names", [("x(m)", "y(m)", "vx(m/s)", "vy(m/s)"), ("pos_x", "pos_y", "velocity_x", "velocity_y")]
+)
+@pytest.mark.parametrize("own", [True, False])
+def test_the_place_of_a_body_goes_where_its_velocities_are_its_own(names, own, tmp_path):
+    """Of a racing car the next stretch of a healthy drive was an alarm; by velocities of its frame a place is told."""
+    rng, rows, x, y, heading, v, u = np.random.default_rng(8), [], 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3000):
+        u = float(rng.normal()) if k % 40 == 0 else u
+        turn = 0.4 + 0.1 * math.sin(k / 90)
+        ahead, aside = (v, 0.05 * v * turn) if own else (v * math.cos(heading), v * math.sin(heading))
+        rows.append([f"{0.02 * k:.2f}", *(f"{value + 1e-3 * rng.normal():.5f}" for value in (x, y, ahead, aside)), u])
+        x, y, heading = x + 0.02 * v * math.cos(heading), y + 0.02 * v * math.sin(heading), heading + 0.02 * turn
+        v += 0.02 * (5 + 2 * u - v)
+    proposal = propose([csv(tmp_path / "car.csv", ["time", *names, "throttle_cmd"], rows)])
+    assert ("a place in a fixed frame, where the velocities are the body's" in proposal.text) == own, proposal.text
+
+
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     def extra(k, x, u):
         t = at(k)

@@ -276,6 +276,8 @@ def _sift(source: Source) -> None:
             candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
         candidate.reason = _unfit(candidate, source)
     _wrapped(source)
+    if source.type == TYPE:
+        _leave_out_places(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
         source.reason += f" and {len(source.candidates) - 3} more" * (len(source.candidates) > 3)
@@ -333,6 +335,30 @@ def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
     if (np.diff(finite) < 0).any():
         return False
     return follows or bool(len(np.unique(finite)) >= 0.5 * len(finite) and (finite == np.rint(finite)).all())
+
+
+_OF_BODY = re.compile(
+    r"(?P<place>(pos(ition)?_?)?(?P<a>[xy])(_?pos(ition)?)?(_m)?)|(v|vel|velocity|speed)_?(?P<b>[xy])|(?P<c>[xy])_?(vel|dot)"
+)
+"""Columns of the place of a body in a plane, and of its velocity."""
+
+
+def _leave_out_places(source: Source) -> None:
+    """Of a body whose velocities are in its own frame: its place goes where it heads, which no linear model has."""
+    found = [(c, m) for c in source.free if (m := _OF_BODY.fullmatch(bare(c.path)))]
+    places = {m["a"]: c for c, m in found if m["place"]}
+    velocities = {m["b"] or m["c"]: c for c, m in found if not m["place"]}
+    if len(places) == len(velocities) == 2 and not all(_rate_of(places[axis], velocities[axis]) for axis in "xy"):
+        for candidate in places.values():
+            candidate.reason, candidate.ready = "a place in a fixed frame, where the velocities are the body's", "state"
+
+
+def _rate_of(place: Candidate, velocity: Candidate) -> bool:
+    """Whether a place moves in FEWEST rows as its velocity does meanwhile."""
+    move = np.concatenate([values[FEWEST:] - values[:-FEWEST] for values in place.values])
+    speed = np.concatenate([np.convolve(v, np.ones(FEWEST), "valid")[:-1] for v in velocity.values if len(v) > FEWEST])
+    good = np.isfinite(move) & np.isfinite(speed)
+    return bool(np.count_nonzero(good) < FEWEST or np.corrcoef(move[good], speed[good])[0, 1] > 0.9)
 
 
 def _wrapped(source: Source) -> None:
