@@ -110,6 +110,12 @@ def test_controls_that_nearly_move_together_are_named_with_the_cure():
     assert "'valve' and 'pump'" in message and "record 'valve' moving while 'pump' rests" in message
 
 
+def test_columns_that_move_together_in_two_ways_are_named_once():
+    one = run(noise=0.0)
+    twice = [m for m in messages(Transient(one.t_ns, one.x[:, [0, 0, 1, 1]], one.u, name="run")) if "rank def" in m]
+    assert len(twice) == len(set(twice)) > 0
+
+
 def test_a_state_that_follows_its_control_is_named_with_the_cure():
     u = np.zeros((1501, 2))
     u[:, 0] = np.sin(np.arange(1501) * 0.002)  # far slower than the plant

@@ -131,6 +131,15 @@ def test_samples_without_a_verdict_are_told_with_their_reason():
     assert told.endswith("have no verdict (2 missing)")
 
 
+def test_what_of_many_recordings_was_never_fitted_is_told_of_the_two_farthest():
+    x = np.sin(np.arange(300) / 20)[:, None]
+    model = fit([Transient(np.arange(300) * 0.01, x, x)], additive="noise")
+    runs = [Transient(np.arange(300) * 0.01, x + 3 * far, x, name=f"run {far}") for far in (1, 2, 3, 4)]
+    facts = findings(model, "m", [EnvelopeMonitor(model).check(run) for run in runs])
+    (told,) = (r["text"] for r in facts["rely"]["reasons"] if "ranges seen in the fit" in r["text"])
+    assert told.count("x1 at ") == 2 and told.endswith("; and others in 2 more recordings")
+
+
 def test_the_headline_is_no_better_than_the_model():
     """Quiet by bounds that hold everything is no good news, and the page does not say so in green."""
     verdicts = [EnvelopeMonitor(by_hand()).check(Transient([0.0, 0.1], np.zeros((2, 2)), np.zeros((2, 1))))]

@@ -253,6 +253,20 @@ def test_sizes_have_the_order_that_they_must_have(validation, found):
     assert all(by_name(found)["spike", s].size < np.inf for s in ("x1", "x2", "x3"))
 
 
+def test_an_earlier_value_of_a_state_is_no_actuator():
+    topic = {"topic": "/m", "type": "std_msgs/msg/Float64MultiArray"}
+    of = [Signal(n, field=f, **topic) for n, f in (("x", "data[0]"), ("u", "data[1]"), ("was", "lag(data[0], 1)"))]
+    signals, runs = SignalMap((of[0],), (of[1], of[2]), clock="/m", max_gap=1.0), []
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        x, u = np.zeros(400), np.repeat(rng.normal(size=40), 10)
+        for k in range(399):
+            x[k + 1] = 0.8 * x[k] + 0.2 * u[k] + 0.01 * rng.normal()
+        runs.append(Transient(0.1 * np.arange(399.0), x[1:, None], np.column_stack([u[1:], x[:-1]]), signals=signals))
+    result = validate(runs, additive="noise", alarm_rule=AlarmRule(2, 3))
+    assert [s.signal for s in detectable(result.model, result.parts, kinds=("loss",)).faults] == ["u"]
+
+
 def test_what_cannot_be_known_is_refused_in_words(validation):
     too_long = detectable(validation.model, validation.parts, 100.0)
     assert "lasts 100 s without a gap" in too_long.refused and not too_long.faults

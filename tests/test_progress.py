@@ -117,6 +117,16 @@ def test_a_step_that_is_counted_moves_the_bar():
     assert "note: said while the bar stands\n" in said and said.endswith("note: said after it\n")
 
 
+def test_what_holds_of_several_recordings_is_one_note():
+    screen = io.StringIO()
+    with Progress(stream=screen) as progress:
+        progress.note(*(f"{name}.csv: column 't': in ms" for name in "abcd"), "d.csv: is short", "alone")
+        progress.note("d.csv: column 't': in ms", "e.csv: column 't': in ms")
+    one, short, alone, later = screen.getvalue().splitlines()
+    assert one == "note: a.csv, b.csv and 2 more: column 't': in ms" and later == "note: e.csv: column 't': in ms"
+    assert (short, alone) == ("note: d.csv: is short", "note: alone")
+
+
 def test_a_log_gets_a_line_now_and_then_with_the_time_left(monkeypatch):
     now = 0.0
     monkeypatch.setattr(time, "perf_counter", lambda: now)

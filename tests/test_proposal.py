@@ -318,6 +318,77 @@ def test_a_topic_of_unknown_name_is_taken_where_no_state_answers_and_its_bursts_
     assert "step: constant\nmax_gap: 0." in proposal.text
 
 
+def test_bursts_are_those_of_the_times_that_count(tmp_path):
+    """Header stamps that mostly stand still came evenly; by the times of arrival half of the samples were gaps."""
+    rng, messages, yaw = np.random.default_rng(4), [], 0.0
+    for k in range(1600):
+        yaw += 0.05 * rng.normal() - 0.05 * yaw
+        stamped = pose("/base/pose", at(k // 4 * 4), yaw)
+        messages.append(Message(stamped.topic, at(k // 8 * 8) + 1000 * (k % 8), stamped.data))
+    _, proposal = proposed(tmp_path, messages, {"/base/pose": POSE})
+    assert "/base/pose: {time: log}" in proposal.text and "step: constant\nmax_gap: 0." in proposal.text
+
+
+def test_a_reading_that_flickers_is_no_switch_and_a_demand_a_command(tmp_path):
+    """Two sensors that flicker in their last digit were the controls, and the current that is asked for no signal."""
+    rng, rows, speed = np.random.default_rng(5), [], 0.0
+    asked = np.repeat(rng.normal(size=40), 30).tolist()
+    for k, current in enumerate(asked):
+        rows.append([0.05 * k, speed, current, 621 + k % 2, 0.30 * current + 0.7 * speed, f"{0.05 * k:.2e}"])
+        speed += 0.1 * (current - speed) + 0.01 * rng.normal()
+    path = csv(tmp_path / "a.csv", ["time", "speed", "I_req", "adc_7", "V_bat", "way"], rows)
+    proposal = propose([path])
+    assert signals_of(proposal)[1] == [("/table", "I_req")], proposal.text
+    assert "way: grows as a clock or a counter does" in proposal.text  # of three digits
+
+
+def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_told_and_no_signals(tmp_path):
+    """Of an engine's log at two rates no transition was left, and its gearbox was the command, which stood still."""
+    rng, rows, speed = np.random.default_rng(6), [], 1000.0
+    for k, throttle in enumerate(np.repeat(rng.uniform(0, 50, 40), 30).tolist()):
+        slow = ["", ""] if k % 2 else [throttle, f"{throttle + rng.normal():.3f}"]
+        rows.append([f"{0.02 * k:.2f}", speed, 3, *slow, f"{0.019 * k**1.01:.3f}"])
+        speed += 0.1 * (1000 + 40 * throttle - speed) + rng.normal()
+    path = csv(tmp_path / "a.csv", ["time", "rpm", "drivetrain_gear", "dbw_target", "tps", "Test (Sec)"], rows)
+    proposal = propose([path])
+    assert signals_of(proposal) == ([("/table", "rpm")], []), proposal.text
+    (warning,) = proposal.warnings
+    assert re.search("a number of (dbw_target, tps|tps, dbw_target); where it holds.* fill the empty cells", warning)
+    assert "Test_Sec: grows as a clock" in proposal.text
+    assert fitted([path], proposal).fit_summary["violations"] == 0
+
+
+def test_words_of_a_switch_are_read_where_they_are_truths_and_told_where_not(tmp_path):
+    """A heater that Excel wrote as WAHR and FALSCH and a fan with words of its own were lost without a word."""
+    rows, heat = [], 20.0
+    for k in range(600):
+        on, fan = k // 40 % 2, ("low", "high", "off")[k // 70 % 3]
+        rows.append([0.1 * k, f"{heat:.4f}", ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3]])
+        heat += 0.05 * (20 + 30 * on - heat)
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "heat", "heater", "fan", "fault_label"], rows)])
+    assert signals_of(proposal) == ([("/table", "heat")], [("/table", "heater")]), proposal.text
+    (said,) = [warning for warning in proposal.warnings if "words" in warning]
+    assert said.startswith("columns of words are no signals: fan (high, low, off);")
+
+
+@pytest.mark.parametrize(
+    "names", [("x(m)", "y(m)", "vx(m/s)", "vy(m/s)"), ("pos_x", "pos_y", "velocity_x", "velocity_y")]
+)
+@pytest.mark.parametrize("own", [True, False])
+def test_the_place_of_a_body_goes_where_its_velocities_are_its_own(names, own, tmp_path):
+    """Of a racing car the next stretch of a healthy drive was an alarm; by velocities of its frame a place is told."""
+    rng, rows, x, y, heading, v, u = np.random.default_rng(8), [], 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(3000):
+        u = float(rng.normal()) if k % 40 == 0 else u
+        turn = 0.4 + 0.1 * math.sin(k / 90)
+        ahead, aside = (v, 0.05 * v * turn) if own else (v * math.cos(heading), v * math.sin(heading))
+        rows.append([f"{0.02 * k:.2f}", *(f"{value + 1e-3 * rng.normal():.5f}" for value in (x, y, ahead, aside)), u])
+        x, y, heading = x + 0.02 * v * math.cos(heading), y + 0.02 * v * math.sin(heading), heading + 0.02 * turn
+        v += 0.02 * (5 + 2 * u - v)
+    proposal = propose([csv(tmp_path / "car.csv", ["time", *names, "throttle_cmd"], rows)])
+    assert ("a place in a fixed frame, where the velocities are the body's" in proposal.text) == own, proposal.text
+
+
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
     def extra(k, x, u):
         t = at(k)
@@ -1081,23 +1152,35 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         analyser = rng.normal() if k % 5 == 0 else analyser
         pressure = 2 * flow + 3 * rng.normal()
         rows.append([60 * k, level, rng.normal(), pressure, on[k], flow, 0, valve, analyser, level, int(k == 700)])
+        rows[-1] += [622 + int(rng.integers(2)), rng.random()]
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
-    path = csv(tmp_path / "plant.csv", names, rows)
+    path = csv(tmp_path / "plant.csv", [*names, "Flicker", "elapsed"], rows)
     proposal = propose([path])
-    assert [c.name for c in proposal.states] == ["Level1", "Temp"], proposal.text
+    assert [c.name for c in proposal.states] == ["Level1", "Temp", "Flicker"], proposal.text
     why = {c.name: c.why for c in proposal.controls}
     assert why["S_PU1"] == "switched between 0, 1" and why["F_PU1"] == "0 whenever S_PU1 is off"
     assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
-                  "Level1_again: moves with Level1"):  # fmt: skip
+                  "Level1_again: moves with Level1", "elapsed: a time that a computer took"):  # fmt: skip
         assert re.search(words, proposal.text), words
     assert not any(c.steady for c in [*proposal.states, *proposal.controls]), "fit decides what to count from"
     model = fitted([path], proposal)
-    assert model.state_names == ("Level1", "Temp", "XMV_1") and model.fit_summary["violations"] == 0
+    assert model.state_names == ("Level1", "Temp", "Flicker", "XMV_1") and model.fit_summary["violations"] == 0
     noise = [message for message in model.fit_summary["messages"] if "'Temp' moves like noise" in message]
     assert noise and "leave it out" not in noise[0] and "its level is judged" in noise[0]  # as the proposal has it
     assert "its level is judged, how it moves needs faster rows" in remedies(noise, "noise", "Temp")
+
+
+def test_a_measurement_that_begins_at_0_with_its_command_is_a_state(tmp_path):
+    """Of a heater that was off in its first row alone nothing was left that is measured."""
+    rows, heat = [(0, 0, 0.0)], 800.0
+    for k in range(1, 900):
+        u = 1829 + 300 * (k // 90 % 3)
+        rows.append((k, u, f"{heat:.2f}"))
+        heat += 0.05 * (0.4 * u - heat)
+    path = csv(tmp_path / "heater.csv", ["T", "U", "Y"], rows)
+    assert signals_of(propose([path])) == ([("/table", "Y")], [("/table", "U")])
 
 
 def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_and_set_points_as_controls(tmp_path):

@@ -991,7 +991,7 @@ def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
         ("time (millisec)", 5, 0.005, "taken for ms"),
         ("ms_today", 40, 0.04, "taken for ms"),
         ("us_since_boot", 2500, 0.0025, "taken for us"),
-        ("timestamp", 1000000, 1e6, "taken for s, 1000000 from row to row"),
+        ("timestamp", 90, 90.0, "taken for s, 90 from row to row"),
         ("timestamp", 7200, 7200.0, ""),  # by the hour or so
         ("timestamp", 5, 5.0, "taken for s, 5 from row to row"),
         ("timestamp_s", 5, 5.0, ""),
@@ -1003,6 +1003,16 @@ def test_the_unit_of_a_clock_is_in_its_name_or_asked_for(head, step, seconds, wo
     bag = read_csv(tmp_path, f"{head},x", (f"{112574307 + step * k},{k % 7}" for k in range(60)))
     assert set(np.diff(bag.times).tolist()) == {round(seconds * 1e9)}
     assert words in " ".join(bag.warnings) and bool(bag.warnings) == bool(words)
+
+
+def test_a_clock_whose_rows_are_far_apart_in_no_unit_is_refused_until_its_unit_is_given(tmp_path):
+    """Of a quadrotor at 83 rows a second a plant's model was fitted, of a row in three hours."""
+    rows = [f"{112574307 + 11999 * k + k % 3},{k % 7}" for k in range(60)]
+    refuses(BagError, "12000 from row to row: has no unit.*--table unit=us", read_csv, tmp_path, "timestamp,x", rows)
+    (bag,) = group_recordings([tmp_path / "a.csv"], layout=TableLayout(unit="us"))
+    assert np.median(np.diff(bag.times)) == 12_000_000
+    polled = read_csv(tmp_path, "timestamp,x", (f"{1732860000 + 302 * k},{k % 7}" for k in range(60)))  # since 1970
+    assert np.median(np.diff(polled.times)) == 302 * 10**9
 
 
 @pytest.mark.parametrize("suffix", [".txt", ".dat", ".TXT"])

@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, TextIO
 
-from uncertain_lti.base.text import printable
+from uncertain_lti.base.text import printable, shortlist
 
 _DELAY = 0.4  # s; what is done sooner shows no bar
 _REDRAW = 0.1  # s
@@ -71,11 +71,18 @@ class Progress:
         return not self.quiet and self._stream.isatty()
 
     def note(self, *texts: str) -> None:
-        """Remarks that the reader should know, unless quiet, each once: `start` reads a recording several times."""
+        """Remarks that the reader should know, unless quiet, each once: `start` reads a recording several times.
+
+        Those of several recordings that differ in the name before the colon alone are one.
+        """
+        named: dict[str, list[str]] = {}
         for text in texts if not self.quiet else ():
             if text not in self._noted:
                 self._noted.add(text)
-                self.write(f"note: {printable(text)}")
+                name, colon, rest = text.partition(": ")
+                named.setdefault(colon + rest or name, []).append(name * bool(colon))
+        for rest, names in named.items():
+            self.write(f"note: {printable(shortlist(names, 2) + rest)}")
 
     def say(self, text: str) -> None:
         """Part of the result, on standard output, unless quiet; a bar stays below it."""

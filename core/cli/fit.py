@@ -90,8 +90,8 @@ def _read(options: argparse.Namespace, signals: str | SignalMap) -> list[Transie
     from uncertain_lti.sampling.reading import loses_much
 
     transients = read_transients(options.bags, signals, options.progress.iterate("reading"), processes=None)
+    options.progress.note(*(note for transient in transients for note in transient.notes))
     for transient in transients:
-        options.progress.note(*transient.notes)
         (options.say_losses if loses_much(transient) else options.say)(recording_text(transient))
     return transients
 
@@ -209,8 +209,7 @@ def tune(options: argparse.Namespace) -> Result:
     if not healthy:
         raise FitError("no recording of the healthy machine is named; give at least one without a label")
     transients = read_transients(healthy, options.signals, options.progress.iterate("reading"), processes=None)
-    for transient in transients:
-        options.progress.note(*transient.notes)
+    options.progress.note(*(note for transient in transients for note in transient.notes))
     resolve_groups(transients, options.group)
     signals = transients[0].signals
     assert signals is not None

@@ -100,7 +100,7 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
                 f"rank deficient: {_quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
-    return int(np.count_nonzero(values > limit)), messages
+    return int(np.count_nonzero(values > limit)), list(dict.fromkeys(messages))
 
 
 def _directions(sums: Moments, columns: NDArray[np.intp]) -> tuple[Array, Array]:

@@ -86,6 +86,11 @@ class Candidate:
         return np.asarray(values[np.isfinite(values)])
 
     @property
+    def flickers(self) -> bool:
+        """Whether it moves by less than a hundredth of what it is, as a reading's last digits do, and no switch."""
+        return bool(np.ptp(self.finite) < 0.01 * np.abs(self.finite).max())
+
+    @property
     def kind(self) -> str:
         """Path without the entry: `position` of `position[j0]`."""
         return self.path.partition("[")[0]
@@ -336,14 +341,10 @@ def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: 
 
 
 # Words in the name of a topic or of its type; the last word of a name counts most.
-_COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive|trajectory"
+_COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive(?!n|train)|trajectory"
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
-
-
 _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)tau(_?con)?_?\d*$")  # of a control in a table
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
-
-
 _LABEL = re.compile(
     r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
     r"alarm|emergency|(^|_)e_?stop|protective_?stop|(^|_)(lost|fail(ed|ure)?)$)"
@@ -351,26 +352,20 @@ _LABEL = re.compile(
 _LABELS = 30
 """Values that a label takes, at most."""
 
-
 _REFERENCE = re.compile(
-    r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)soll|demand|ref$|_des(_|\d|$)|(^|_)(sp|ref|des)_|_sp$)"
+    r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)soll|demand|request|(^|_)req(_|$)|ref$|_des(_|\d|$)|"
+    r"(^|_)(sp|ref|des)_|_sp$)"
 )
-
-
 _STATE = re.compile(
     r"(state|odom|pose|twist|imu|uwb|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
     r"depth|pressure|temperature|power|attitude|estimat|log|loc$|response|data$|(^|_)mag(net|_|$)|compass|transform)"
 )
-
-
 _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
-
-
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 
 
 _TOLD = re.compile(
-    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
+    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
 )
 """Likewise, of what is measured or reckoned, in the names of columns."""
 
@@ -448,12 +443,17 @@ TWO_VALUES = "takes two values only"
 """Why a measurement is no state; in a table it may be a switch."""
 
 
+def is_label(name: str) -> bool:
+    """Whether a column says by its name what people hold of a row."""
+    return _LABEL.search(name.lower()) is not None
+
+
 def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> list[str]:
     """Leave out columns of tables that are labels by their names; a warning for each that does not stay the same."""
     columns: dict[str, Counter[object]] = {}
     for table in (bag for bag in bags if isinstance(bag, Table)):
         for name, column in table.columns_by_field.items():
-            if _LABEL.search(name.lower()):
+            if is_label(name):
                 values = [v for v in column.ravel().tolist() if v not in ("", None) and v == v]
                 columns.setdefault(name, Counter()).update(values)
     warnings = []
@@ -487,7 +487,7 @@ def take_switches(sources: Sequence[Source]) -> list[Source]:
     for table in (s for s in sources if s.type == TYPE and s.role == "state"):
         for candidate in filter(_is_code, table.free if commanded else ()):  # else it may be the only one
             candidate.reason, candidate.ready = "a code by its name, and its numbers are no amounts", "control"
-        if switches := [c for c in table.candidates if c.reason == TWO_VALUES]:
+        if switches := [c for c in table.candidates if c.reason == TWO_VALUES and not c.flickers]:
             found.append(table.parted(switches, "switch"))
         for candidate in switches:
             candidate.reason = ""

@@ -520,12 +520,13 @@ def _drop_errors(pool: Sequence[Candidate]) -> None:
 def _is_set(candidate: Candidate, called: bool) -> bool:
     """Whether a column is a control by its values or its name, or is `called` one; says why."""
     values = np.unique(candidate.finite)
+    few = MOST_VALUES if (values == np.rint(values)).all() else 2
     by_name = called or _TURNED.search(candidate.path.removesuffix("_mV").lower())  # no manipulated variable
     if len(values) == 1:
         candidate.why = (
             f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"
         )
-    elif len(values) <= 2 or (len(values) <= MOST_VALUES and (values == np.rint(values)).all()):
+    elif len(values) <= few and not candidate.flickers:
         candidate.why = f"switched between {', '.join(f'{v + 0.0:.6g}' for v in values)}"
     elif _WEATHER.search(candidate.path.lower()):
         candidate.why = "the weather, by its name, which is no fault of the machine"
@@ -540,7 +541,7 @@ def _gated(candidate: Candidate, switch: Candidate) -> bool:
     """Whether a column is 0 when a switch is at its least value, and nearly only then."""
     for values, on in zip(candidate.values, switch.values, strict=True):
         off = on == np.nanmin(np.concatenate(switch.values))
-        if np.mean((values == 0) == off) < GATED or not (values[off] == 0).any():
+        if np.mean((values == 0) == off) < GATED or np.count_nonzero(values[off] == 0) < FEWEST:
             return False
     return True
 

@@ -38,6 +38,7 @@ from uncertain_lti.proposal.candidates import (
     at_rest,
     bare,
     earlier,
+    is_label,
     role_by_name,
     role_of_column,
     set_aside_labels,
@@ -80,11 +81,15 @@ _RUN = re.compile(
 )  # name of a column that says which run a row is of
 
 
-_CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch"}  # words in the name of one
+_CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
 _CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
+_TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
 _COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
+MOST_WORDS = 8
+"""Words of a column that is switched, at most."""
+_FILL = "fill the empty cells with the number above"
 
 
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
@@ -158,6 +163,17 @@ def run_column(bags: Sequence[Recording]) -> str:
     tables = [bag for bag in bags if isinstance(bag, Table)]
     names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
     return next((name for name in names if all(_tells_runs(table, name) for table in tables)), "")
+
+
+def _in_words(bags: Sequence[Recording], runs: str | None) -> list[str]:
+    """Columns of tables in which a few words change, as of a switch, with the words."""
+    found: dict[str, set[str]] = {}
+    for table in (bag for bag in bags if isinstance(bag, Table)):
+        for name, column in table.columns_by_field.items():
+            if column.dtype.kind == "O" and name != runs and not is_label(name):
+                found.setdefault(name, set()).update(str(cell) for cell in set(column.tolist()) if cell)
+    few = {name: sorted(words) for name, words in found.items() if 1 < len(words) <= MOST_WORDS}
+    return [f"{name} ({shortlist(words, 3)})" for name, words in few.items()]
 
 
 def _tells_runs(table: Table, name: str) -> bool:
@@ -260,6 +276,8 @@ def _sift(source: Source) -> None:
             candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
         candidate.reason = _unfit(candidate, source)
     _wrapped(source)
+    if source.type == TYPE:
+        _leave_out_places(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
         source.reason += f" and {len(source.candidates) - 3} more" * (len(source.candidates) > 3)
@@ -276,8 +294,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return f"always {finite[0] + 0.0:.6g}"
     if source.type != TYPE and np.ptp(finite) < DUST:
         return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
-    if len(finite) < 0.5 * len(values):
-        what = "rows only, so fill its empty cells with the number above" if source.type == TYPE else "messages only"
+    in_a_row = sum(np.count_nonzero(np.isfinite(v[:-1]) & np.isfinite(v[1:])) for v in candidate.values)
+    if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
+        what = f"rows only, so {_FILL}" if source.type == TYPE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
     counts = np.unique(finite, return_counts=True)[1]
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
@@ -289,6 +308,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
+    if source.type == TYPE and (not _TAKEN.isdisjoint(words_of(candidate.path)) or candidate.path.lower() == "dt"):
+        return "a time that a computer took, by its name, and no signal of the machine"
     if source.type == TYPE and _PLACE.search("_".join(words_of(candidate.path))):
         return "a place on the map, and another run may be elsewhere"
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
@@ -311,9 +332,33 @@ def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
     follows = bool(((y - slope * x) ** 2).sum() < (0.002 * np.ptp(finite)) ** 2 * len(finite))
     if np.mean(np.diff(finite) == 1) > 0.9 or (follows and any(abs(slope / 1000**k - 1) < 1e-3 for k in range(4))):
         return True
-    if (np.diff(finite) < 0).any() or len(np.unique(finite)) < 0.5 * len(finite):
+    if (np.diff(finite) < 0).any():
         return False
-    return follows or bool((finite == np.rint(finite)).all())
+    return follows or bool(len(np.unique(finite)) >= 0.5 * len(finite) and (finite == np.rint(finite)).all())
+
+
+_OF_BODY = re.compile(
+    r"(?P<place>(pos(ition)?_?)?(?P<a>[xy])(_?pos(ition)?)?(_m)?)|(v|vel|velocity|speed)_?(?P<b>[xy])|(?P<c>[xy])_?(vel|dot)"
+)
+"""Columns of the place of a body in a plane, and of its velocity."""
+
+
+def _leave_out_places(source: Source) -> None:
+    """Of a body whose velocities are in its own frame: its place goes where it heads, which no linear model has."""
+    found = [(c, m) for c in source.free if (m := _OF_BODY.fullmatch(bare(c.path)))]
+    places = {m["a"]: c for c, m in found if m["place"]}
+    velocities = {m["b"] or m["c"]: c for c, m in found if not m["place"]}
+    if len(places) == len(velocities) == 2 and not all(_rate_of(places[axis], velocities[axis]) for axis in "xy"):
+        for candidate in places.values():
+            candidate.reason, candidate.ready = "a place in a fixed frame, where the velocities are the body's", "state"
+
+
+def _rate_of(place: Candidate, velocity: Candidate) -> bool:
+    """Whether a place moves in FEWEST rows as its velocity does meanwhile."""
+    move = np.concatenate([values[FEWEST:] - values[:-FEWEST] for values in place.values])
+    speed = np.concatenate([np.convolve(v, np.ones(FEWEST), "valid")[:-1] for v in velocity.values if len(v) > FEWEST])
+    good = np.isfinite(move) & np.isfinite(speed)
+    return bool(np.count_nonzero(good) < FEWEST or np.corrcoef(move[good], speed[good])[0, 1] > 0.9)
 
 
 def _wrapped(source: Source) -> None:
@@ -407,6 +452,11 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
+    if words := _in_words(bags, layout.runs):
+        warnings.append(f"columns of words are no signals: {shortlist(words, 4)}; write numbers in place of them")
+    if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
+        few = "few rows, or no two in a row, have a number of"
+        warnings.append(f"{few} {shortlist(rare, 4)}; where it holds until the next one, {_FILL}")
     if not (states or controls or like) and is_plant(sources):  # names are those of the columns
         chosen, used = plant_signals(sources)
         if not chosen:

@@ -175,13 +175,14 @@ def signals_file(
         f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
-    instants = [clock.instants(clock, number)[0] for number in range(len(clock.arrival))]
+    offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
+    by_arrival = any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0
+    instants = clock.arrival if by_arrival else [clock.instants(clock, k)[0] for k in range(len(clock.arrival))]
     if pause := longest_pause(instants):
         lines += ["", "# They come in bursts, and their samples evenly.", "step: constant", f"max_gap: {pause:g}"]
     elif unit := coarse_ns(instants):
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
-    offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
-    if any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0:
+    if by_arrival:
         lines += ["", "# Not all header stamps move, are in each recording and of one clock: times of arrival"]
         lines.append("# serve for all.")
         lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]

@@ -58,6 +58,7 @@ _DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
 _COMPACT = re.compile(r"((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _LARGEST_ZONE = 14  # hours
+_UNLIKELY = 100, 1000  # s from row to row, not whole minutes, from which on it hardly is in s; the other: since 1970
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
 
@@ -109,7 +110,11 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
         doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
         if unit == "s" and not stated and (step := _coarse(values)):
-            doubt = f", {step:.10g} from row to row: for others name it time_us or time_ms, or give `--table unit=us`"
+            doubt, ask = f", {step:.10g} from row to row", "name it time_us or time_ms, or give `--table unit=us`"
+            if step >= _UNLIKELY[_since_1970(values)]:
+                none = "has no unit, which may be s, ms or us"
+                raise BagError(f"{where}{doubt}: {none}; {ask} (in a signals file `table: {{unit: us}}`)")
+            doubt += f": for others {ask}"
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
         times = _of_numbers(where, table, column, UNITS[unit])
@@ -183,9 +188,13 @@ def _grows(column: Column) -> bool:
     """Whether numbers grow from each row to the next, or nearly so and are times since 1970."""
     if column.ndim != 1 or column.dtype.kind not in "iuf" or len(column) < 3:
         return False
-    size = float(np.median(column))
-    since = any(0.9 < size / 10**digits < 4.1 for digits in (9, 12, 15, 18))  # from 1998 to 2099, s to ns
+    since = any(_since_1970(column, 10**digits) for digits in (0, 3, 6, 9))  # in s to ns
     return bool((column[1:] > column[:-1]).all()) or (since and goes_forward(column))
+
+
+def _since_1970(column: Column, unit: int = 1) -> bool:
+    """Whether numbers may be times since 1970, from 1998 to 2099; `unit`: how many are a second."""
+    return bool(0.9e9 < float(np.nanmedian(column)) / unit < 4.1e9)
 
 
 def _days_beside(table: RawTable, column: str) -> str:
@@ -326,11 +335,12 @@ def _like_days(values: Column) -> bool:
 
 
 def _coarse(values: Column) -> float:
-    """Usual step of whole numbers, where it is beyond 1 and no whole minutes, as of a clock of ms or us; else 0."""
+    """Usual step of whole numbers, where it is beyond 1 and no whole minutes or hours, as of a clock of ms; else 0."""
     steps = np.diff(values[np.isfinite(values)].astype(np.float64))
-    if len(steps) < 3 or (steps % 1 != 0).any() or (steps % 60 != 0).mean() <= 0.5:
+    if len(steps) < 3 or (steps % 1 != 0).any():
         return 0.0
-    return step if (step := float(np.median(steps))) > 1 else 0.0
+    step = float(np.median(steps))
+    return step if step > 1 and (steps % (60 if step <= 3600 else 3600) != 0).mean() > 0.5 else 0.0
 
 
 def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:

@@ -304,7 +304,9 @@ def _recording_reasons(
         text = f"{_percent(violated)} of the verdicts are violated, and {nothing}: such a verdict cannot tell a fault"
         yield NO, "recordings", text
     if outside > OUTSIDE_DOMAIN:
-        where = "; ".join(dict.fromkeys(filter(None, (r["beyond"] for r in recordings))))
+        farthest = sorted(recordings, key=lambda r: -int(r["outside_domain"]))
+        each = list(dict.fromkeys(filter(None, (r["beyond"] for r in farthest))))
+        where = "; ".join([*each[:2], *[f"and others in {plural(len(each) - 2, 'more recording')}"] * (len(each) > 2)])
         text = f"{_percent(outside)} of the verdicts are outside the ranges seen in the fit"
         yield CARE, "recordings", f"{text}: {where}" if where else text
     for text in drift_in_words(model, recordings):

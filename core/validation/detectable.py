@@ -201,7 +201,9 @@ def detectable(
     if within is None:
         within = typical_within(parts)
     names = {"actuator": model.control_names, "sensor": model.state_names, "dynamics": model.state_names}
-    pairs = [(kind, i, name) for kind in kinds for i, name in enumerate(names[KINDS[kind].of])]
+    remembered = {("actuator", r.position - model.n) for r in model.signals.recalled}  # earlier values are no actuators
+    every_pair = ((kind, i, name) for kind in kinds for i, name in enumerate(names[KINDS[kind].of]))
+    pairs = [(kind, i, name) for kind, i, name in every_pair if (KINDS[kind].of, i) not in remembered]
     steps = within / max(_median_step(parts), 1e-12) + _memory(model, _median_step(parts))
     cases = max(min(cases, int(LIMIT / (max(len(pairs), 1) * (ROUNDS + 1) * steps))), 2 * FEWEST)
     every = _cases(model, parts, within, cases, seed)
