@@ -68,6 +68,7 @@ REFUSED = {
     "bytes behind odd text": framed(b"", more=12),
     "a length that lies": framed(b"base\0").replace(b"\5\0\0\0base", b"\xff\0\0\0base"),
     "another encapsulation": framed(b"base\0", start=b"\0\7\0\0"),
+    "another encapsulation that the middleware takes": framed(b"ba\0", start=b"\0\7\0\0"),
     "too short": framed(b"base\0")[:40],
     "nothing": b"",
 }

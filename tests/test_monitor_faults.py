@@ -504,6 +504,18 @@ def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(bench
     until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without")
 
 
+def test_a_folder_of_snapshots_that_was_cleared_away_is_made_again(bench: StartBench, tmp_path: Path) -> None:
+    folder = tmp_path / "of" / "snapshots"
+    on = bench(**{"snapshot.folder": str(folder)})
+    on.plant.send(20)
+    on.flags.count(20)
+    folder.rmdir()
+    folder.parent.rmdir()
+    success, said = trigger(on.world, "snapshot")
+    assert success, said
+    until(lambda: len(list(folder.glob("*.mcap"))) == 1, "the snapshot")
+
+
 def test_a_snapshot_of_an_alarm_that_cannot_be_written_is_logged(bench: StartBench, tmp_path: Path) -> None:
     """The log said that it is written, and nothing else."""
     folder = tmp_path / "snapshots"

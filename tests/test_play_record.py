@@ -209,6 +209,29 @@ def test_recording_takes_the_quality_of_service_it_finds_and_writes_it_down(worl
     assert player.succeed()
 
 
+def test_what_comes_after_the_recorder_stood_still_is_put_in_the_order_of_sending(world: World, tmp_path: Path) -> None:
+    """More than Fast DDS holds for it, so that the rest is sent again, one topic after the other."""
+    pair = [world.publisher(Float64, name) for name in ("/command", "/state")]
+    process = recorder(world, ["/command", "/state"], tmp_path / "out.mcap")
+    world.subscribed(*pair)
+
+    def send(*numbers: int) -> None:
+        for number in range(*numbers):
+            for publisher in pair:
+                publisher.publish(Float64(data=float(number)))
+            time.sleep(0.004)
+
+    send(100)
+    process.signal(signal.SIGSTOP)
+    send(100, 800)
+    process.signal(signal.SIGCONT)
+    send(800, 2000)
+    process.signal(signal.SIGINT)
+    told = "after others that were sent later" in process.succeed()  # as where the machine is too busy all the time
+    numbers = np.array([m.data for _, _, m in Bag(tmp_path / "out.mcap").messages(["/command", "/state"])])
+    assert len(numbers) > 3000 and (told or (np.maximum.accumulate(numbers) - numbers).max() < 30)
+
+
 def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     numbers = world.publisher(Float64, "/numbers")

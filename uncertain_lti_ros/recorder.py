@@ -15,6 +15,7 @@ import argparse
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from enum import Enum
@@ -28,13 +29,17 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.cli.command import Result
+from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, Waiting
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
 from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
 _CHUNK = 1 << 20  # bytes
+_LONGEST = 6.0  # s that messages wait for others that were held up
+_CLOCK = 60.0  # s later than ever: no message was on its way for so long, a clock was set
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,17 +67,22 @@ def run(args: argparse.Namespace) -> Result:
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
         topics = list(dict.fromkeys(resolved_name(life.node, topic) for topic in args.topics))
         types = _wait_for(life, topics, args.wait, args.progress.note)
-        subscriptions = [_subscribe(life.node, topic, types[topic], file) for topic in topics]
+        taken = _InOrder(file)
+        subscriptions = [_subscribe(life.node, topic, types[topic], file, taken) for topic in topics]
         (args.progress.note if args.json else args.say)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
         stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
         with stage as step:
-            _record(life, subscriptions, file, args.duration, step, args.progress.note)
+            _record(life, subscriptions, file, taken, args.duration, step, args.progress.note)
         if not file.count:
             raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
     on_the_way = f", {lost} lost on the way" if lost else ""
+    if taken.late:
+        each = shortlist([f"{count} of {topic}" for topic, count in taken.late.most_common()], 5)
+        after = f"came up to {taken.latest:.2g} s after others that were sent later, and fits and checks take them so"
+        on_the_way += f"; {each} {after}: record again on a less busy machine, or fewer topics"
     args.say(f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s{on_the_way}")
-    counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost}
+    counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost, "late": taken.late}
     return Result(data={"bag": str(output), **counts})
 
 
@@ -110,16 +120,13 @@ def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable
     return {topic: there[topic][0] for topic in topics}
 
 
-def _subscribe(node: Node, topic: str, type_name: str, file: _File) -> MatchedSubscription:
-    clock = node.get_clock()
-    channel = file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
-    return MatchedSubscription(
-        node, topic, type_name, lambda data, _: file.write(topic, channel, clock.now().nanoseconds, data)
-    )
+def _subscribe(node: Node, topic: str, type_name: str, file: _File, taken: _InOrder) -> MatchedSubscription:
+    file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
+    return MatchedSubscription(node, topic, type_name, lambda data, sent_ns: taken.take(topic, data, sent_ns))
 
 
 def _record(
-    life: Life, subscriptions: list[MatchedSubscription], file: _File, duration: float | None,
+    life: Life, subscriptions: list[MatchedSubscription], file: _File, taken: _InOrder, duration: float | None,
     step: Callable[[str], None], note: Callable[..., None],
 ) -> None:  # fmt: skip
     def look() -> None:
@@ -128,6 +135,7 @@ def _record(
             note(*subscription.problems)
 
     def poll() -> None:
+        taken.release()
         for subscription in subscriptions:
             subscription.poll()
         if any(s.look_soon for s in subscriptions):
@@ -141,6 +149,59 @@ def _record(
     for period, task in ((POLL, poll), (_LOOK, look), (_FLUSH, file.flush)):
         life.node.create_timer(period, task)
     life.until(over)
+    taken.release(all_of_them=True)
+    file.hold()
+
+
+class _InOrder:
+    """Messages as they come to a file; after a stall, what was held up goes in the order in which it was sent.
+
+    A process that stands still gets the rest later, one topic after another; the live node puts that in order too.
+
+    `late`: how many came after others that were sent over `LATE` later, and stayed so; `latest`: s at most.
+    """
+
+    def __init__(self, file: _File) -> None:
+        self._file, self._began_ns = file, time.time_ns()
+        self._came, self._heard, self._least = math.inf, dict[str, float](), dict[str, float]()
+        self._since, self._behind = math.inf, set[str]()
+        self._waiting: list[tuple[Waiting, int, float, float]] = []
+        self._newest_ns = 0
+        self.late, self.latest = Counter[str](), 0.0
+
+    def take(self, topic: str, data: bytes, sent_ns: int) -> None:
+        """Take one message as it comes."""
+        now, received_ns, by = time.monotonic(), time.time_ns(), 0.0
+        if sent_ns > self._began_ns:  # what was sent before is late for a good reason
+            way = (received_ns - sent_ns) * 1e-9
+            least = min(way, self._least.get(topic, way))
+            least = self._least[topic] = way if way - least > _CLOCK else least
+            by, sent_ns = way - least, sent_ns + (round(least * 1e9) if abs(least) > LATE else 0)  # by another clock
+        if now - self._came > STALL and not self._waiting:
+            self._since = now
+            self._behind = {other for other, heard in self._heard.items() if heard >= self._came - STALL}
+        self._came = self._heard[topic] = now
+        behind = (self._newest_ns - sent_ns) * 1e-9
+        self._newest_ns = max(self._newest_ns, min(sent_ns, received_ns))
+        if self._since <= now:
+            self._waiting.append(((topic, received_ns, data), sent_ns, by, now))
+            self._behind -= {topic} if by <= LATE else set()
+            return
+        if behind > LATE and by > LATE:
+            self.late[topic] += 1
+            self.latest = max(self.latest, behind)
+        self._file.write(topic, received_ns, data)
+
+    def release(self, all_of_them: bool = False) -> None:
+        """Write what waits, once all topics come in time again."""
+        now, order = time.monotonic(), CatchUp((), 0.0, start=False)
+        if all_of_them or now - self._since > (_LONGEST if self._behind else STALL):
+            held_up = any(by > LATE for *_, by, _ in self._waiting)
+            for message, sent_ns, _, came in self._waiting:
+                order.put(message, sent_ns if held_up else 0, 0.0, came)
+            for message in order.finish(now):
+                self._file.write(*message)
+            self._waiting, self._since = [], math.inf
 
 
 class _File:
@@ -151,6 +212,7 @@ class _File:
         self._part = path.with_name(f"{path.name}.part")
         self.count = 0
         self.counts: dict[str, int] = {}
+        self._channels: dict[str, int] = {}
         self.began: float | None = None
         self._first = self._last = 0
         self._full: BagError | None = None
@@ -190,17 +252,17 @@ class _File:
         """Log time from the first to the last message, s."""
         return (self._last - self._first) * 1e-9
 
-    def channel(self, topic: str, type_name: str, offered: list[QoSProfile]) -> int:
+    def channel(self, topic: str, type_name: str, offered: list[QoSProfile]) -> None:
         schema = self._writer.register_schema(type_name, "ros2msg", definition(type_name).encode())
         metadata = {"offered_qos_profiles": _qos_text(offered)}
         self.counts[topic] = 0
-        return int(self._writer.register_channel(topic, "cdr", schema, metadata))
+        self._channels[topic] = int(self._writer.register_channel(topic, "cdr", schema, metadata))
 
-    def write(self, topic: str, channel: int, log_time: int, data: bytes) -> None:
+    def write(self, topic: str, log_time: int, data: bytes) -> None:
         if self.began is None:
             self.began, self._first = time.monotonic(), log_time
         self._last = max(log_time, self._last)  # a clock that is set back must not reorder what was received
-        self._to_disk(self._writer.add_message, channel, self._last, bytes(data), self._last, self.count)
+        self._to_disk(self._writer.add_message, self._channels[topic], self._last, bytes(data), self._last, self.count)
         self.count += 1
         self.counts[topic] += 1
 

@@ -19,12 +19,13 @@ WINDOW = 4.0
 """s of steady time that messages wait at most: Fast DDS asks every 3 s for what a reliable reader has missed."""
 STALL = 0.2
 """s without any message after which topics may arrive one after another."""
+LATE = 0.1
+"""s that a message may be on its way longer than others, and is not held up."""
 MOST = 20_000
 """Messages that wait at most."""
 
 _QUIET = STALL  # s that messages wait at least: a longer pause counts as another stall
 _BURST = 5  # messages that come this many times as fast as they were sent come in a burst
-_LATE = 0.1  # s that a message may be on its way longer than others, and is not held up
 
 Waiting = tuple[str, int, bytes]
 """Topic, arrival in ns, and data of one message."""
@@ -45,9 +46,9 @@ class _Way:
     def is_calm(self, now: float, least: float) -> bool:
         """Whether nothing came in a burst lately, and nothing more is on the way; `least`: s that any message took."""
         late = [late for at, _, late in self._lately if at >= now - _QUIET]
-        if late and max(late) - min(late) > _LATE:
+        if late and max(late) - min(late) > LATE:
             return False
-        if len(self._lately) < 2 or self._lately[-1][2] < least + _LATE:
+        if len(self._lately) < 2 or self._lately[-1][2] < least + LATE:
             return True
         (before, first, _), (last, sent, _) = self._lately[-2], self._lately[-1]
         return (last - before) * _BURST >= (sent - first) * 1e-9
@@ -55,8 +56,8 @@ class _Way:
     def ahead_ns(self, now: float) -> int:
         """By how much the clock of the sender is behind, ns: messages are on the way for long, and all as long."""
         late = [late for _, _, late in self._lately]
-        same = len(late) > 2 and self._lately[-1][0] >= now - _QUIET and max(late) - min(late) < _LATE / 2
-        return round(min(late) * 1e9) if same and abs(min(late)) > _LATE else 0
+        same = len(late) > 2 and self._lately[-1][0] >= now - _QUIET and max(late) - min(late) < LATE / 2
+        return round(min(late) * 1e9) if same and abs(min(late)) > LATE else 0
 
 
 class CatchUp:

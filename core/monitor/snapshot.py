@@ -202,6 +202,8 @@ class Album:
 
     def _write(self, scene: Scene, path: Path) -> None:
         try:
+            if not os.path.lexists(self._folder):  # it was cleared away, as folders of /tmp are
+                self._folder.mkdir(parents=True)
             with whole_file(path) as stream:
                 scene.write(stream)
                 size = stream.tell()

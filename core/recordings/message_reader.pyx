@@ -564,8 +564,8 @@ cdef class MessageReader:
                     f"is {what - LONGER} bytes longer than a {self.type_name}; "
                     f"its publisher may have another version of that type"
                 )
-            if what == UNTRUE:
-                raise UnreadableError("holds a truth value that is neither 0 nor 1")
+            if what == UNTRUE or what == OTHER:  # the middleware takes some of these as well
+                raise UnreadableError("holds a truth value that is neither 0 nor 1" if what == UNTRUE else "is no plain CDR")
             self.strange = what == STRANGE
             if found is not None:
                 return found
