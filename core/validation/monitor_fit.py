@@ -233,7 +233,7 @@ def _medians(transients: Sequence[Transient]) -> OperatingPoint:
 
 NOTE = (
     "brought up to date: of each recording counts how far it was from the fit that was made without it at the time; a "
-    "fit of all recordings leaves each out of all the others, which moves thresholds a little"
+    "fit of all recordings leaves each out of all the others, which moves thresholds"
 )
 GROWN = 1.5
 """Size of what the alarm sees after updates, over that before them, from which on it is said."""
