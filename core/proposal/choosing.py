@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from itertools import permutations, product
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ from uncertain_lti.proposal.candidates import (
     size_of,
     steps_of,
 )
-from uncertain_lti.proposal.signals_file import set_own_scale, words_of
+from uncertain_lti.proposal.signals_file import set_own_scale
 from uncertain_lti.recordings.table import TOPIC, TYPE
 from uncertain_lti.recordings.table_times import field_name
 from uncertain_lti.signals.field_path import FieldPath
@@ -467,7 +467,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for candidate in every:
         if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason):  # what hardly moves is a signal, too
             candidate.reason = ""
-    _drop_errors(drop_copies([c for c in every if not c.reason and np.ptp(c.finite) > 0], exact=True))
+    drop_copies([c for c in every if not c.reason and np.ptp(c.finite) > 0], exact=True)
     free = [c for c in every if not c.reason]
     called = {c for s in sources if s.role in ("control", "reference") for c in s.candidates}
     controls = [c for c in free if _is_set(c, c in called)]
@@ -505,16 +505,6 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
         candidate.name, candidate.scale = field_name(FieldPath(candidate.path).angle), candidate.scale or 1.0
         candidate.steady = 0.0  # what returns to its median would alarm on every change of load
     return states, [c for c in free if c in controls]
-
-
-def _drop_errors(pool: Sequence[Candidate]) -> None:
-    """Leave out the error of a controller, which jumps with its set point."""
-    errors = [c for c in pool if not {"err", "error"}.isdisjoint(words_of(c.path))]
-    some = {c: (values := np.concatenate(c.values))[:: 1 + len(values) // 1000] for c in pool if errors}
-    for error in errors:
-        for a, b in permutations([c for c in pool if c is not error], 2):
-            if np.nanmax(np.abs(some[a] - some[b] - some[error])) < 1e-3 * np.ptp(error.finite):
-                error.reason = f"is {a.path} less {b.path}"
 
 
 def _is_set(candidate: Candidate, called: bool) -> bool:

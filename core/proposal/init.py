@@ -85,6 +85,7 @@ _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "
 _CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
 _TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
 _COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
+_COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
 MOST_WORDS = 8
@@ -361,6 +362,20 @@ def _rate_of(place: Candidate, velocity: Candidate) -> bool:
     return bool(np.count_nonzero(good) < FEWEST or np.corrcoef(move[good], speed[good])[0, 1] > 0.9)
 
 
+def _drop_computed(sources: Sequence[Source]) -> None:
+    """Leave out what is computed from other columns: an average, or an error, which jumps with its set point."""
+    pool = [c for s in sources if s.type == TYPE for c in s.free if np.ptp(c.finite) > 0]
+    some = {c: np.concatenate(c.values)[:: 1 + len(c.values[0]) // 1000] / np.ptp(c.finite) for c in pool}
+    for candidate in [c for c in pool if not _COMPUTED.isdisjoint(words_of(c.path))]:
+        known = np.isfinite(some[candidate])
+        others = [c for c in pool if c is not candidate and not c.reason and np.isfinite(some[c][known]).all()]
+        y, X = some[candidate][known], np.column_stack([some[c] for c in others] + [np.ones(len(known))])[known]
+        share = np.linalg.lstsq(X, y, rcond=None)[0]
+        if len(y) > 2 * len(share) and np.abs(X @ share - y).max() < 1e-3:
+            of = [c.path for c, size in zip(others, np.abs(share), strict=False) if size > 0.01]
+            candidate.reason = f"follows from {shortlist(of, 3)} of the same row"
+
+
 def _wrapped(source: Source) -> None:
     """Angles that jump by a turn are unwrapped, those of a quaternion always."""
     for candidate in source.free:
@@ -452,6 +467,7 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
+    _drop_computed(sources)
     if words := _in_words(bags, layout.runs):
         warnings.append(f"columns of words are no signals: {shortlist(words, 4)}; write numbers in place of them")
     if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
