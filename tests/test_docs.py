@@ -154,7 +154,7 @@ class Reader:
         done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **here)
         assert done.returncode == int(block.marks.get("status", 0)), done.stdout
         # without how far long work is, which a busy machine prints
-        self.said = re.sub(r"(?m)^[a-z]+ing: .*\n", "", done.stdout)
+        self.said = re.sub(r"(?m)^([a-z]+ing:|note: fell behind) .*\n", "", done.stdout)
 
     def _python(self, block: Block) -> None:
         code = compile(block.text, f"line {block.line}", "exec")
