@@ -255,16 +255,14 @@ def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) 
 def _sift(source: Source) -> None:
     """Say of each number whether it moves; angles in place of the quaternions that are some."""
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
-    parts = {c.path: c for c in source.candidates}
     for base in bases:
-        read = [parts[path].values for axis in "xyzw" if (path := f"{base}.{axis}") in parts and parts[path].values]
+        part = re.compile(rf"{re.escape(base)}(\.[xyzw]|\[[0-3]\]|_[0-3])").fullmatch
+        read = [c.values for c in source.candidates if part(c.path) and c.values]
         norm = np.sqrt(sum(np.concatenate(values) ** 2 for values in read)) if len(read) == 4 else np.zeros(1)
         unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
         is_rotation = len(unit) > 0 and unit.mean() > 0.9
         source.candidates = [  # the other form of the same numbers has its line
-            c
-            for c in source.candidates
-            if not (c.path.startswith(f"{base}.") if is_rotation else c.path.endswith(f"({base})"))
+            c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
     shared = shared_codes(list(each.values())) if source.type == TYPE else set()
