@@ -248,6 +248,7 @@ def test_what_is_desired_is_a_reference(column, role):
     [
         ("x u v r delta n", "delta n"), ("U_m_s V_m_s Q_rad_s rudder", "rudder"), ("x v u", "u"), ("n delta u", "u"),
         ("T_brine_in T_brine_out", ""), ("T_brine_in T_out in", "T_brine_in in"), ("Brake_IN Speed", "Brake_IN"),
+        ("ESC_signal_µs Servo_1_us loop_us pump_duty", "ESC_signal_µs Servo_1_us pump_duty"),
         ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
@@ -1284,6 +1285,21 @@ def test_four_numbers_of_a_body_and_not_of_joints_are_a_quaternion(tmp_path):
         assert ("q[0]" in proposal.text) != ("roll(q)" in proposal.text)
         angle = FieldPath("yaw(q)")
     assert angle.read(SimpleNamespace(q=[q[9].w, q[9].x, q[9].y, q[9].z])) == pytest.approx(yaw[9], abs=1e-9)
+
+
+def test_a_number_of_the_first_row_alone_is_neither_a_time_nor_a_control(tmp_path):
+    """Tables of a benchmark write their step, `Ts`, once: as a control it left one transition of all."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=30), 20)
+    columns = {"y": answers(rng, u[:, None])[:, 0], "u": u, "Ts": np.where(np.arange(len(u)) == 0, 4.0, np.nan)}
+    path = table_of(tmp_path / "a.csv", columns, 4.0 * np.arange(len(u)))
+    proposal = propose([path])
+    assert "Ts" not in [c.path for c in [*proposal.states, *proposal.controls]]
+    assert "/table Ts: a number in 1 of 600 rows only" in proposal.text
+    rows = "\n".join(f"{y},{u},{4 * (k == 0) or ''}" for k, (y, u) in enumerate(zip(columns["y"], u, strict=True)))
+    (tmp_path / "b.csv").write_text(f"y,u,Ts\n{rows}\n")
+    words = "column 'Ts' is the same in all rows, and no other is called time.*--table step"
+    refuses(BagError, words, propose, [tmp_path / "b.csv"])
 
 
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):

@@ -343,8 +343,8 @@ def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: 
 # Words in the name of a topic or of its type; the last word of a name counts most.
 _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive(?!n|train)|trajectory"
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
-_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)tau(_?con)?_?\d*$")  # of a control in a table
-_SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
+_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$)")
+_SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
 _LABEL = re.compile(
     r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
     r"alarm|emergency|(^|_)e_?stop|protective_?stop|(^|_)(lost|fail(ed|ure)?)$)"

@@ -288,14 +288,14 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     values, finite = np.concatenate(candidate.values), candidate.finite
     if not len(finite):
         return "never a number"
-    if finite.min() == finite.max():
-        return f"always {finite[0] + 0.0:.6g}"
-    if source.type != TYPE and np.ptp(finite) < DUST:
-        return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     in_a_row = sum(np.count_nonzero(np.isfinite(v[:-1]) & np.isfinite(v[1:])) for v in candidate.values)
     if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
         what = f"rows only, so {_FILL}" if source.type == TYPE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
+    if finite.min() == finite.max():
+        return f"always {finite[0] + 0.0:.6g}"
+    if source.type != TYPE and np.ptp(finite) < DUST:
+        return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     counts = np.unique(finite, return_counts=True)[1]
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
         return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"

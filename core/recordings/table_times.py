@@ -226,7 +226,8 @@ def _of_parts(table: RawTable) -> str:
 
 
 def _stands_still(column: Column) -> bool:
-    return column.dtype.kind in "iuf" and len(column) > 2 and bool((column == column[0]).all())
+    known = column[column == column]
+    return column.dtype.kind in "iuf" and len(column) > 2 and len(known) > 0 and bool((known == known[0]).all())
 
 
 def _of_a_minute(name: str, column: Column) -> bool:
