@@ -1287,6 +1287,17 @@ def test_four_numbers_of_a_body_and_not_of_joints_are_a_quaternion(tmp_path):
     assert angle.read(SimpleNamespace(q=[q[9].w, q[9].x, q[9].y, q[9].z])) == pytest.approx(yaw[9], abs=1e-9)
 
 
+def test_the_phase_of_a_flight_is_no_state_where_there_is_no_command(tmp_path):
+    """It took the place of a voltage that moved with it, and the next phase, never seen, was an alarm."""
+    rng = np.random.default_rng(3)
+    phase = np.repeat(rng.permutation(np.arange(30) % 5 + 3.0), 50)
+    speed, voltage = answers(rng, np.column_stack([rng.normal(size=len(phase)), phase])).T
+    columns = {"state": phase, "speed": speed, "drogue_voltage": voltage}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(phase)))])
+    assert "state" not in [c.path for c in proposal.states], proposal.text
+    assert "drogue_voltage" in [c.path for c in proposal.states], proposal.text
+
+
 def test_a_number_of_the_first_row_alone_is_neither_a_time_nor_a_control(tmp_path):
     """Tables of a benchmark write their step, `Ts`, once: as a control it left one transition of all."""
     rng = np.random.default_rng(3)
