@@ -1283,8 +1283,13 @@ def test_four_numbers_of_a_body_and_not_of_joints_are_a_quaternion(tmp_path):
         proposal = propose([path])
         assert all(f"{wanted}" in proposal.text for wanted in paths), proposal.text
         assert ("q[0]" in proposal.text) != ("roll(q)" in proposal.text)
-        angle = FieldPath("yaw(q)")
-    assert angle.read(SimpleNamespace(q=[q[9].w, q[9].x, q[9].y, q[9].z])) == pytest.approx(yaw[9], abs=1e-9)
+        if data is attitude:
+            field = "{{name: {0}, topic: /attitude, field: {0}(q), steady: 0, scale: 1}}".format
+            (tmp_path / "s.yaml").write_text(f"clock: /attitude\nstates: [{field('roll')}, {field('yaw')}]\n")
+            (run,) = read_transients(path, tmp_path / "s.yaml")
+            assert np.abs(np.sin((run.x[:, :2] - np.column_stack([roll, yaw])) / 2)).max() < 1e-6
+    live = SimpleNamespace(q=[q[9].w, q[9].x, q[9].y, q[9].z])
+    assert FieldPath("yaw(q)").read(live) == pytest.approx(yaw[9], abs=1e-9)
 
 
 def test_the_phase_of_a_flight_is_no_state_where_there_is_no_command(tmp_path):
