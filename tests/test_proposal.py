@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from bag_writer import Message, Topic, array, cdr, header, joint_state, message, write
+from bag_writer import Message, Topic, array, cdr, float64, header, joint_state, message, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import bounded
@@ -35,7 +35,7 @@ from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose,
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
-from uncertain_lti.signals.field_path import KINDS, Memory
+from uncertain_lti.signals.field_path import KINDS, FieldPath, Memory
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
 JOINT, POSE_2D = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Pose2D"
@@ -248,6 +248,7 @@ def test_what_is_desired_is_a_reference(column, role):
     [
         ("x u v r delta n", "delta n"), ("U_m_s V_m_s Q_rad_s rudder", "rudder"), ("x v u", "u"), ("n delta u", "u"),
         ("T_brine_in T_brine_out", ""), ("T_brine_in T_out in", "T_brine_in in"), ("Brake_IN Speed", "Brake_IN"),
+        ("ESC_signal_µs Servo_1_us loop_us pump_duty", "ESC_signal_µs Servo_1_us pump_duty"),
         ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
@@ -1255,7 +1256,9 @@ def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     assert "c1_mode" in proposal.text and "a code by its name, and its numbers are no amounts" in proposal.text
 
 
-@pytest.mark.parametrize(("name", "step"), [("q{}", 0.05), ("pose.orientation.{}", 0.05), ("Q_{}", 2.0)])
+@pytest.mark.parametrize(
+    ("name", "step"), [("q{}", 0.05), ("pose.orientation.{}", 0.05), ("Q_{}", 2.0), ("q[{}]", 0.05)]
+)
 def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
     """q and -q are one attitude: what jumps in each column is no movement, and in the next run an alarm."""
     rng = np.random.default_rng(3)
@@ -1264,7 +1267,8 @@ def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
     sign = rng.choice([-1.0, 1.0], size=len(u))
     parts = {"x": 0 * u, "y": 0 * u, "z": sign * np.sin(yaw / 2), "w": sign * np.cos(yaw / 2)}
     letters = str.upper if "Q" in name else str
-    columns = {name.format(letters(axis)): part for axis, part in parts.items()} | {"rudder_cmd": u}
+    numbers = dict(zip("xyzw", "1230", strict=True)) if "[" in name else {axis: letters(axis) for axis in "xyzw"}
+    columns = {name.format(numbers[axis]): part for axis, part in parts.items()} | {"rudder_cmd": u}
     path = table_of(tmp_path / "a.csv", columns, step * np.arange(len(u)))
     proposal = propose([path])
     (field,) = [c.path for c in proposal.states]
@@ -1273,6 +1277,58 @@ def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
     (tmp_path / "s.yaml").write_text(proposal.text)
     (run,) = read_transients(path, tmp_path / "s.yaml")
     assert np.abs(np.diff(run.x[:, 0]) - np.diff(yaw)).max() < 1e-9
+
+
+def test_four_numbers_of_a_body_and_not_of_joints_are_a_quaternion(tmp_path):
+    """PX4 writes an attitude as q[0] to q[3], from w on; four joints have the same name and another norm."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    roll, pitch, yaw = np.cumsum(answers(rng, u[:, None] * [1, 2, 3]), axis=0).T / 30
+    q = [quaternion(*angles) for angles in zip(roll, np.sin(pitch), yaw, strict=True)]
+    schema = "float32[4] q\n"
+    attitude = [struct.pack("<4B4f", 0, 1, 0, 0, one.w, one.x, one.y, one.z) for one in q]
+    joints = [struct.pack("<4B4f", 0, 1, 0, 0, *some) for some in zip(roll, pitch, yaw, roll + yaw, strict=True)]
+    for data, paths in ((attitude, ["yaw(q)", "roll(q)", "pitch(q)"]), (joints, ["q[0]", "q[1]", "q[2]", "q[3]"])):
+        topics = [Topic("/attitude", "p/msg/Attitude", schema=schema), Topic("/rudder_cmd")]
+        messages = [Message("/attitude", k * 20_000_000, bytes(one)) for k, one in enumerate(data)]
+        messages += [Message("/rudder_cmd", k * 20_000_000 - 1, float64(value)) for k, value in enumerate(u)][1:]
+        path = write(topics, sorted(messages, key=lambda one: one.log_time)).save(tmp_path / "a.mcap")
+        proposal = propose([path])
+        assert all(f"{wanted}" in proposal.text for wanted in paths), proposal.text
+        assert ("q[0]" in proposal.text) != ("roll(q)" in proposal.text)
+        if data is attitude:
+            field = "{{name: {0}, topic: /attitude, field: {0}(q), steady: 0, scale: 1}}".format
+            (tmp_path / "s.yaml").write_text(f"clock: /attitude\nstates: [{field('roll')}, {field('yaw')}]\n")
+            (run,) = read_transients(path, tmp_path / "s.yaml")
+            assert np.abs(np.sin((run.x[:, :2] - np.column_stack([roll, yaw])) / 2)).max() < 1e-6
+    live = SimpleNamespace(q=[q[9].w, q[9].x, q[9].y, q[9].z])
+    assert FieldPath("yaw(q)").read(live) == pytest.approx(yaw[9], abs=1e-9)
+
+
+def test_the_phase_of_a_flight_is_no_state_where_there_is_no_command(tmp_path):
+    """It took the place of a voltage that moved with it, and the next phase, never seen, was an alarm."""
+    rng = np.random.default_rng(3)
+    phase = np.repeat(rng.permutation(np.arange(30) % 5 + 3.0), 50)
+    speed, voltage = answers(rng, np.column_stack([rng.normal(size=len(phase)), phase])).T
+    columns = {"state": phase, "speed": speed, "drogue_voltage": voltage}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(phase)))])
+    assert "state" not in [c.path for c in proposal.states], proposal.text
+    assert "drogue_voltage" in [c.path for c in proposal.states], proposal.text
+
+
+def test_a_number_of_the_first_row_alone_is_neither_a_time_nor_a_control(tmp_path):
+    """Tables of a benchmark write their step, `Ts`, once: as a control it left one transition of all."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=30), 20)
+    columns = {"y": answers(rng, u[:, None])[:, 0], "u": u, "Ts": np.where(np.arange(len(u)) == 0, 4.0, np.nan)}
+    path = table_of(tmp_path / "a.csv", columns, 4.0 * np.arange(len(u)))
+    proposal = propose([path])
+    assert "Ts" not in [c.path for c in [*proposal.states, *proposal.controls]]
+    assert "/table Ts: a number in 1 of 600 rows only" in proposal.text
+    rows = "\n".join(f"{y},{u},{4 * (k == 0) or ''}" for k, (y, u) in enumerate(zip(columns["y"], u, strict=True)))
+    (tmp_path / "b.csv").write_text(f"y,u,Ts\n{rows}\n")
+    words = "column 'Ts' is the same in all rows, and no other is called time.*--table step"
+    refuses(BagError, words, propose, [tmp_path / "b.csv"])
 
 
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):

@@ -476,6 +476,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"time\n1\n2\n", "there is one column only in it"),
         ("a.csv", b"\x00\x01\x02" * 100, "holds bytes that are no text"),
         ("a.csv", b"time x y\n1 2 3\n2 a 4\n", "apart by spaces, and not all are numbers"),
+        ("a.csv", b'"t,x"\n"2020-01-01 10:00:00,1"\n"2020-01-01 10:00:01,2"\n', "each line is in quotes as a whole"),
         ("a.csv", b"linear:\n  x: 0.1\n---\nlinear:\n  x: 0.2\n", "what `ros2 topic echo` prints"),
         ("a.csv", b"x,time,y\n2,3\n1,4\n3,4\n", "header names 3 columns and its rows have 2 cells.*no column is"),
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),

@@ -343,14 +343,13 @@ def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: 
 # Words in the name of a topic or of its type; the last word of a name counts most.
 _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive(?!n|train)|trajectory"
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
-_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)tau(_?con)?_?\d*$")  # of a control in a table
-_SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # likewise, as it is spelt: SetSpeed, speed_set, but no Settling
+_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$)")
+_SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
 _LABEL = re.compile(
     r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
     r"alarm|emergency|(^|_)e_?stop|protective_?stop|(^|_)(lost|fail(ed|ure)?)$)"
 )
-_LABELS = 30
-"""Values that a label takes, at most."""
+_LABELS = 30  # values that a label takes, at most
 
 _REFERENCE = re.compile(
     r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)soll|demand|request|(^|_)req(_|$)|ref$|_des(_|\d|$)|"
@@ -483,13 +482,14 @@ def _is_code(candidate: Candidate) -> bool:
 
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls."""
-    found, commanded = [], any(s.role == "control" and s.free for s in sources)
+    found, driven = [], any(s.role == "control" and s.free for s in sources)
     for table in (s for s in sources if s.type == TYPE and s.role == "state"):
-        for candidate in filter(_is_code, table.free if commanded else ()):  # else it may be the only one
+        codes = [c for c in table.free if _is_code(c)]
+        for candidate in codes * driven:  # else it may be the only control
             candidate.reason, candidate.ready = "a code by its name, and its numbers are no amounts", "control"
-        if switches := [c for c in table.candidates if c.reason == TWO_VALUES and not c.flickers]:
-            found.append(table.parted(switches, "switch"))
-        for candidate in switches:
+        if turned := codes * (not driven) + [c for c in table.candidates if c.reason == TWO_VALUES and not c.flickers]:
+            found.append(table.parted(turned, "switch"))
+        for candidate in turned:
             candidate.reason = ""
     return found
 

@@ -256,16 +256,14 @@ def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) 
 def _sift(source: Source) -> None:
     """Say of each number whether it moves; angles in place of the quaternions that are some."""
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
-    parts = {c.path: c for c in source.candidates}
     for base in bases:
-        read = [parts[path].values for axis in "xyzw" if (path := f"{base}.{axis}") in parts and parts[path].values]
+        part = re.compile(rf"{re.escape(base)}(\.[xyzw]|\[[0-3]\]|_[0-3])").fullmatch
+        read = [c.values for c in source.candidates if part(c.path) and c.values]
         norm = np.sqrt(sum(np.concatenate(values) ** 2 for values in read)) if len(read) == 4 else np.zeros(1)
         unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
         is_rotation = len(unit) > 0 and unit.mean() > 0.9
         source.candidates = [  # the other form of the same numbers has its line
-            c
-            for c in source.candidates
-            if not (c.path.startswith(f"{base}.") if is_rotation else c.path.endswith(f"({base})"))
+            c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
     shared = shared_codes(list(each.values())) if source.type == TYPE else set()
@@ -291,14 +289,14 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     values, finite = np.concatenate(candidate.values), candidate.finite
     if not len(finite):
         return "never a number"
-    if finite.min() == finite.max():
-        return f"always {finite[0] + 0.0:.6g}"
-    if source.type != TYPE and np.ptp(finite) < DUST:
-        return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     in_a_row = sum(np.count_nonzero(np.isfinite(v[:-1]) & np.isfinite(v[1:])) for v in candidate.values)
     if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
         what = f"rows only, so {_FILL}" if source.type == TYPE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
+    if finite.min() == finite.max():
+        return f"always {finite[0] + 0.0:.6g}"
+    if source.type != TYPE and np.ptp(finite) < DUST:
+        return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     counts = np.unique(finite, return_counts=True)[1]
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
         return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"

@@ -505,7 +505,7 @@ cdef class Plan:
                 start, count = place[2 * index : 2 * index + 2].tolist()
                 order = "<" if data[1] else ">"
                 found = () if start < 0 else struct.unpack_from(f"{order}{count}{code}", data, ENCAPSULATION + start)
-                return math.nan if start < 0 else function.of_parts(*map(float, found))
+                return math.nan if start < 0 else function.of_array(*map(float, found))
         values = [row[<Py_ssize_t>parts[part]] for part in range(len(parts))]
         if all(map(math.isnan, values)):
             return math.nan

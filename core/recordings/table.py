@@ -39,7 +39,7 @@ from uncertain_lti.recordings.table_times import (
     spread,
 )
 from uncertain_lti.recordings.unreadable import missing
-from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, of_quaternion
+from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
 from uncertain_lti.signals.values import TableLayout
 
 TOPIC = "/table"
@@ -193,11 +193,13 @@ class Table(Recording):
         steps = np.diff(self.times)
         step = float(np.median(steps)) if len(steps) else 0.0
         numbers = [(name, c) for name, c in self.columns_by_field.items() if _field_type(c).kind == "number"]
-        parts = {name for names in self._quaternions.values() for name in names}
+        numbered = [base for base in self._quaternions if f"{base}_0" in self.columns_by_field]
+        parts = {name for base, names in self._quaternions.items() if base not in numbered for name in names}
         whole = [(name, c) for name, c in numbers if name not in parts]
         fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in whole)
         for base in self._quaternions:
-            fields += (*(f"{base}.{axis}" for axis in "xyzw"), *(f"{name}({base})" for name in of_quaternion()))
+            axes = "" if base in numbered else "xyzw"
+            fields += (*(f"{base}.{axis}" for axis in axes), *(f"{name}({base})" for name in of_quaternion()))
         gap = float(steps.max()) * 1e-9 if len(steps) else None
         return [TopicFacts(self.topics[TOPIC], 1e9 / step if step > 0 else None, gap, fields, "none", None)]
 
@@ -378,11 +380,13 @@ _QUATERNION = "quaternion"
 
 
 def _quaternions(columns: Mapping[str, Column]) -> dict[str, list[str]]:
-    """Names of four columns that end in x, y, z and w, by what they begin with: `q` of `qw`, `qx`, `qy` and `qz`."""
+    """Names of the columns of x, y, z, w, by their beginning: `q` of `qx` to `qw`, or of `q[0]` (w) to `q[3]`."""
     found = {}
     for name in columns:
         base = name[:-1].rstrip("_")
         parts = [name[:-1] + axis for axis in ("XYZW" if name[-1] == "W" else "xyzw")]
+        if name[-1] == "0" and base in QUATERNION_ARRAYS and f"{base}_4" not in columns:
+            parts = [f"{base}_{entry}" for entry in "1230"]
         if name == parts[3] and base and base not in columns and all(part in columns for part in parts):
             if all(_field_type(columns[part]) == FieldType("number", "float64") for part in parts):
                 found[base] = parts

@@ -278,6 +278,8 @@ def once(names: Iterable[str], between: str) -> list[str]:
 
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     """Find the delimiter with which most lines have as many values as each other, and the first line of data."""
+    if all(re.fullmatch(r'\s*("[^"]*[,;\t][^"]*"\s*)?', line) for line in lines) and any(map(str.strip, lines)):
+        raise BagError(f"{path}: each line is in quotes as a whole, and so one cell; take them off the lines' two ends")
     best: tuple[float, int, int, str] | None = None  # how well it fits, cells, - first line, delimiter
     for delimiter in (*_DELIMITERS, " "):
         if delimiter == " " and best:

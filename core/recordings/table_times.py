@@ -226,7 +226,8 @@ def _of_parts(table: RawTable) -> str:
 
 
 def _stands_still(column: Column) -> bool:
-    return column.dtype.kind in "iuf" and len(column) > 2 and bool((column == column[0]).all())
+    same = column.dtype.kind in "iuf" and len(column) > 2 and (column == column[0]).sum()
+    return bool(same == len(column) or (same and np.count_nonzero(column == column) == 1))
 
 
 def _of_a_minute(name: str, column: Column) -> bool:

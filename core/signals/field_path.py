@@ -26,13 +26,14 @@ class ValueKind(NamedTuple):
     """What a function takes: a message with certain fields, or also an array of numbers.
 
     `words`: what it is, for errors; `required`: fields that a message must have, one letter each; `optional`: fields
-    that count where the message has them; `array`: whether an array of numbers will do as well.
+    that count where the message has them; `array`: entries of an array of numbers that will do as well, in its order,
+    `*` for any; empty where none will.
     """
 
     words: str
     required: str
     optional: str = ""
-    array: bool = False
+    array: str = ""
 
     def parts(self, fields: Container[str]) -> tuple[str, ...]:
         """Fields of a message that the function takes, in its order."""
@@ -61,8 +62,14 @@ class FieldFunction(NamedTuple):
         """The number for one value of a message; NaN where there is none."""
         names = self.takes.required + self.takes.optional
         if self.takes.array and not hasattr(value, names[0]):
-            return self.of_parts(*(as_number(v) for v in value))
+            return self.of_array(*(as_number(v) for v in value))
         return self.of_parts(*(getattr(value, name) for name in names if hasattr(value, name)))
+
+    def of_array(self, *entries: float) -> float:
+        """The same from the entries of an array."""
+        if len(self.takes.array) == len(entries) and self.takes.array != "*":
+            entries = tuple(entries[self.takes.array.index(name)] for name in self.takes.required)
+        return self.of_parts(*entries)
 
     def of_parts(self, *parts: Any) -> float:
         """The same from the parts of the value."""
@@ -103,8 +110,10 @@ def _unchanged(*parts: Any) -> tuple[tuple[Any, ...], Any]:
     return parts, 1.0
 
 
-QUATERNION = ValueKind("a quaternion with x, y, z, w", "xyzw")
-VECTOR = ValueKind("a vector with x, y, z or an array of numbers", "x", "yzw", array=True)
+QUATERNION = ValueKind("a quaternion with x, y, z, w or an array of four from w on", "xyzw", array="wxyz")
+VECTOR = ValueKind("a vector with x, y, z or an array of numbers", "x", "yzw", array="*")
+QUATERNION_ARRAYS = ("q", "q_d", "quaternion")
+"""Names of such arrays of four, as PX4 and Unitree write them."""
 
 FUNCTIONS: Mapping[str, FieldFunction] = {
     "roll": FieldFunction(QUATERNION, _roll, math.atan2, unit="rad", wraps=True),
@@ -341,7 +350,7 @@ class FieldPath:
             takes = self.function.takes
             inner = type_fields(leaf.type_name) if leaf.kind == "message" and leaf.array is None else {}
             if leaf.array is not None:
-                fits = takes.array and leaf.kind == "number"
+                fits = leaf.kind == "number" and (takes.array == "*" or leaf.array == len(takes.array) > 0)
             else:
                 parts = takes.parts(inner)
                 fits = bool(parts) and all(inner[name].kind == "number" for name in parts)
@@ -395,6 +404,8 @@ def signal_paths(
             if field.kind == "message":
                 yield from _inside(type_fields, field, value[0], every, depth)
             elif field.kind in ("number", "bool"):
+                if name in QUATERNION_ARRAYS and field.kind == "number" and field.array == len(QUATERNION.array):
+                    yield from (f"{function}({path})" for function in of_quaternion())
                 names = _names(type_fields, type_name, message) if field.kind == "number" else []
                 yield from [f"{path}[{n}]" for n in names] if len(names) == len(value) else [every]
         elif field.kind == "message":
