@@ -611,8 +611,11 @@ def test_a_computed_average_is_no_state(tmp_path, step):
     top, bottom, mean_wind = (answers(rng, u, 0.02, 0.9)[:, 0].round(3) for _ in range(3))
     columns = {"top_speed": top, "bottom_speed": bottom, "average_speed": ((top + bottom) / 2).round(3)}
     columns |= {"mean_wind_speed": mean_wind, "motor_cmd": u[:, 0]}
-    proposal = propose([table_of(tmp_path / "a.csv", columns, step * np.arange(2000))])
+    path = table_of(tmp_path / "a.csv", columns, step * np.arange(2000))
+    proposal = propose([path])
     assert [c.path for c in proposal.states] == ["top_speed", "bottom_speed", "mean_wind_speed"]
+    asked = propose([path], states=["/table:average_speed"])
+    assert [c.path for c in asked.states] == ["average_speed"]
     assert "average_speed: follows from top_speed, bottom_speed of the same row" in proposal.text
 
 

@@ -363,8 +363,9 @@ def _rate_of(place: Candidate, velocity: Candidate) -> bool:
 def _drop_computed(sources: Sequence[Source]) -> None:
     """Leave out what is computed from other columns: an average, or an error, which jumps with its set point."""
     pool = [c for s in sources if s.type == TYPE for c in s.free if np.ptp(c.finite) > 0]
-    some = {c: np.concatenate(c.values)[:: 1 + len(c.values[0]) // 1000] / np.ptp(c.finite) for c in pool}
-    for candidate in [c for c in pool if not _COMPUTED.isdisjoint(words_of(c.path))]:
+    named = [c for c in pool if not _COMPUTED.isdisjoint(words_of(c.path))]
+    some = {c: np.concatenate(c.values)[:: 1 + len(c.values[0]) // 1000] / np.ptp(c.finite) for c in pool if named}
+    for candidate in named:
         known = np.isfinite(some[candidate])
         others = [c for c in pool if c is not candidate and not c.reason and np.isfinite(some[c][known]).all()]
         y, X = some[candidate][known], np.column_stack([some[c] for c in others] + [np.ones(len(known))])[known]
@@ -465,7 +466,8 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
-    _drop_computed(sources)
+    if not (states or controls):  # what a person asks for stays
+        _drop_computed(sources)
     if words := _in_words(bags, layout.runs):
         warnings.append(f"columns of words are no signals: {shortlist(words, 4)}; write numbers in place of them")
     if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
