@@ -15,14 +15,13 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import numpy as np
-
 from uncertain_lti.base.text import Block, Table, list_of, named, number, numbers_of, plural, share, shortlist, text_of
 from uncertain_lti.identification.diagnosis import CONSTANT, remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.likeness import Learnt
+from uncertain_lti.sampling.clock import passed
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.values import CRITERIA
@@ -34,8 +33,9 @@ MOST_SHOWN = 20
 def recording_text(transient: Transient) -> str:
     """One recording: what was read, and what of it is not used."""
     usable, left = int(transient.usable.sum()), ", ".join(unused(transient))
-    span = float(np.maximum(np.diff(transient.t_ns), 0).sum()) * 1e-9  # the clock may begin anew
-    text = f"{plural(len(transient), 'sample')} over {span:.4g} s, {plural(usable, 'usable transition')}"
+    text = (
+        f"{plural(len(transient), 'sample')} over {passed(transient.t_ns):.4g} s, {plural(usable, 'usable transition')}"
+    )
     return f"{transient.name}: {text}{f' ({left})' * bool(left)}"
 
 

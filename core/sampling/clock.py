@@ -105,6 +105,11 @@ def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) 
     return int(np.median(steps)) if steps.size else None
 
 
+def passed(t_ns: NDArray[np.int64]) -> float:
+    """Time from the first to the last of some instants, s; a step back of the clock, which begins anew, takes none."""
+    return float(np.maximum(np.diff(t_ns), 0).sum()) * 1e-9
+
+
 def longest_step(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0, recalls: bool = False) -> float:
     """Longest step that is no gap where nobody says, s; inf without a forward step.
 

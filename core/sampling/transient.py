@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.text import html_table, meant, named, number_text, plural
-from uncertain_lti.sampling.clock import Counters, Status, longest_step, to_ns
+from uncertain_lti.sampling.clock import Counters, Status, longest_step, passed, to_ns
 from uncertain_lti.sampling.samples import (
     csv_columns,
     frame_columns,
@@ -362,7 +362,7 @@ class Transient:
         return len(self.t_ns)
 
     def __repr__(self) -> str:
-        span, usable = float(self.t[-1]) if len(self) else 0.0, plural(int(self.usable.sum()), "usable transition")
+        span, usable = passed(self.t_ns), plural(int(self.usable.sum()), "usable transition")
         signals = f"{plural(self.x.shape[1], 'state')}, {plural(self.u.shape[1], 'control')}"
         samples = f"{plural(len(self), 'sample')} over {span:g} s"
         return f"Transient({self.name!r}: {samples}, {signals}, {usable} in {plural(self.segments, 'segment')})"

@@ -26,6 +26,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.clock import passed
 from uncertain_lti.sampling.transient import Transient, controls_as, listed_transients
 from uncertain_lti.validation.groups import likely_groups, resolve_groups
 from uncertain_lti.validation.part import Part, Reach, judge
@@ -56,7 +57,7 @@ def block_spans(transient: Transient, blocks: int) -> list[tuple[int, int]]:
 def guard_interval(model: UncertainLTI, cuts: Sequence[tuple[Transient, int, int]]) -> float:
     """Three of the slowest stable time constants of the model, at most half of the shortest block."""
     stable = [-v.real for v in model.eigenvalues().ravel() if v.real < 0]
-    shortest = min(float(np.maximum(np.diff(t.t[start:stop]), 0.0).sum()) for t, start, stop in cuts)
+    shortest = min(passed(t.t_ns[start:stop]) for t, start, stop in cuts)
     return min(3.0 / min(stable) if stable else math.inf, 0.5 * shortest)
 
 
