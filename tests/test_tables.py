@@ -22,13 +22,14 @@ from conftest import ROOT
 from processes import bounded
 from refusals import refuses
 
-from uncertain_lti import SignalMap, UncertainLTI, read_transients
+from uncertain_lti import SignalMap, Transient, UncertainLTI, read_transients
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.cli.main import main
 from uncertain_lti.proposal.init import propose, run_column
 from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
 from uncertain_lti.recordings.table_files import _of_arrays, read_table
+from uncertain_lti.sampling.reading import refuse_copies
 from uncertain_lti.signals.values import TableLayout
 
 SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"
@@ -473,7 +474,8 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
     [
         ("a.csv", b"", "the file is empty"),
         ("a.csv", b"time,x\n", "there is no line of numbers in it"),
-        ("a.csv", b"time\n1\n2\n", "there is one column only in it"),
+        ("a.csv", b"time\n1\n2\n", "there is one column only in it.*put the columns of a recording side by side"),
+        ("a.txt", b"   1.5e+00\n   2.5e+00\n", "there is one column only in it"),
         ("a.csv", b"\x00\x01\x02" * 100, "holds bytes that are no text"),
         ("a.csv", b"time x y\n1 2 3\n2 a 4\n", "apart by spaces, and not all are numbers"),
         ("a.csv", b'"t,x"\n"2020-01-01 10:00:00,1"\n"2020-01-01 10:00:01,2"\n', "each line is in quotes as a whole"),
@@ -817,7 +819,7 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
         (
             "time,x",
             (f"{k // 10},{k % 10}" for k in range(100)),
-            "90 of 100 rows have the time of a row before, and only",
+            "90 of 100 rows have the time of a row before in column 'time', and only.*or take another, `--table time=",
         ),
         ("Date,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9)), "write days of a spreadsheet"),
     ):
@@ -826,6 +828,46 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
     assert list(read_csv(tmp_path, "time,Größe °C", ["0,1", "1,2"], "cp1252").columns_by_field) == ["Größe_C"]
     rows = read_csv(tmp_path, "time,signal,value", (f"{k},{('speed', 'load')[k % 2]},{k * k}" for k in range(90)))
     assert "column 'signal' names the signal" in rows.topics["/table"].reason
+
+
+SAID = {  # of a recording, by the historian of a plant and by the tool of a test rig
+    "historian": ["Begin,09/12/2017 10:00,End,", ",PIC1/OUT,PIC1/PV,LI2/PV", "TIMESTAMP,Outlet,,Level"],
+    "rig": ["user,admin", "", "types,5,4,4", "names,,Out1,Out1", "path,time,a/PIC1,b/LI2", "max,,1e9,1e9"],
+}
+
+
+@pytest.mark.parametrize("tool", SAID)
+def test_names_are_found_below_what_a_tool_says_of_the_recording(tool, tmp_path):
+    """Its lines with a number or an instant were the first data, so that no column had a name."""
+    form = {"historian": "{t},{k},{x},{k}", "rig": ",{t},{x},{k}"}[tool]
+    rows = (form.format(t=0.5 * k, k=k, x=k % 7) for k in range(50))
+    bag = read_csv(tmp_path, SAID[tool][0], [*SAID[tool][1:], *rows])
+    assert {"historian": "PIC1_PV", "rig": "a_PIC1"}[tool] in bag.columns_by_field
+    assert len(bag.times) == 50 and set(np.diff(bag.times).tolist()) == {5 * 10**8}
+
+
+@pytest.mark.parametrize(("first", "hour"), [(42990.41667, 10), (737045.41667, 10)])
+def test_days_of_a_spreadsheet_are_read_where_they_are_said(first, hour, tmp_path):
+    """A plant's rows a second apart were taken for 10^5 a second; now their unit is asked for."""
+    rows = [f"{first + k / 86400:.5f},{k}" for k in range(400)]
+    refuses(BagError, "may be s or days.*unit=d", read_csv, tmp_path, "time,x", rows)
+    for head, layout in (("time,x", TableLayout(unit="d")), ("time (days),x", None)):
+        (tmp_path / "a.csv").write_text("\n".join([head, *rows]))
+        (bag,) = group_recordings([tmp_path / "a.csv"], layout=layout or TableLayout())
+        begin, end = (np.datetime64(int(t), "ns").astype("datetime64[s]") for t in bag.times[[0, -1]])
+        assert str(begin)[10:13] == f"T{hour}" and abs(int((end - begin).astype(int)) - 399) <= 1
+        assert str(begin)[:4] in ("2017", "2018")
+
+
+def test_runs_of_the_same_times_are_not_all_compared_with_each_other(monkeypatch):
+    """Of 10 000 runs of 20 rows that took longer than the fit."""
+    t, compared = np.arange(20) * 10**9, []
+    runs = [Transient(t, np.random.default_rng(k).normal(size=(20, 2)), np.zeros((20, 1))) for k in range(60)]
+    monkeypatch.setattr(np, "array_equal", lambda *some, **how: compared.append(1) or False)
+    refuse_copies(runs)
+    assert len(compared) < len(runs)
+    monkeypatch.undo()
+    refuses(BagError, "holds the samples of", refuse_copies, [*runs, runs[7].replace(x=runs[7].x.copy())])
 
 
 def test_rows_of_whole_seconds_come_evenly_and_those_of_units_do_not(tmp_path):

@@ -119,12 +119,9 @@ class Table(Recording):
                 self.times, taken = spread(self.times), f"they are taken to come evenly in the {usual:g} s after it: "
             else:
                 taken = f"only the first of such rows counts: {f'{each}write a file for each; else ' * (number > 1)}"
-            self._warnings.append(
-                f"{path}: {equal} of {len(kept)} rows have the time of a row before, and {taken}"
-                "write times with more decimals"
-                + f", or take column '{other}', `table: {{time: '{other}'}}`"
-                * bool(other)
-            )
+            named = f"column '{other}', `table: {{time: '{other}'}}`" if other else "another, `--table time=COLUMN`"
+            same = f"{equal} of {len(kept)} rows have the time of a row before in column '{time}'"
+            self._warnings.append(f"{path}: {same}, and {taken}write times with more decimals, or take {named}")
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
         fields = zip(once(map(field_name, names), "_"), names, strict=True)
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}

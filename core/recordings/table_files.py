@@ -295,20 +295,25 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
             candidate = (fit, wide, -begin, delimiter)
             best = max(best, candidate) if best else candidate
     if best is None:
-        kind = "one column only" if any(map(_is_value, lines)) else "no line of numbers"
-        raise BagError(f"{path}: there is {kind} in it, and a table has a column of time and others; check the file")
+        alone = any(_is_value(line.strip()) for line in lines)
+        kind = "one column only" if alone else "no line of numbers"
+        remedy = "put the columns of a recording side by side in one file" if alone else "check the file"
+        raise BagError(f"{path}: there is {kind} in it, and a table has a column of time and others; {remedy}")
     _, wide, begin, delimiter = best
+    split = [_split(line, delimiter) for line in lines]
+    first, begin = -begin, _below_names(split, wide, -begin)
     if wide > _MOST_COLUMNS:
         raise BagError(f"{path}: has {wide} columns, more than {_MOST_COLUMNS}; write those that are needed")
-    in_spaces = [line.split() for line in lines[-begin:] if delimiter == " " and line.strip()]
+    in_spaces = [line.split() for line in lines[begin:] if delimiter == " " and line.strip()]
     if any(len(c) != wide or not all(_is_value(v) or v.lower() in _MISSING for v in c) for c in in_spaces):
         raise BagError(
             f"{path}: its cells are apart by spaces, and not all are numbers, or as many in each line; write commas, "
             "semicolons or tabs between them, or record a bag in place of what `ros2 topic echo` prints"
         )
-    above = [_split(line.lstrip("#% "), delimiter) for line in lines[:-begin]]
+    above = [_split(line.lstrip("#% "), delimiter) for line in lines[:first]]
+    above += [cells for cells in split[first:begin] if not any(map(_is_value, cells))]
     above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
-    rows = [cells for line in lines[-begin:] if len(cells := _split(line, delimiter)) == wide]
+    rows = [cells for cells in split[begin:] if len(cells) == wide]
     named = any(len(cells) == wide and 2 * len(set(cells) - {""}) > wide for cells in above)
     if not named and not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none of the names
         above = [[*cells, ""] if len(cells) == wide - 1 else cells for cells in above]
@@ -321,11 +326,23 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
         unlike = (
             f"its header names {len(last)} columns and its rows have {wide} cells, so no column has a name; mend it"
         )
-        return _Shape(delimiter, -begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike * bool(last))
+        return _Shape(delimiter, begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike * bool(last))
     chosen = next(
         (i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0]
     )  # above the names there may be groups of them
-    return _Shape(delimiter, -begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
+    return _Shape(delimiter, begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
+
+
+_FEW = 10  # lines with a number or an instant that may come above the names
+
+
+def _below_names(split: Sequence[list[str]], wide: int, begin: int) -> int:
+    """The first line of data, below the names where what a tool says of the recording comes above them."""
+    whole = [(i, cells, any(map(_is_value, cells))) for i, cells in enumerate(split) if len(cells) == wide]
+    names = next((i for i, cells, valued in whole if not valued and 2 * len({*cells} - {""}) > wide), 0)
+    if not begin < names < begin + _FEW:
+        return begin
+    return next((i for i, _, valued in whole if i > names and valued), begin)
 
 
 def _split(line: str, delimiter: str) -> list[str]:

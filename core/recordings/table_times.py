@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 
 import numpy as np
@@ -34,7 +35,7 @@ _NAMES = (
 )  # fmt: skip
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
-    "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?",
+    "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?", "d": r"days?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
 _DAY = re.compile(
@@ -58,6 +59,8 @@ _DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
 _COMPACT = re.compile(r"((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _LARGEST_ZONE = 14  # hours
+_CALENDARS = (20_000, 80_000, 25_569), (690_000, 800_000, 719_529)  # days of these decades: Excel, MATLAB; 1970-01-01
+_HARDLY = 1e-4  # s from row to row, below which numbers such as days of a spreadsheet hardly are s
 _UNLIKELY = 100, 1000  # s from row to row, not whole minutes, from which on it hardly is in s; the other: since 1970
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
@@ -108,7 +111,11 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         times, _ = _of_text(where, [f"{value:.0f}" if value == value else "" for value in values.tolist()])
     else:
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
-        doubt, unit = "; write days of a spreadsheet as ISO times" * (not stated and _like_days(values)), stated or "s"
+        unit, days = stated or "s", "write days of a spreadsheet as ISO times, or give `--table unit=d`"
+        doubt = f"; {days}" * (not stated and _like_days(values))
+        if doubt and np.median(np.abs(np.diff(values[np.isfinite(values)]))) < _HARDLY:
+            none = "has no unit, which may be s or days"
+            raise BagError(f"{where}: {none}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
         if unit == "s" and not stated and (step := _coarse(values)):
             doubt, ask = f", {step:.10g} from row to row", "name it time_us or time_ms, or give `--table unit=us`"
             if step >= _UNLIKELY[_since_1970(values)]:
@@ -117,6 +124,8 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             doubt += f": for others {ask}"
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
+        if unit == "d" and (since := _first_day(values)):
+            table = replace(table, columns={column: values - since}, exact=None)
         times = _of_numbers(where, table, column, UNITS[unit])
     words = " and ".join(filter(None, said))
     return column, times, f"column '{column}': {words}" if words else ""
@@ -330,9 +339,16 @@ def _compact(values: Column) -> bool:
 def _like_days(values: Column) -> bool:
     """Whether numbers with more than three decimals are such as Excel and MATLAB write for days of these decades."""
     known = values[np.isfinite(values)]
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     fine = bool((np.abs(1e3 * known - np.rint(1e3 * known)) > 1e-3).any())
-    return fine and any(least < low and high < most for least, most in ((20_000, 80_000), (690_000, 800_000)))
+    return fine and _first_day(values) > 0
+
+
+def _first_day(values: Column) -> int:
+    """The first of January 1970 as Excel or MATLAB count days, whichever fits; 0 if neither."""
+    known = values[np.isfinite(values)]
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
+    fits = (first for least, most, first in _CALENDARS if least < low and high < most)
+    return next(fits, 0)
 
 
 def _coarse(values: Column) -> float:

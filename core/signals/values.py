@@ -227,10 +227,10 @@ CHOICES_TEXT = " or ".join(", ".join(CHOICES).rsplit(", ", 1))
 """The choices as a part of a sentence."""
 
 
-UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "min": 60 * 10**9, "h": 3600 * 10**9}
+UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "min": 60 * 10**9, "h": 3600 * 10**9, "d": 86400 * 10**9}
 """Units of time that a column of numbers can have, with their nanoseconds."""
 
-TimeUnit = Literal["s", "ms", "us", "ns", "min", "h"]
+TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d"]
 
 
 @dataclass(frozen=True, slots=True)
