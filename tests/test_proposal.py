@@ -249,6 +249,8 @@ def test_what_is_desired_is_a_reference(column, role):
         ("x u v r delta n", "delta n"), ("U_m_s V_m_s Q_rad_s rudder", "rudder"), ("x v u", "u"), ("n delta u", "u"),
         ("T_brine_in T_brine_out", ""), ("T_brine_in T_out in", "T_brine_in in"), ("Brake_IN Speed", "Brake_IN"),
         ("ESC_signal_µs Servo_1_us loop_us pump_duty", "ESC_signal_µs Servo_1_us pump_duty"),
+        ("ESC_signal_µs Thrust_gf", "ESC_signal_µs"), ("Thrust_N Speed", "Thrust_N"), ("pwm thrust", "pwm thrust"),
+        ("Pos_AccPedal drive_axle_speed DE_drive_end drive_cmd", "Pos_AccPedal drive_cmd"),
         ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
@@ -461,6 +463,27 @@ def test_stamps_that_cannot_be_used_give_way_to_times_of_arrival(tmp_path, stamp
     proposal = propose(paths)
     assert yaml.safe_load(proposal.text)["topics"] == {"/plant/state": {"time": "log"}, "/plant/cmd": {"time": "log"}}
     assert fitted(paths, proposal).fit_summary["transitions"] > 300 * len(paths)
+
+
+def test_the_rate_that_is_told_is_that_of_the_times_that_count(tmp_path):
+    """A simulation at a quarter of the real time was said to have 6.8 samples a second, and 29 were fitted."""
+    states = [m for m in stamped(driven(), lambda log: 10**9 + (log - 10**9) // 4) if m.topic == "/plant/state"]
+    text = propose([save(tmp_path / "a.mcap", states, {"/plant/state": "geometry_msgs/msg/PointStamped"})]).text
+    (rate,) = re.findall(r"the sample instants: ([\d.]+) a second", text)
+    steps = np.diff([m.log_time for m in states])
+    assert float(rate) == pytest.approx(4e9 / float(np.median(steps)), rel=1e-3)
+
+
+def test_recordings_are_told_apart_and_thousands_are_one_line(tmp_path):
+    rows = [(0.1 * k, math.sin(0.1 * k), math.cos(0.3 * k)) for k in range(60)]
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        csv(tmp_path / folder / "run.csv", ["time", "x", "cmd"], rows)
+    text = propose([tmp_path / "a" / "run.csv", tmp_path / "b" / "run.csv"]).text
+    assert all(f"#   {tmp_path / folder / 'run.csv'}\n" in text for folder in ("a", "b"))
+    runs = [(run, *row) for run in range(50) for row in rows]
+    text = propose([csv(tmp_path / "all.csv", ["run", "time", "x", "cmd"], runs)]).text
+    assert "#   all.csv[0] to all.csv[49]: 50\n" in text and "all.csv[7]" not in text
 
 
 def test_topics_and_names_that_yaml_would_misread(tmp_path):

@@ -341,7 +341,8 @@ def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: 
 
 
 # Words in the name of a topic or of its type; the last word of a name counts most.
-_COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|joy|ackermann|drive(?!n|train)|trajectory"
+_COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|pedal|joy|ackermann|trajectory"
+_COMMANDS += "|drive(?!n|_?(train|axle|shaft|wheel|end))"  # parts of a machine are none
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 _COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$)")
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
@@ -359,10 +360,9 @@ _STATE = re.compile(
     r"(state|odom|pose|twist|imu|uwb|vicon|mocap|optitrack|feedback|measur|sensor|encoder|velocity|position|speed|"
     r"depth|pressure|temperature|power|attitude|estimat|log|loc$|response|data$|(^|_)mag(net|_|$)|compass|transform)"
 )
+_FORCE, _ESC = re.compile(r"thrust.*_(g|gf|kgf?|k?n|lbf?)$"), re.compile(r"throttle|pwm|(^|_)esc(_|$)")  # on a stand
 _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
-
-
 _TOLD = re.compile(
     r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
 )
@@ -371,11 +371,9 @@ _TOLD = re.compile(
 FEWEST_SET, MOST_SET = 3, 0.2
 """A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
 
-
 _PHYSICAL = re.compile(
     r"^(imu|jointstate|odometry|twist|pose|wrench|accel|vector3|quaternion|transformstamped|ackermann)"
 )
-
 
 _APART_TYPES = {
     "rcl_interfaces/msg/Log", "rcl_interfaces/msg/ParameterEvent", "tf2_msgs/msg/TFMessage", "rosgraph_msgs/msg/Clock",
@@ -431,7 +429,7 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
     if _BODY[0].issubset(beside) and not _BODY[1].isdisjoint(beside):
         if low in _BODY[0] or _EFFECTOR.fullmatch(low):
             return "state" if low in _BODY[0] else "control"
-    if _ANSWER.search(low):
+    if _ANSWER.search(low) or (_FORCE.search(low) and any(map(_ESC.search, beside))):
         return "state"
     if _REFERENCE.search(low) or (low == "r" and {"u", "y"}.issubset(beside) and {"v", "x", "p"}.isdisjoint(beside)):
         return "reference"

@@ -15,6 +15,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, count
 from types import MappingProxyType
 
@@ -167,17 +168,20 @@ def signals_file(
     clock = clock_of(states, sources)
     lines = [
         "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
-        *(f"#   {bag.path.name}" for bag in bags),
+        *_recordings(bags),
         "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",
         *([] if plant else [_ADDITIVE, "additive: noise", ""]),
-        f"# Its messages define the sample instants: {clock.rate:.4g} a second.",
-        f"clock: {_quoted(clock.topic)}",
     ]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     by_arrival = any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0
     instants = clock.arrival if by_arrival else [clock.instants(clock, k)[0] for k in range(len(clock.arrival))]
+    by_them = replace(clock, arrival=instants)
+    lines += [
+        f"# Its messages define the sample instants: {by_them.rate:.4g} a second.",
+        f"clock: {_quoted(clock.topic)}",
+    ]
     if pause := longest_pause(instants):
         lines += ["", "# They come in bursts, and their samples evenly.", "step: constant", f"max_gap: {pause:g}"]
     elif unit := coarse_ns(instants):
@@ -228,6 +232,19 @@ def signals_file(
         lines += ["", "# Half a turn or more: nothing depends on how many turns there were.", "structure:"]
         lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
+
+
+def _recordings(bags: Sequence[Recording]) -> list[str]:
+    """A line for each recording, or, of many, for the first and the last."""
+    names = [bag.path.name for bag in bags]
+    if len(set(names)) < len(names):  # files of one name in several folders
+        names = [str(bag.path) for bag in bags]
+    return (
+        [f"#   {name}" for name in names] if len(names) <= _LISTED else [f"#   {names[0]} to {names[-1]}: {len(names)}"]
+    )
+
+
+_LISTED = 40
 
 
 def _turns(candidate: Candidate) -> bool:
