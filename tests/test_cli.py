@@ -290,6 +290,7 @@ def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, wor
     verdicts = EnvelopeMonitor(model).check(Transient(t_ns, x, np.zeros((200, 1))))
     data = check_data(model, verdicts)
     assert f"ALARM: raised once, {words}" in check_text(data)
+    assert ("2023-11-15T23:13:20 UTC, 25 h on  " in check_text(data).split("ALARM")[0]) == ("UTC" in words)
     data["states"]["x1"]["jump"] = {**data["alarms"][0], "text": "x1 jumped"}
     at = words.removeprefix("first at ").rpartition(" for ")[0].rstrip(",")
     assert f"x1 jumped at {at}" in check_text(data).splitlines()

@@ -372,6 +372,7 @@ def test_what_is_not_worth_having_is_said_first():
             "good",
             "worth having: it sees jumps of 2 to 90 % of the recorded ranges, large ones alone of x2",
         ),
+        ((2e-7, 0.996), "good", "worth having: it sees jumps of 0.00002 to 100 % of the recorded ranges, large"),
         ((0.6, 0.9), "some", "worth little: it sees jumps of 60 to 90 % of the recorded ranges only, which a plot "),
         ((0.02, 1.1), "some", "sees only x1: of x2 not even a jump of the whole recorded range"),
     ],

@@ -492,7 +492,7 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     for name, s in data["states"].items():
         counts = [str(s["violations"]), share(s["inside"]), number(s["mean_width"]), share(s["width_to_range"], 2)]
         worst = beyond(s["worst"]["utilisation"]) if s["violations"] else "-"
-        when = "-" if s["first_violation"] is None else f"{s['first_violation']['t']:.4f} s"
+        when = "-" if s["first_violation"] is None else instant_text(s["first_violation"])
         rows.append([named(name, s["unit"]), *counts, when, worst])
     header: Sequence[str] = ("state", "violations", "inside", "mean width", "width/range", "first", "worst")
     blocks.append(Table(header, rows, most=200))

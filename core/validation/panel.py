@@ -497,7 +497,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         why = [f"{', '.join(still)} never moved"] if still else []
         why += [f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []
         return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
-    low, high = (f"{100 * extreme:.2g}" for extreme in (share.min(), share.max()))
+    low, high = (np.format_float_positional(float(f"{100 * s:.2g}"), trim="-") for s in (share.min(), share.max()))
     ranges = f"{low} % of the recorded range" if low == high else f"{low} to {high} % of the recorded ranges"
     coarse = [name for name, s in zip(names, share.tolist(), strict=True) if s > COARSE]
     if len(coarse) == model.n:
