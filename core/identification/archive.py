@@ -205,16 +205,10 @@ def fit_archive(
         return f"transition {index - starts[which]} of {named[which][0]}"
 
     fleet.check_solvable(where, [s.name for s in signals.states])
+    dt_median = fleet.median_dt() if dt is None else float(np.median(dt))
+    asked: dict[str, Any] = {"structure": structure_of(signals, scheduled), "alarm_rule": alarm_rule}
     with contradiction_named(where, signals):
-        model = fit_fleet(
-            fleet,
-            signals,
-            criterion,
-            structure=structure_of(signals, scheduled),
-            alarm_rule=alarm_rule,
-            progress=progress,
-            dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
-        )
+        model = fit_fleet(fleet, signals, criterion, dt_median=dt_median, progress=progress, **asked)
     facts = {
         **model.fit_summary,
         "messages": [*model.fit_summary.get("messages", []), *messages],
@@ -263,10 +257,8 @@ def _refuse_copies(recordings: Sequence[Recording], marks: Sequence[bytes]) -> N
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:
     """The usable transitions of one recording, normalised."""
     point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
-    return replace(
-        assemble([_sampled(recording, signals)], point, None, "none", empty=True, regimes=columns.regimes),
-        columns=columns,
-    )
+    problem = assemble([_sampled(recording, signals)], point, None, "none", empty=True, regimes=columns.regimes)
+    return replace(problem, columns=columns)
 
 
 def repeats(recording: Recording, model: UncertainLTI) -> Found:

@@ -486,11 +486,9 @@ def _carried(
     wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
     listed = ", ".join(f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4])
     listed += f" and of {len(wide) - 4} other states" if len(wide) > 4 else ""
-    cure = (
-        "leave that stretch out of the recording"
-        if discarded is None
-        else f"--discard {discarded + len(indices)} leaves them out and lists them"
-    )
+    cure = "leave that stretch out of the recording"
+    if discarded is not None:
+        cure = f"--discard {discarded + len(indices)} leaves them out and lists them"
     return [
         f"{plural(len(indices), 'transition')} of {problem.N} ({_where(problem, indices, transients)}) "
         f"{'makes' if len(indices) == 1 else 'make'} the envelope of {listed} {_FEW}: look at what happened there; if "
@@ -518,8 +516,9 @@ def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
     moving = np.ptp(problem.z[:, :n], axis=0) > 0
     slow = float(np.median(problem.dt)) * FASTEST >= 1.0
-    remedy = "its level is judged, how it moves needs faster rows"
-    remedy = remedy if slow else "leave it out, or record the machine at work"
+    remedy = (
+        "its level is judged, how it moves needs faster rows" if slow else "leave it out, or record the machine at work"
+    )
     return {
         i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "
         f"variance at the next; {remedy}"

@@ -188,9 +188,8 @@ def fit(
     if budget:
         facts["discard"] = discard
         facts["discarded"] = discarded
-        facts["with_discarded"] = {
-            key: before.fit_summary[key] for key in ("objective", "mean_width", "max_width", "mean_width_recorded")
-        }
+        keys = ("objective", "mean_width", "max_width", "mean_width_recorded")
+        facts["with_discarded"] = {key: before.fit_summary[key] for key in keys}
     if not horizons:
         return model.replace(fit_summary=facts)
     lengths = [int(h) for h in horizons]
@@ -304,9 +303,8 @@ def fit_fleet(
         if seek_carriers and whole:
             with suppress(FitError):  # a fit that is done does not end for what is said of it
                 few = carriers(describe_on, structure)
-        rank, messages = describe(
-            model, describe_on, sums, found.mean_width, transients, few, discarded if criterion == "qp" else None
-        )
+        gone = discarded if criterion == "qp" else None
+        rank, messages = describe(model, describe_on, sums, found.mean_width, transients, few, gone)
         return rank, messages + distance_in_words(found.gap)
 
     memory = (lambda: None) if remember is None else partial(remember, model.replace(fit_summary=facts), nearest)
@@ -449,11 +447,8 @@ def _field(name: str, otherwise: str) -> str:
 
 
 def _at(signals: SignalMap, point: OperatingPoint) -> SignalMap:
-    steady = np.concatenate((point.x_s, point.u_s, point.s_s)).tolist()
-    scale = np.concatenate((point.X, point.U, point.S)).tolist()
-    return signals.replace_signals(
-        [replace(s, steady=a, scale=b) for s, a, b in zip(signals.signals, steady, scale, strict=True)]
-    )
+    each = zip(signals.signals, point.steady.tolist(), point.scale.tolist(), strict=True)
+    return signals.replace_signals([replace(s, steady=a, scale=b) for s, a, b in each])
 
 
 _PACKAGES = {

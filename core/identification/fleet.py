@@ -108,10 +108,8 @@ class Fleet:
         most = max(min(_LEAST, candidate.most), 2 * candidate.most // max(2, len(self.offsets)))
         each = replace(candidate, most=most)  # all parts together bring about twice as many as one that is alone
         results = self.map(passes.scan, [(each, offset) for offset in self.offsets])
-        rows = []
-        for i in range(len(candidate.rows)):
-            rows.append((Samples.join([r[i][0] for r in results], self.p), min(r[i][1] for r in results)))
-        return rows
+        by_row = (zip(*of_row, strict=True) for of_row in zip(*results, strict=True))
+        return [(Samples.join(samples, self.p), min(reach)) for samples, reach in by_row]
 
     def judge(self, model: Envelope) -> Judged:
         """What the bounds of a model are on all transitions, by the verdict's own arithmetic."""

@@ -96,17 +96,13 @@ class Boxes:
 
     def after(self, columns: Columns, before: UncertainLTI, model: Any, widths: Array) -> Boxes:
         """With the room that another model leaves at least, whose largest widths are `widths` (n,)."""
-        theta, d = (
-            new - old for new, old in zip(elements_of(model, columns), elements_of(before, columns), strict=True)
-        )
+        theta, d = map(np.subtract, elements_of(model, columns), elements_of(before, columns))
         ones, even = np.ones(len(self.source)), [-1] * len(columns.nominal)
-        nearer, farther = (
-            np.maximum(np.maximum(self.low, -self.high), 0.0),
-            np.maximum(np.abs(self.low), np.abs(self.high)),
-        )
+        nearer = np.maximum(np.maximum(self.low, -self.high), 0.0)
+        farther = np.maximum(np.abs(self.low), np.abs(self.high))
+        steps = [term.times_dt for term in columns.half]
         least, largest = (
-            np.vstack([end[:-1], *(end[-1] if term.times_dt else ones for term in columns.half)])
-            for end in (nearer, farther)
+            np.vstack([end[:-1], *(end[-1] if times_dt else ones for times_dt in steps)]) for end in (nearer, farther)
         )
         z_low, z_high = (np.vstack([end[:-1], end[even]]) for end in (self.low, self.high))
         (falls, rises), (less, more) = _products(theta, z_low, z_high), _products(d, least, largest)
@@ -125,13 +121,9 @@ class Boxes:
         room = 255.0 * (np.maximum(self.room, 0.0) / np.where(top > 0.0, top, 1.0)) ** 0.25
         parts = {"low": np.floor(low - 1e-6), "high": np.ceil(high + 1e-6), "room": np.floor(room - 1e-6)}
         counts = np.bincount(self.source, minlength=recordings)
-        return {
-            **{name: as_text(np.maximum(values, 0.0), "u1") for name, values in parts.items()},
-            **{
-                name: as_text(values)
-                for name, values in {"least": least, "step": step, "top": top, "counts": counts}.items()
-            },
-        }
+        units = {"least": least, "step": step, "top": top, "counts": counts}
+        found = {name: as_text(np.maximum(values, 0.0), "u1") for name, values in parts.items()}
+        return found | {name: as_text(values) for name, values in units.items()}
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Boxes:
@@ -285,9 +277,8 @@ def _nearest(
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
     wide = np.square(to_half @ psi).sum(axis=0)
     size = np.square(to_nominal @ phi).sum(axis=0) + wide
-    *_, room = boxes_of(
-        model.tables, of.z_columns, of.dt, of.next_columns, None, widest, np.arange(len(some)), len(some)
-    )
+    alone = np.arange(len(some)), len(some)
+    *_, room = boxes_of(model.tables, of.z_columns, of.dt, of.next_columns, None, widest, *alone)
     near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
     near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
     nearest = np.sort(np.argpartition(near, min(count, near.shape[1]) - 1, axis=1)[:, :count], axis=1)
@@ -318,9 +309,8 @@ def _mark(arrays: Sequence[Array]) -> str:
 
 def _mark_of(model: UncertainLTI) -> str:
     """What a model is recognised by: its elements and its operating point."""
-    return _mark(
-        [*(getattr(model, name) for name in ARRAYS), model.operating_point.steady, model.operating_point.scale]
-    )
+    point = model.operating_point
+    return _mark([*(getattr(model, name) for name in ARRAYS), point.steady, point.scale])
 
 
 def as_text(values: Any, form: str = "<f8") -> list[Any]:

@@ -155,10 +155,7 @@ def optimum(
 
     `sizes` (n,): as in `repair`.
     """
-    if method == "working-set":
-        solution = engine.solve(criterion)
-    else:
-        solution = _as_written(engine, criterion)
+    solution = engine.solve(criterion) if method == "working-set" else _as_written(engine, criterion)
     envelope, d, judged = repair(build, engine, solution, names, sizes, False)
     reference = engine.objective(criterion, solution.d, judged) if solution.delta is None else solution.delta
     if not engine.above(criterion, engine.objective(criterion, d, judged), reference, judged) <= GOOD:

@@ -138,9 +138,8 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             sampled.append((index, block.every(first, stride)))
         weights, (i, j) = block.weights, np.triu_indices(n)
         factors = None if weights.ndim == 1 else weights.T if weights.ndim == 2 else weights[:, i, j].T
-        plain, grams, centre, target, square, width, visits = sums_of(
-            n, *_given(block, columns), *columns.extra, factors
-        )
+        given = *_given(block, columns), *columns.extra
+        plain, grams, centre, target, square, width, visits = sums_of(n, *given, factors)
         coupled = None
         if weights.ndim == 3:
             parts = np.empty((n, len(plain), n, len(plain)))
@@ -168,8 +167,8 @@ def by_row(numbered: Sequence[Numbered], n: int, p: int) -> list[Samples]:
     return [Samples(order, z, rate[i], dt, root[i], s) for i in range(n)]
 
 
-def _joined(parts: Sequence[Array | None]) -> Array | None:
-    """Scheduling signals side by side; None if there are none."""
+def _joined(parts: Sequence[Any]) -> Any:
+    """Arrays side by side; None if there are none."""
     there = [part for part in parts if part is not None]
     return np.hstack(there) if there else None
 
@@ -193,14 +192,9 @@ class Samples:
         return len(self.index)
 
     def __getitem__(self, chosen: Index | NDArray[np.bool_]) -> Samples:
-        return Samples(
-            self.index[chosen],
-            self.z[:, chosen],
-            self.rate[chosen],
-            self.dt[chosen],
-            self.root_weight[chosen],
-            None if self.s is None else self.s[:, chosen],
-        )
+        every = (getattr(self, field.name) for field in fields(self))
+        some: list[Any] = [None if values is None else values[..., chosen] for values in every]
+        return Samples(*some)
 
     def among(self, others: Samples) -> bool:
         """Whether others, in order of index, hold all of these."""
@@ -222,14 +216,7 @@ class Samples:
     @classmethod
     def beside(cls, parts: Sequence[Samples]) -> Samples:
         """All of them, one after the other."""
-        return cls(
-            np.concatenate([s.index for s in parts]),
-            np.hstack([s.z for s in parts]),
-            np.concatenate([s.rate for s in parts]),
-            np.concatenate([s.dt for s in parts]),
-            np.concatenate([s.root_weight for s in parts]),
-            _joined([s.s for s in parts]),
-        )
+        return cls(*(_joined([getattr(s, field.name) for s in parts]) for field in fields(cls)))
 
 
 @dataclass(frozen=True)
@@ -308,11 +295,8 @@ class _Near:
     @classmethod
     def join(cls, parts: Sequence[_Near]) -> _Near:
         """One after the other."""
-        return cls(
-            np.concatenate([part.row for part in parts]),
-            Samples.beside([part.samples for part in parts]),
-            np.concatenate([part.slack for part in parts]),
-        )
+        row, slack = (_joined([getattr(part, name) for part in parts]) for name in ("row", "slack"))
+        return cls(row, Samples.beside([part.samples for part in parts]), slack)
 
 
 def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, residual: Array, offset: int) -> _Near:

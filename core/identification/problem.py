@@ -54,9 +54,13 @@ class Regimes:
         `z` (p, K): [x; u]; `s` (q, K): further scheduling signals; None if there are none; Returns (axes, K):
         normalised.
         """
-        p = len(z)
-        rows = [z[j] if j < p or s is None else s[j - p] for j in self.positions]
-        return np.stack(rows)
+        return np.stack([row_of(z, s, j) for j in self.positions])
+
+
+def row_of(z: Array, s: Array | None, j: int) -> Array:
+    """A row of [z; s]."""
+    row: Array = z[j] if j < len(z) or s is None else s[j - len(z)]
+    return row
 
 
 @dataclass(frozen=True)
@@ -424,11 +428,8 @@ def solve_as_written(
         values = np.asarray(delta.value) * unit_y
     else:
         raise ValueError(f"criterion {criterion!r} is not written out")
-    return (
-        np.asarray(theta.value) / unit_phi[:, None] * unit_y,
-        np.maximum(np.asarray(d.value), 0.0) / unit_psi[:, None] * unit_y,
-        values,
-    )
+    nominal = np.asarray(theta.value) / unit_phi[:, None] * unit_y
+    return nominal, np.maximum(np.asarray(d.value), 0.0) / unit_psi[:, None] * unit_y, values
 
 
 def _unit(columns: Array) -> Array:

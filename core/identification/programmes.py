@@ -194,14 +194,12 @@ class Programmes:
         row = self.row
         if row.r + row.q >= VERY_MANY:
             row.widen_pool((row.r + row.q) // 2, np.inf)
-        answer, solver = self._solve(
-            "quadratic",
-            lambda factor, ridge: row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge),
-            *row.containment(row.pool),
-            row.lower,
-            row.upper,
-            any_solver=True,
-        )
+
+        def objective(factor: float, ridge: float) -> tuple[Array, Array]:
+            return row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
+
+        limits = *row.containment(row.pool), row.lower, row.upper
+        answer, solver = self._solve("quadratic", objective, *limits, any_solver=True)
         row.store(answer)
         return solver
 
@@ -216,13 +214,8 @@ class Programmes:
             whole[:size, :size] = REGULARISATION * H
             return whole, np.append(REGULARISATION * f, 1.0)
 
-        answer, solver = self._solve(
-            "regularised",
-            objective,
-            *self.rows(row.pool),
-            np.append(row.lower, 0.0),
-            np.append(row.upper, np.inf),
-        )
+        limits = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
+        answer, solver = self._solve("regularised", objective, *self.rows(row.pool), *limits)
         row.store_limited(answer)
         return solver
 
@@ -463,10 +456,8 @@ class Programmes:
         width = row.width[pool]
         unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
         rows = np.hstack([np.zeros((len(pool), row.r)), -width[:, None] * row.psi[pool], np.ones((len(pool), 1))])
-        return (
-            np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]),
-            np.concatenate([h, width * row.half[pool] * unit[:, 0]]),
-        )
+        limits = np.concatenate([h, width * row.half[pool] * unit[:, 0]])
+        return np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]), limits
 
     def bounded(self) -> str:
         """Least squared widths, then the centre, among what is as good by (11), sought from an optimum of it.
@@ -543,13 +534,9 @@ class Programmes:
         half = psi @ (row.d[row.free_psi] / (row.unit_psi * row.scale)) + row.half[row.pool]
         y = row.y[row.pool]
         try:
-            programme = Programme(
-                row.centre + self.attempt[1] * np.eye(row.r),
-                -row.target,
-                *self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half])),
-                row.lower[: row.r],
-                row.upper[: row.r],
-            )
+            inside = self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half]))
+            H, limits = row.centre + self.attempt[1] * np.eye(row.r), (row.lower[: row.r], row.upper[: row.r])
+            programme = Programme(H, -row.target, *inside, *limits)
             feasible = FEASIBLE if row.refined else ROUGH
             if row.r < MANY:
                 answer = solve_qp(programme, any_solver=False, feasible=feasible)
@@ -584,11 +571,7 @@ class Programmes:
                 worst, distance, together = int(position), alone, 0
                 break
         sample = int(row.pool[worst])
-        return (
-            int(row.samples.index[sample]),
-            distance * float(row.sizes(sample)) * row.scale,
-            max(together, 0),
-        )
+        return int(row.samples.index[sample]), distance * float(row.sizes(sample)) * row.scale, max(together, 0)
 
     def _with_asked(self, G: Array, h: Array) -> tuple[Array, Array]:
         """Rows G ξ >= h, and what the structure asks of θ if that is no bound of an unknown."""

@@ -22,7 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.base.text import meant, plural
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Columns, Problem, Regimes
+from uncertain_lti.identification.problem import Columns, Problem, Regimes, row_of
 from uncertain_lti.model.schedule import MOST_AXES, Axis, Schedule
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -126,20 +126,13 @@ def signals_of(schedule: Schedule | Mapping[str, Knots], names: Sequence[str]) -
             f"units, Modes, or how many knots"
         )
     check_names(schedule, names)
-    return [
-        name
-        for name, knots in schedule.items()
-        if isinstance(knots, bool) or isinstance(knots, np.ndarray) or knots != 1
-    ]
+    return [name for name, knots in schedule.items() if isinstance(knots, (bool, np.ndarray)) or knots != 1]
 
 
 def unused(further: Sequence[str], on: Sequence[str]) -> list[str]:
     """What is noted of further scheduling signals that schedule nothing."""
-    return [
-        f"scheduling signal '{name}' schedules nothing, and the model leaves it out; use it with --schedule {name}=auto"
-        for name in further
-        if name not in on
-    ]
+    idle = "schedules nothing, and the model leaves it out; use it with --schedule"
+    return [f"scheduling signal '{name}' {idle} {name}=auto" for name in further if name not in on]
 
 
 def check_names(schedule: Iterable[str], names: Sequence[str]) -> None:
@@ -248,9 +241,7 @@ def values_of(problem: Problem, row: int) -> Array:
 
     Returns (N,): normalised.
     """
-    p = problem.p
-    values: Array = problem.z_columns[row] if row < p or problem.s_columns is None else problem.s_columns[row - p]
-    return values
+    return row_of(problem.z_columns, problem.s_columns, row)
 
 
 def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tuple[int, float]:

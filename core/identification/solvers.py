@@ -210,9 +210,8 @@ def _daqp(of: Programme, active: Sense | None) -> _Found:
     H, G = np.ascontiguousarray(of.H), np.ascontiguousarray(of.G)
     cold = np.zeros(size + count, dtype=np.int32)
     for sense in (cold,) if active is None else (active.copy(), cold):
-        x, _, flag, info = daqp.solve(
-            H, of.f, G, bupper, blower, sense, primal_tol=1e-11, iter_limit=20_000, cycle_tol=100
-        )
+        given = H, of.f, G, bupper, blower, sense
+        x, _, flag, info = daqp.solve(*given, primal_tol=1e-11, iter_limit=20_000, cycle_tol=100)
         if flag == 1:
             multiplier = np.asarray(info["lam"])
             found = np.where(multiplier < 0, 3, np.where(multiplier > 0, 1, 0)).astype(np.int32)
@@ -240,10 +239,9 @@ def _by_equations(of: Programme, active: Sense | None) -> _Found:
         return None, None
     along = solve_triangular(R, limits, trans="T") + Q.T @ g
     xi = solve_triangular(L, Q @ along - g, lower=True, trans="T")
-    within = np.concatenate(
-        [solve_triangular(R, along), *(each + _SLIGHT for each in (of.G @ xi - of.h, xi - of.lower, of.upper - xi))]
-    )
-    return (xi, active) if (within >= 0.0).all() else (None, None)
+    slack = np.concatenate([of.G @ xi - of.h, xi - of.lower, of.upper - xi])
+    proven = (solve_triangular(R, along) >= 0.0).all() and (slack + _SLIGHT >= 0.0).all()
+    return (xi, active) if proven else (None, None)
 
 
 def _inside(of: Programme, accuracy: float) -> Any:
@@ -397,24 +395,21 @@ class Simplex:
         import highspy
 
         self._highs: Any = highspy.Highs()
-        for option, value in (
-            ("output_flag", False),
-            ("solver", "simplex"),
-            ("threads", 1),
-            ("primal_feasibility_tolerance", 1e-10),
-            ("dual_feasibility_tolerance", 1e-10),
-        ):
-            self._highs.setOptionValue(option, value)
-        infinity = highspy.kHighsInf
-        self._infinity = infinity
+        self._set({"output_flag": False, "solver": "simplex", "threads": 1})
+        self._set({"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10})
+        self._infinity = infinity = highspy.kHighsInf
         self._size = len(cost)
         self._rows, self._limits = np.empty((0, len(cost))), np.empty(0)
         self._optimal = highspy.HighsModelStatus.kOptimal
         self._endless = highspy.HighsModelStatus.kIterationLimit
-        self._highs.setOptionValue("simplex_iteration_limit", _ITERATIONS * (len(cost) + 100))
+        self._set({"simplex_iteration_limit": _ITERATIONS * (len(cost) + 100)})
         for c, low, high in zip(cost, lower, upper, strict=True):
             self._highs.addVar(max(low, -infinity), min(high, infinity))
             self._highs.changeColCost(self._highs.getNumCol() - 1, c)
+
+    def _set(self, options: dict[str, Any]) -> None:
+        for option, value in options.items():
+            self._highs.setOptionValue(option, value)
 
     def add(self, rows: Array, h: Array) -> None:
         """Add rows·ξ >= h.
@@ -426,9 +421,8 @@ class Simplex:
         self._limits = np.concatenate([self._limits, h])
         starts = np.arange(count, dtype=np.int32) * self._size
         index = np.tile(np.arange(self._size, dtype=np.int32), count)
-        self._highs.addRows(
-            count, h, np.full(count, self._infinity), rows.size, starts, index, np.ascontiguousarray(rows).ravel()
-        )
+        values, upper = np.ascontiguousarray(rows).ravel(), np.full(count, self._infinity)
+        self._highs.addRows(count, h, upper, rows.size, starts, index, values)
 
     def hold(self, rows: Iterable[int], h: Iterable[float]) -> None:
         """Ask rows·ξ >= h of rows that are there already."""
@@ -489,8 +483,7 @@ class Simplex:
             if self._highs.getModelStatus() == self._optimal or cycled > 1:
                 break
             self._highs.clearSolver()  # a warm start can go astray; from scratch then
-            for option, value in remedy.items():
-                self._highs.setOptionValue(option, value)
+            self._set(remedy)
             self._highs.run()
         if self._highs.getModelStatus() != self._optimal:
             status = self._highs.modelStatusToString(self._highs.getModelStatus())

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -194,9 +194,9 @@ class Structure:
         def plain(values: Any) -> Any:
             return [plain(v) for v in values] if isinstance(values, list) else values if math.isfinite(values) else None
 
+        sides = {"lower": self.lower, "upper": self.upper}
         data: dict[str, Any] = {
-            side: {name: plain(array.tolist()) for name, array in getattr(self, side).items()}
-            for side in ("lower", "upper")
+            side: {name: plain(array.tolist()) for name, array in arrays.items()} for side, arrays in sides.items()
         }
         if any(array.any() for array in self.shared.values()):
             data["shared"] = {name: array.tolist() for name, array in self.shared.items()}
@@ -228,14 +228,13 @@ class Structure:
                 raise FitError(f"structure: {name} is not 0, and the fit has no such term; choose another additive")
         if self.blocks not in (None, len(tied)):
             raise FitError(f"structure is for {plural(self.blocks, 'block')}, and the fit has {len(tied)}")
-        theta, d = (
-            tuple(
-                np.vstack([np.vstack(self._columns(side, which, names, r)) for r in tied])
-                for side in (self.lower, self.upper)
-            )
-            for which in ("nominal", "half")
-        )
-        return theta[0], theta[1], d[0], d[1]
+
+        def sides(which: str) -> Iterator[Array]:
+            for side in (self.lower, self.upper):
+                yield np.vstack([row for r in tied for row in self._columns(side, which, names, r)])
+
+        (theta_low, theta_high), (d_low, d_high) = sides("nominal"), sides("half")
+        return theta_low, theta_high, d_low, d_high
 
     def _columns(
         self, arrays: Mapping[str, NDArray[Any]], which: str, names: Collection[str], block: int | None

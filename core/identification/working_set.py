@@ -335,13 +335,8 @@ class WorkingSet:
         for group in self._groups(again):
             self._settle_and_prove(settle, group)
         bounds[[row.i for row in again]] = [self._least_width(row) for row in again]
-        again = [
-            row
-            for row in self.rows
-            if row.unknown
-            and (self.programmes[row.i].collinear() or not self._above(row, bounds) <= GOOD)
-            and not row.refined
-        ]
+        again = [row for row in unknown if self.programmes[row.i].collinear() or not self._above(row, bounds) <= GOOD]
+        again = [row for row in again if not row.refined]
         for row in again:
             self.programmes[row.i].exact = True
         for row, answer, width in self._again(again, settle, self._largest_width):
