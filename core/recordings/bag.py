@@ -96,10 +96,11 @@ class Bag(Recording):
         wanted = set(topics)
         for topic in sorted(wanted):
             self._require(topic, readable)
-        return [
-            (contents, {k: c for k, c in channels.items() if c.topic in wanted and (c.counted or not readable)})
-            for contents, channels in zip(self._contents, self._channels, strict=True)
+        each = [
+            {k: c for k, c in channels.items() if c.topic in wanted and (c.counted or not readable)}
+            for channels in self._channels
         ]
+        return list(zip(self._contents, each, strict=True))
 
     def leave_out(self, undecoded: Mapping[str, tuple[int, str]]) -> None:
         """Warn of messages that cannot be decoded: topic -> how many, and why one of them cannot."""
@@ -191,10 +192,8 @@ class Bag(Recording):
 
     def _topic(self, topic: str, kinds: dict[tuple[str, str, str], list[tuple[int, int]]]) -> TopicInfo:
         """Choose the channels of a topic that count."""
-        tallies = {
-            kind: [self._contents[part].tally[key] for part, key in keys if key in self._contents[part].tally]
-            for kind, keys in kinds.items()
-        }
+        found = {kind: [self._contents[part].tally.get(key) for part, key in keys] for kind, keys in kinds.items()}
+        tallies = {kind: [tally for tally in of_kind if tally is not None] for kind, of_kind in found.items()}
         counts = {kind: sum(tally.count for tally in of_kind) for kind, of_kind in tallies.items()}
         chosen = max(counts, key=lambda kind: counts[kind])
         type_name, encoding, reason = chosen

@@ -71,9 +71,8 @@ def group_recordings(
     with a column that tells the runs in it apart.
     """
     recordings: list[Recording] = []
-    for format, some in itertools.groupby(
-        map(Path, paths), lambda path: next(f for f in FORMATS if f.recognises(path))
-    ):
+    by_format = itertools.groupby(map(Path, paths), lambda path: next(f for f in FORMATS if f.recognises(path)))
+    for format, some in by_format:
         recordings += format.group(list(some), indexed, layout)
     seen: set[Path] = set()
     named = (r.parts if r.path.exists() else (r.path,) for r in recordings)  # a run of a table is no file

@@ -237,7 +237,8 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
         if fastest is not None and 0.8 * step < least * times < 1.25 * step:
             words = f"its steps are {step / least:.4g} times those of {fastest.path}: if its times are in {unit}"
             table._warnings.append(f"{table.path}: {words} and those in s, call its column time_{unit}")
-    alone = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED and _is_alone(t)]
+    dated = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED]
+    alone = [t for t in dated if len(_numbers(t.columns_by_field)) == 1]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
             remedy = "if each of them is of another signal of one machine, write them as columns of one file"
@@ -245,9 +246,9 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
     return tables
 
 
-def _is_alone(table: Table) -> bool:
-    """Whether it holds one column of numbers."""
-    return [column.dtype.kind in "OM" for column in table.columns_by_field.values()].count(False) == 1
+def _numbers(columns: Mapping[str, Column]) -> list[Column]:
+    """Columns that are neither text nor instants."""
+    return [column for column in columns.values() if column.dtype.kind not in "OM"]
 
 
 def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> tuple[int, str]:
@@ -364,8 +365,7 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
 
 def _names_signals(columns: Mapping[str, Column]) -> str:
     """The column of text that changes from row to row among few values, beside a single column of numbers."""
-    numbers = [column for column in columns.values() if column.dtype.kind not in "OM"]
-    for name, column in columns.items() if len(numbers) == 1 else ():
+    for name, column in columns.items() if len(_numbers(columns)) == 1 else ():
         if column.dtype.kind == "O" and 2 * np.count_nonzero(column[1:] != column[:-1]) > len(column):
             if len(set(column.tolist())) <= len(column) // 20:
                 return name

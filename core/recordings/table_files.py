@@ -246,9 +246,8 @@ def _thousands(cells: Sequence[str]) -> str:
     grouped = [m for m in map(_GROUPED.match, cells) if m]
     alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)] if grouped else []
     other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
-    found = {
-        m["by"] for m in grouped if m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or m["by"] in other
-    }
+    marks = [(m["by"], m["rest"] or m[0].count(m["by"]) > 1) for m in grouped]
+    found = {by for by, telling in marks if telling or by not in ",." or by in other}
     by = found.pop() if len(found) == 1 else ""
     return by if by and all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
 
@@ -323,13 +322,11 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     kinds = [len(set(cells) - {""}) for cells in above]
     lines_of_names = [i for i, kind in enumerate(kinds) if kind > 1]
     if not lines_of_names:
-        unlike = (
-            f"its header names {len(last)} columns and its rows have {wide} cells, so no column has a name; mend it"
-        )
-        return _Shape(delimiter, begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike * bool(last))
-    chosen = next(
-        (i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0]
-    )  # above the names there may be groups of them
+        unlike = f"its header names {len(last)} columns and its rows have {wide} cells"
+        unlike = f"{unlike}, so no column has a name; mend it" * bool(last)
+        return _Shape(delimiter, begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike)
+    # above the names there may be groups of them
+    chosen = next((i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0])
     return _Shape(delimiter, begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
 
 
@@ -544,10 +541,7 @@ def _wants(path: Path, package: str) -> str:
 
 
 _READERS: Mapping[str, Callable[[Path], Any]] = {
-    ".csv": _read_csv,
-    ".txt": _read_csv,
-    ".dat": _read_csv,
-    ".tsv": _read_csv,
+    **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_csv),
     ".parquet": _read_arrow,
     ".feather": _read_arrow,
     ".mat": lambda path: aside(_read_mat, path, ".mat file"),  # damage may break its reader down

@@ -263,11 +263,8 @@ def _with_colons(cells: Sequence[object]) -> Sequence[object]:
         return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
     if sum(map(bool, map(_MINUTES.fullmatch, texts))) < (1 - ODD_SHARE) * sum(map(bool, texts)):
         return cells
-    minutes = {
-        row: int(text.partition(":")[0])
-        for row, text in enumerate(texts)
-        if re.fullmatch(r"\d\d?:[0-5]\d([.,]\d+)?", text)
-    }
+    found = ((row, re.fullmatch(r"(\d\d?):[0-5]\d([.,]\d+)?", text)) for row, text in enumerate(texts))
+    minutes = {row: int(match[1]) for row, match in found if match}
     hours = np.cumsum(np.diff([*minutes.values()], prepend=[*minutes.values()][:1]) < -30).tolist()
     for row, hour in zip(minutes, hours, strict=True):
         texts[row] = f"{hour}:{texts[row]}"

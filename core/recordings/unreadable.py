@@ -39,33 +39,33 @@ def not_mcap(path: Path, head: bytes) -> BagError:
         return BagError(f"{path}: the file is empty; record or copy it again")
     if MAGIC.startswith(head):
         return BagError(f"{path}: cut after {len(head)} bytes, before any message; record or copy it again")
-    if head.startswith(b"version https://git-lfs"):
-        lfs = "fetch it with `git lfs pull` in its repository"
-        return BagError(f"{path}: a Git LFS pointer, not the recording itself; {lfs}")
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         return _compressed(path)
-    if path.suffix.lower() in (".xlsx", ".xls", ".ods"):
-        return BagError(f"{path}: a spreadsheet; save its sheet as .csv")
-    for magic, of, tool in (
-        (b"ULog", "PX4", "ulog2csv"),
-        (b"\xa3\x95", "ArduPilot", "mavlogdump.py --format csv --types ATT"),
-    ):
-        if head.startswith(magic):
-            return BagError(f"{path}: a log of {of}; write its messages as .csv, such as with `{tool}`")
-    if head.startswith((b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04")):
-        return BagError(f"{path}: compressed as a whole file or an archive; unpack it first")
-    if head.startswith(MAGIC[:5]):
-        return BagError(f"{path}: MCAP of another version ({head[5:6]!r}) or damaged in its first bytes; copy it again")
-    if not head.strip(b"\0"):
-        return BagError(f"{path}: begins with zeros only, as after a power cut; there is no recording in it")
-    if path.suffix.lower() in TABLES:
-        return BagError(f"{path}: a table, and a recording of ROS messages is wanted here; check the path")
-    if known := kind_of(path):
-        return BagError(f"{path}: this is {known}, and a recording is wanted here; are the arguments swapped?")
+    suffix, known = path.suffix.lower(), kind_of(path)
     text = all(byte >= 32 or byte in b"\t\r\n\f" for byte in head[:512])
     kind = "a text file" if text else "no kind of file that is known"
     wanted = f"a recording is wanted (MCAP, .db3, .bag, or a table called {', '.join(TABLES)})"
-    return BagError(f"{path}: {kind}, while {wanted}; check the path and its suffix")
+    csv = "write its messages as .csv, such as with"
+    why = next(
+        words
+        for met, words in (
+            (head.startswith(b"version https://git-lfs"),
+             "a Git LFS pointer, not the recording itself; fetch it with `git lfs pull` in its repository"),
+            (suffix in (".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as .csv"),
+            (head.startswith(b"ULog"), f"a log of PX4; {csv} `ulog2csv`"),
+            (head.startswith(b"\xa3\x95"), f"a log of ArduPilot; {csv} `mavlogdump.py --format csv --types ATT`"),
+            (head.startswith((b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04")),
+             "compressed as a whole file or an archive; unpack it first"),
+            (head.startswith(MAGIC[:5]),
+             f"MCAP of another version ({head[5:6]!r}) or damaged in its first bytes; copy it again"),
+            (not head.strip(b"\0"), "begins with zeros only, as after a power cut; there is no recording in it"),
+            (suffix in TABLES, "a table, and a recording of ROS messages is wanted here; check the path"),
+            (known, f"this is {known}, and a recording is wanted here; are the arguments swapped?"),
+            (True, f"{kind}, while {wanted}; check the path and its suffix"),
+        )
+        if met
+    )  # fmt: skip
+    return BagError(f"{path}: {why}")
 
 
 def missing(path: Path) -> BagError:
@@ -150,8 +150,7 @@ def _main() -> None:
     module, name, path = sys.argv[1], sys.argv[2], Path(sys.argv[3])
     function = getattr(importlib.import_module(module), name)
     size = path.stat().st_size
-    with open("/proc/self/statm", encoding="ascii") as stream:
-        taken = int(stream.read().split()[0]) * resource.getpagesize()
+    taken = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0]) * resource.getpagesize()
     seconds = _SECONDS + size // _BYTES_A_SECOND
     resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
