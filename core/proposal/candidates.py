@@ -193,12 +193,8 @@ class Steps:
         own[np.diag_indices(m)] += 1e-100 * (np.diagonal(own) == 0.0)
         inverse = np.linalg.inv(own)
         gains = (inverse @ explained) ** 2 / (inverse**2).sum(axis=1)[:, None]
-        return np.vstack(
-            [
-                _statistic(full + (explained**2).sum(axis=0), full, self.dX, m, freedom),
-                _statistic(full + gains, full, self.dX, 1, freedom),
-            ]
-        )
+        together = _statistic(full + (explained**2).sum(axis=0), full, self.dX, m, freedom)
+        return np.vstack([together, _statistic(full + gains, full, self.dX, 1, freedom)])
 
     def coupling(self, kept: Sequence[int], rest: Sequence[int]) -> Array:
         """Larger F statistic of each other state in the next step of those kept, and of these in that of the other.

@@ -176,14 +176,8 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
     kept: list[Candidate] = []
     may = _may_move_with(pool)
     for candidate in pool:
-        if twin := next(
-            (
-                c
-                for c in kept
-                if (id(c), id(candidate)) in may and _moves_with(candidate, c, exact or _alike(candidate, c))
-            ),
-            None,
-        ):
+        near = (c for c in kept if (id(c), id(candidate)) in may)
+        if twin := next((c for c in near if _moves_with(candidate, c, exact or _alike(candidate, c))), None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)

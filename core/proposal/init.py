@@ -301,9 +301,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
         return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
     known = [np.isfinite(values) for values in candidate.values]
-    if source.role != "control" and all(
-        np.ptp(v[k]) == 0 for v, k in zip(candidate.values, known, strict=True) if k.any()
-    ):
+    apart = [v[k] for v, k in zip(candidate.values, known, strict=True)]
+    if source.role != "control" and all(np.ptp(v) == 0 for v in apart if len(v)):
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
@@ -313,7 +312,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "a place on the map, and another run may be elsewhere"
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
     if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
-        steps = np.concatenate([np.diff(v[k]) for v, k in zip(candidate.values, known, strict=True)])
+        steps = np.concatenate([np.diff(v) for v in apart])
         clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
     if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival))):
         return "grows as a clock or a counter does"

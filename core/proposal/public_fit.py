@@ -203,7 +203,7 @@ def fit(
     if rule is not None:
         steps = lengths_of(rule, transients)
         if not rule.leaves_out:
-            lengths = {h: "growing" if rule.widths == "growing" else "constant" for h in steps}
+            lengths = dict.fromkeys(steps, "growing" if rule.widths == "growing" else "constant")
         elif transient_weights is not None:
             raise FitError(
                 "horizons are chosen by leaving recordings out, and transient_weights are for all of them; give steps "
@@ -319,11 +319,9 @@ def _some(bags: Sequence[Recording], signals: SignalMap) -> list[Transient]:
 
 def _ways(criterion: str | None, additive: str | None, scheduled: bool) -> list[dict[str, Any]]:
     """Criteria and additive terms to choose from, the simplest first."""
-    return [
-        {"criterion": one, "additive": terms}
-        for terms in ((additive,) if additive else ("noise",) if scheduled else ("noise", "both"))
-        for one in ((criterion,) if criterion else ("lp", "qp"))
-    ]
+    every = (additive,) if additive else ("noise",) if scheduled else ("noise", "both")
+    criteria = (criterion,) if criterion else ("lp", "qp")
+    return [{"criterion": one, "additive": terms} for terms in every for one in criteria]
 
 
 def _horizons_asked_for(

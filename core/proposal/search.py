@@ -154,10 +154,11 @@ def _promising_ends(transients: Sequence[Transient], arrival: Sequence[Transient
     them: the effects of what is new in the command are compared.
     """
     at = [np.flatnonzero(now.usable & end.usable) for now, end in zip(transients, arrival, strict=True)]
-    X, U, after, V = (
-        np.concatenate([getattr(t, name)[k + later] for t, k in zip(runs, at, strict=True)])
-        for runs, name, later in ((transients, "x", 0), (transients, "u", 0), (transients, "x", 1), (arrival, "u", 0))
-    )
+
+    def joined(runs: Sequence[Transient], name: str, later: int = 0) -> Array:
+        return np.concatenate([getattr(t, name)[k + later] for t, k in zip(runs, at, strict=True)])
+
+    X, U, after, V = *(joined(transients, name) for name in "xu"), joined(transients, "x", 1), joined(arrival, "u")
     free = np.array([a != b for a, b in zip(transients[0].ends, arrival[0].ends, strict=True)], dtype=bool)
     if not free.any() or len(X) < ENOUGH * (X.shape[1] + 2 * U.shape[1]):
         return []

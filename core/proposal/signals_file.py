@@ -74,10 +74,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     words = [w for w in words_of(inner) if w not in _DULL]
     if all(len(w) == 1 or w.isdigit() for w in words):
         of_table = candidate.kind if "[" in candidate.path else ""  # whose topic says nothing
-        words = [
-            *words_of(of_table if candidate.topic == TOPIC else candidate.topic.rstrip("/").rpartition("/")[2]),
-            *words,
-        ]
+        of_topic = of_table if candidate.topic == TOPIC else candidate.topic.rstrip("/").rpartition("/")[2]
+        words = [*words_of(of_topic), *words]
     return words or ["signal"]
 
 
@@ -97,10 +95,8 @@ def columns_of(states: Sequence[Candidate], controls: Sequence[Candidate], sourc
     every, clock = {s.topic: s for s in sources}, clock_of(states, sources)
     limits = [None] * len(states) + [longest_hold(every[c.topic], clock)[0] for c in controls]
     each = [(c, every[c.topic], limit) for c, limit in zip([*states, *controls], limits, strict=True)]
-    return [
-        np.column_stack([held(c, source, number, clock, limit) for c, source, limit in each])
-        for number in range(len(clock.arrival))
-    ]
+    numbers = range(len(clock.arrival))
+    return [np.column_stack([held(c, source, k, clock, limit) for c, source, limit in each]) for k in numbers]
 
 
 def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
@@ -218,11 +214,8 @@ def signals_file(
             limit, why = (None, candidate.why) if plant else longest_hold(every[candidate.topic], clock)
             lines.append(entry(candidate, limit, candidate.reason or why, out=bool(candidate.ready)))
     else:
-        lines += [
-            "",
-            "# No command can be used. Without controls the envelope must cover what they do.",
-            "controls: []",
-        ]
+        lines += ["", "# No command can be used. Without controls the envelope must cover what they do."]
+        lines.append("controls: []")
     proposed = {*states, *controls, *(c for alike in members.values() for c in alike)}
     if left_out := _left_out(sources, proposed):
         lines += ["", "# Not proposed, and why:", *left_out]

@@ -217,9 +217,8 @@ def promise(transients: Sequence[Transient]) -> dict[str, float]:
     """
     first, steps = transients[0], [t.transitions() for t in transients]
     names = [*first.state_names, *first.control_names, *first.scheduling_names]
-    x, u, s, x_next, dt = (
-        np.concatenate([getattr(step, name) for step in steps]) for name in ("x", "u", "s", "x_next", "dt")
-    )
+    each = ([getattr(step, name) for step in steps] for name in ("x", "u", "s", "x_next", "dt"))
+    x, u, s, x_next, dt = map(np.concatenate, each)
     z = np.column_stack([x, u])
     phi = dt * np.vstack([(z / size_of(z)).T, np.ones(len(z))])
     if len(z) < 9 * len(phi):
@@ -382,12 +381,8 @@ def tune(
 def _missed(model: UncertainLTI, setting: Setting, faulty: Mapping[str, Sequence[Transient]]) -> set[tuple[str, int]]:
     """Recordings with a fault that raise no alarm."""
     monitor = EnvelopeMonitor(model)
-    return {
-        (label, k)
-        for label, runs in faulty.items()
-        for k, run in enumerate(setting.prepared(runs))
-        if not monitor.check(run).alarm.any()
-    }
+    every = ((label, *one) for label, runs in faulty.items() for one in enumerate(setting.prepared(runs)))
+    return {(label, k) for label, k, run in every if not monitor.check(run).alarm.any()}
 
 
 def _row(words: str, size: float, base: float, model: UncertainLTI) -> dict[str, Any]:
