@@ -105,10 +105,8 @@ class Table:
     def __str__(self) -> str:
         lines = [self.header, *self.rows[: self.most]]
         sides = [str.ljust if i == 0 or i in self.left else str.rjust for i in range(len(self.header))]
-        columns = [
-            [side(cell, max(map(len, cells))) for cell in cells]
-            for side, cells in zip(sides, zip(*lines, strict=True), strict=True)
-        ]
+        each = zip(sides, zip(*lines, strict=True), strict=True)
+        columns = [[side(cell, max(map(len, cells))) for cell in cells] for side, cells in each]
         text = ["  " + "  ".join(cells).rstrip() for cells in zip(*columns, strict=True)]
         more = len(self.rows) - self.most
         return "\n".join(text + [f"  and {plural(more, 'more row')}; --json has all"] * (more > 0))

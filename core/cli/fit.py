@@ -321,10 +321,8 @@ def signature(options: argparse.Namespace) -> Result:
     runs = ((label, run) for label, _, bag in pairs for run in read_fitted(options, [bag], model.signals))
     learnt = learn_signatures(model, [(label, monitor.check(run)) for label, run in runs], options.force)
     model.replace(signatures=learnt.signatures).save(output)
-    faults = [
-        {"label": s.label, "recordings": s.recordings, "verdicts": s.verdicts, "steps": list(s.steps)}
-        for s in learnt.signatures
-    ]
+    keys = ("label", "recordings", "verdicts", "steps")
+    faults = [{key: value for key, value in s.to_dict().items() if key in keys} for s in learnt.signatures]
     named = [{"recording": r, "label": label, "named": found} for r, label, found in learnt.named]
     alike = [{"labels": [a, b], "match": match} for a, b, match in learnt.alike]
     options.say(f"{signature_text(learnt)}\nmodel written to {output}")

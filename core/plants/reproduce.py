@@ -193,10 +193,8 @@ def eigenvalue_text(models: dict[str, UncertainLTI]) -> str:
     for name, matrix in every.items():
         values = sorted(np.linalg.eigvals(matrix).tolist(), key=lambda v: (-v.real, v.imag))
         rows.append([name, *(f"{v.real:.2f}{v.imag:+.2f}j" if abs(v.imag) > 1e-9 else f"{v.real:.2f}" for v in values)])
-    return (
-        "Eigenvalues of A [1/s]; over one step: (exp(A Δt) - I) / Δt, what (3) sees of the same engine\n"
-        + str(Table(("", "1", "2", "3", "4", "5"), rows))
-    )  # fmt: skip
+    title = "Eigenvalues of A [1/s]; over one step: (exp(A Δt) - I) / Δt, what (3) sees of the same engine"
+    return f"{title}\n{Table(('', '1', '2', '3', '4', '5'), rows)}"
 
 
 def matrix_text(model: UncertainLTI, name: str) -> str:
@@ -204,8 +202,7 @@ def matrix_text(model: UncertainLTI, name: str) -> str:
     parts = []
     for title, m in (("published", leibov2006()), (name, model)):
         nominal, half = np.hstack([m.A, m.B]), np.hstack([m.dA, m.dB])
-        rows = [
-            [SHORT[i], *(f"{a:.2f} ± {d:.2g}" for a, d in zip(nominal[i], half[i], strict=True))] for i in range(m.n)
-        ]
+        each = zip(SHORT, nominal, half, strict=True)
+        rows = [[name, *(f"{a:.2f} ± {d:.2g}" for a, d in zip(*of, strict=True))] for name, *of in each]
         parts.append(f"A, B [1/s], {title}\n{Table(('', *SHORT, *SHORT_CONTROLS), rows)}")
     return "\n\n".join(parts)

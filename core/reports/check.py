@@ -46,7 +46,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
-from uncertain_lti.monitor.verdict import Verdicts
+from uncertain_lti.monitor.verdict import NUMBERS, Verdicts
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient, Transitions
@@ -288,29 +288,22 @@ def _episode(model: UncertainLTI, verdicts: Verdicts, rows: NDArray[np.intp]) ->
         bad = rows[verdicts.flags[rows, i] == 1.0]
         if len(bad):
             states[name] = {"violations": len(bad), "first": float(t[bad[0]]), **_worst(verdicts, i, bad)}
-    return {
-        "first": _instant(verdicts.transient, first),
-        "last": _instant(verdicts.transient, last),
-        "verdicts_violated": len(rows),
-        "alarm": bool(verdicts.alarm[first : last + 1].any()),
-        "states": states,
-    }
+    ends = {name: _instant(verdicts.transient, k) for name, k in (("first", first), ("last", last))}
+    alarm = bool(verdicts.alarm[first : last + 1].any())
+    return {**ends, "verdicts_violated": len(rows), "alarm": alarm, "states": states}
 
 
 def _per_sample(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
-    numbers = {"flags": verdicts.flags, "lower": verdicts.lower, "upper": verdicts.upper, "state": verdicts.transient.x}
-    numbers["utilisation"] = verdicts.utilisation
-    if model.horizons:
-        numbers["horizon_utilisation"] = verdicts.horizon_utilisation
-    flags = {"outside_domain": verdicts.outside_domain, "alarm": verdicts.alarm}
-    lists = {key: _nulls(values) for key, values in numbers.items()} | {key: v.tolist() for key, v in flags.items()}
+    names = [*NUMBERS, *["horizon_utilisation"] * bool(model.horizons)]
+    lists = {name: _nulls(getattr(verdicts, name)) for name in names}
+    lists |= {name: getattr(verdicts, name).tolist() for name in ("outside_domain", "alarm")}
     if model.schedule is not None:
         lists["unknown_regime"] = verdicts.unknown_regime.tolist()
         lists["regime"] = [r if r >= 0 else None for r in sample_blocks(model, verdicts).tolist()]
-    return [
-        {"t_ns": t_ns, "status": status.value, **{key: values[k] for key, values in lists.items()}}
-        for k, (t_ns, status) in enumerate(zip(verdicts.transient.t_ns.tolist(), verdicts.statuses(), strict=True))
-    ]
+    lists = {
+        "t_ns": verdicts.transient.t_ns.tolist(), "status": [status.value for status in verdicts.statuses()], **lists,
+    }  # fmt: skip
+    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
 
 
 def _nulls(values: Array) -> list[Any]:
@@ -349,9 +342,8 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     fitted = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
     fitted[np.isinf(fitted)] = 0.0  # of a model that was given
     hardly = np.minimum(MOVES * fitted, [s["mean_width"] or 0.0 for s in data["states"].values()])
-    if (model.domain.x_max > model.domain.x_min).any() and (
-        np.ptp(verdicts.transient.x[verdicts.judged], axis=0) <= hardly
-    ).all():
+    moved = np.ptp(verdicts.transient.x[verdicts.judged], axis=0)
+    if (model.domain.x_max > model.domain.x_min).any() and (moved <= hardly).all():
         return "nothing that is judged moves in it by more than its bounds are wide, so its quiet says nothing"
     alarmed = verdicts.alarm[verdicts.judged]
     if alarmed.mean() > STRANGE and alarmed[: max(1, judged // 10)].any():

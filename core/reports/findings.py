@@ -94,11 +94,9 @@ def findings(
     """
     rule = rule or model.alarm_rule
     rules = model.alarm if rule == model.alarm_rule else with_containment(model.alarm, rule)
-    recordings = [
-        check_data(model, verdicts, samples=False)
-        | {"files": [{"file": path, "sha256": sha256(path)} for path in verdicts.transient.sources]}
-        for verdicts in checked
-    ]
+    recordings = [check_data(model, verdicts, samples=False) for verdicts in checked]
+    for recording, verdicts in zip(recordings, checked, strict=True):
+        recording["files"] = [{"file": path, "sha256": sha256(path)} for path in verdicts.transient.sources]
     validation = readable_validation(model.validation)
     reasons = [*_fit_reasons(model), *_regime_reasons(model, recordings), *_validation_reasons(model, validation)]
     reasons += [*_width_reasons(model, recordings), *_recording_reasons(model, recordings, validation)]

@@ -85,13 +85,12 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> str:
         axes = {"showXAxisLabels": True, "showYAxisLabels": True, "isSynced": True, "xAxisVal": "timestamp"}
         return panel("Plot", plot.key, plot.title, {"paths": lines, **shown, **axes, "sidebarDimension": 240})
 
-    pages = [
-        (title, _split("row", _stack([drawn(p) for p in bounds]), _stack([drawn(p) for p in verdicts]), 60))
-        for title, bounds, verdicts in _pages(states)
-    ]
-    body: Any = pages[0][1]
-    if len(pages) > 1:
-        tabs = [{"title": title, "layout": page} for title, page in pages]
+    tabs = []
+    for title, *both in _pages(states):
+        bounds, verdicts = (_stack([drawn(plot) for plot in plots]) for plots in both)
+        tabs.append({"title": title, "layout": _split("row", bounds, verdicts, 60)})
+    body: Any = tabs[0]["layout"]
+    if len(tabs) > 1:
         body = panel("Tab", "states", "states", {"activeTabIdx": 0, "tabs": tabs})
     value = f"{base}/{_ALARM.name}.data"
     looks = [("true", VIOLATED, "ALARM"), ("false", CONTAINED, "no alarm")]
@@ -100,13 +99,8 @@ def foxglove_layout(states: Sequence[Signal], base: str = NODE) -> str:
     alarm = panel("Indicator", "alarm", "alarm", {"path": value, "style": "background", **unknown, "rules": rules})
     paths = {"isSynced": True, "paths": [_change(value, "alarm")]}
     raised = panel("StateTransitions", "alarm", "alarm", paths)
-    whole = {
-        "configById": panels,
-        "globalVariables": {},
-        "userNodes": {},
-        "playbackConfig": {"speed": 1},
-        "layout": _split("column", _split("row", alarm, raised, 25), body, 15),
-    }
+    plain = {"globalVariables": {}, "userNodes": {}, "playbackConfig": {"speed": 1}}
+    whole = {"configById": panels, **plain, "layout": _split("column", _split("row", alarm, raised, 25), body, 15)}
     return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
 
 

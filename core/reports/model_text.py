@@ -33,10 +33,8 @@ MOST_SHOWN = 20
 def recording_text(transient: Transient) -> str:
     """One recording: what was read, and what of it is not used."""
     usable, left = int(transient.usable.sum()), ", ".join(unused(transient))
-    text = (
-        f"{plural(len(transient), 'sample')} over {passed(transient.t_ns):.4g} s, {plural(usable, 'usable transition')}"
-    )
-    return f"{transient.name}: {text}{f' ({left})' * bool(left)}"
+    text = f"{plural(len(transient), 'sample')} over {passed(transient.t_ns):.4g} s"
+    return f"{transient.name}: {text}, {plural(usable, 'usable transition')}{f' ({left})' * bool(left)}"
 
 
 def fit_text(model: UncertainLTI) -> str:
@@ -177,9 +175,8 @@ def _widths(model: UncertainLTI) -> list[Block]:
         header = ("one-step envelope", "mean width", "largest", "range", "width/range")
         blocks.append(Table(header, rows, most=200))
     if over := facts.get("horizons"):
-        rows = [
-            [str(h["steps"]), number(h["seconds"]), h["widths"], *map(number, h["mean_width_recorded"])] for h in over
-        ]
+        each = (([str(h["steps"]), number(h["seconds"]), h["widths"]], h["mean_width_recorded"]) for h in over)
+        rows = [[*cells, *map(number, widths)] for cells, widths in each]
         blocks.append(Table(("mean width after steps", "s", "half-widths", *model.state_names), rows))
     return blocks
 

@@ -240,10 +240,10 @@ def plotted_check(model: UncertainLTI, verdicts: Verdicts, recordings: int = 1) 
     made["values"] = charts.envelope_chart(*of, states)
     for row, steps in enumerate(model.steps, 1):
         made[f"utilisation, {plural(steps, 'step')}"] = charts.utilisation_chart(*of, states, row)
-    views = {
-        name: sorted(((columns, p) for p in chart.panels if isinstance(p, Panel)), key=lambda placed: -placed[1].count)
-        for name, chart in made.items()
-    }
+    views: dict[str, list[Placed]] = {}
+    for name, chart in made.items():
+        panels = [panel for panel in chart.panels if isinstance(panel, Panel)]
+        views[name] = [(columns, panel) for panel in sorted(panels, key=lambda panel: -panel.count)]
     run, controls = verdicts.transient, [(s.name, s.unit) for s in model.signals.controls]
     views["values"] += _panels(columns, run.u, controls, "control")
     note = f"{charts.heading(verdicts)}{_how(columns)}."
@@ -306,10 +306,8 @@ def _stretches(recordings: int, numbers: int) -> int:
 
 def _panels(columns: Columns, values: Array, names: Sequence[tuple[str, str]], role: str) -> list[Placed]:
     low, high = columns.extremes(np.where(np.isfinite(values), values, np.nan))
-    return [
-        (columns, Panel(name, (charts.series_of(role, low[:, i], high[:, i], columns),), unit))
-        for i, (name, unit) in enumerate(names)
-    ]
+    series = ((charts.series_of(role, a, b, columns),) for a, b in zip(low.T, high.T, strict=True))
+    return [(columns, Panel(name, one, unit)) for (name, unit), one in zip(names, series, strict=True)]
 
 
 def _how(columns: Columns) -> str:
