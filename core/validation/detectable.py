@@ -349,10 +349,8 @@ def _cases(model: UncertainLTI, parts: Sequence[Part], within: float, cases: int
             chosen.append((part, int(unit), places[picks], lasts[picks], rng))
     before = _memory(model, step)
     after = max(int((lasts - onsets).max()) for _, _, onsets, lasts, _ in chosen)
-    rows = [
-        _rows(part.transient, onsets, lasts, np.arange(-before, after + 1), to_ns(step))
-        for part, _, onsets, lasts, _ in chosen
-    ]
+    around = np.arange(-before, after + 1)
+    rows = [_rows(part.transient, onsets, lasts, around, to_ns(step)) for part, _, onsets, lasts, _ in chosen]
     times, x, u, s, valid = (np.concatenate(arrays) for arrays in zip(*rows, strict=True))
     models = {id(part.model): part.model for part, *_ in chosen}
     counts, first = [len(onsets) for _, _, onsets, *_ in chosen], chosen[0][0].transient

@@ -170,20 +170,11 @@ def _on_some_states(
         return None
     kept, of = np.arange(0, n, n // STATES), point_of(first)
     rest = np.setdiff1d(np.arange(n), kept)
-    point = replace(
-        of, x_s=of.x_s[kept], X=of.X[kept], u_s=np.append(of.u_s, of.x_s[rest]), U=np.append(of.U, of.X[rest])
-    )
+    u_s, U = np.append(of.u_s, of.x_s[rest]), np.append(of.U, of.X[rest])
+    point = replace(of, x_s=of.x_s[kept], X=of.X[kept], u_s=u_s, U=U)
     names, others = ([first.state_names[i] for i in some] for some in (kept, rest))
-    some = [
-        t.replace(
-            x=t.x[:, kept],
-            u=np.hstack([t.u, t.x[:, rest]]),
-            signals=None,
-            state_names=names,
-            control_names=[*t.control_names, *others],
-        )
-        for t in transients
-    ]
+    own: dict[str, Any] = {"signals": None, "state_names": names, "control_names": [*first.control_names, *others]}
+    some = [t.replace(x=t.x[:, kept], u=np.hstack([t.u, t.x[:, rest]]), **own) for t in transients]
     return _promising(some, ways, {**options, "operating_point": point})[0]
 
 
@@ -225,9 +216,8 @@ def point_of(transient: Transient) -> OperatingPoint:
 
 def _medians(transients: Sequence[Transient]) -> OperatingPoint:
     """The medians of all samples, with the scales of the signals."""
-    x, u, s = (
-        np.nan_to_num(np.nanmedian(np.concatenate([getattr(t, name) for t in transients]), axis=0)) for name in "xus"
-    )
+    every = (np.concatenate([getattr(t, name) for t in transients]) for name in "xus")
+    x, u, s = (np.nan_to_num(np.nanmedian(values, axis=0)) for values in every)
     return replace(point_of(transients[0]), x_s=x, u_s=u, s_s=s)
 
 

@@ -174,10 +174,11 @@ class Evidence:
         parts = [part for part, _ in shown]
         pieces = [np.array_split(sizes, len(sizes) // WORTH_THREADS + 1) for _, sizes in shown]
         levels = [np.concatenate([(some / thresholds).max(axis=1) for some in each]) for each in pieces]
-        counts, near = (
-            by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
-            for factor in (self.factor, min(self.factor, max(0.95 * third, NEARBY * self.factor)))
-        )
+
+        def counted(factor: float) -> Array:
+            return by_unit(parts, [rising(v > factor, p.starts) for v, p in zip(levels, parts, strict=True)])
+
+        counts, near = map(counted, (self.factor, min(self.factor, max(0.95 * third, NEARBY * self.factor))))
         return replace(self, counts=np.append(self.counts, counts), near=np.append(self.near, near))
 
 
@@ -370,9 +371,8 @@ def _narrowest(
             roots = np.diagonal(form.whitening(np.ones(model.n, dtype=bool)))
             half = evidence.widths[1] / 2.0 / model.operating_point.X if form.relative else np.ones(model.n)
             sizes = np.log(half[roots > 0.0] / roots[roots > 0.0])
-            room = float(
-                sizes.sum() / max(len(sizes), 1) + np.log(evidence.thresholds(joint, model.n, validation.what)).mean()
-            )
+            levels = np.log(evidence.thresholds(joint, model.n, validation.what))
+            room = float(sizes.sum() / max(len(sizes), 1) + levels.mean())
         if room < least:
             best, least = (own, left, seen), room
     return best
@@ -417,9 +417,8 @@ def _gathered(
 
     def top_and_median(rule: StatisticRule, columns: slice) -> tuple[Array, Array]:  # of one: of many states, much
         every = [*(of[:, columns] for of in sizes), *(sizes_of([rule], part) for part in others)]
-        medians = [
-            np.median(np.concatenate(of), overwrite_input=True) for of in zip(*(of.T for of in every), strict=True)
-        ]
+        states = zip(*(of.T for of in every), strict=True)
+        medians = [np.median(np.concatenate(of), overwrite_input=True) for of in states]
         return np.max([of.max(axis=0, initial=0.0) for of in every], axis=0), np.array(medians)
 
     given = [(rule, slice(end - count, end)) for rule, count, end in zip(rules, numbers, ends, strict=True)]

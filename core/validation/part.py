@@ -239,10 +239,8 @@ def unit_numbers(parts: Sequence[Part]) -> NDArray[np.intp]:
     Returns (parts,): from 0, in order of first appearance.
     """
     numbers: dict[str, int] = {}
-    found = [
-        numbers.setdefault(f"group {p.group}" if p.group else f"part {i}", len(numbers)) for i, p in enumerate(parts)
-    ]
-    return np.array(found, dtype=np.intp)
+    names = (f"group {p.group}" if p.group else f"part {i}" for i, p in enumerate(parts))
+    return np.array([numbers.setdefault(name, len(numbers)) for name in names], dtype=np.intp)
 
 
 def by_unit(parts: Sequence[Part], values: ArrayLike) -> Array:
