@@ -81,18 +81,15 @@ def run(args: argparse.Namespace) -> Result:
     say("\n3. The same recording checked offline")
     say(check_text(check_data(model, offline, samples=False)))
     expected = offline.flags[offline.judged]
-    same = sum(
-        np.array_equal(flags, live.get(t_ns, ()))
-        for t_ns, flags in zip(offline.transient.t_ns[offline.judged].tolist(), expected, strict=True)
-    )
+    each = zip(offline.transient.t_ns[offline.judged].tolist(), expected, strict=True)
+    same = sum(np.array_equal(flags, live.get(t_ns, ())) for t_ns, flags in each)
     say(f"live and offline verdicts: {same} of {len(expected)} equal")
     about = metadata_pairs(bags / CHECK)
     event = t, what = float(about["fault_at"].split()[0]), about["what happens"]
     left = offline.transient.t_ns[0] + t * 1e9
     after = offline.judged & (offline.transient.t_ns > left)
-    (early, of_early), (late, of_late) = (
-        [int((marks & part).sum()) for marks in (offline.violated, offline.judged)] for part in (~after, after)
-    )
+    early, late = (int((offline.violated & part).sum()) for part in (~after, after))
+    of_early, of_late = (int((offline.judged & part).sum()) for part in (~after, after))
     say(f"at {t:.2f} s {what}: violated in {early} of {of_early} verdicts before and {late} of {of_late} after")
     raised = offline.transient.t[offline.alarm]
     in_time = len(raised) > 0 and raised[0] >= t

@@ -52,10 +52,8 @@ _LOOK = 1.0  # s between two looks at the graph; events of the middleware bring 
 _NOTE = 0.05  # s between two checks for changes to log
 _LAST_WORDS = 1.0  # s that the end waits until readers of /diagnostics have the last report
 
-_TRANSITIONS = {
-    getattr(Transition, name): name.removeprefix("TRANSITION_").lower()
-    for name in ("TRANSITION_CONFIGURE", "TRANSITION_CLEANUP", "TRANSITION_ACTIVATE", "TRANSITION_DEACTIVATE")
-}
+_NAMES = ("configure", "cleanup", "activate", "deactivate")
+_TRANSITIONS = {getattr(Transition, f"TRANSITION_{name.upper()}"): name for name in _NAMES}
 
 
 def _failures_noted(transition: Callable[..., TransitionCallbackReturn]) -> Callable[..., TransitionCallbackReturn]:

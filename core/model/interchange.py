@@ -156,11 +156,8 @@ def from_control(
     if signals is None:
         if recorded:
             raise ModelError("recorded units need the scales; give signals")
-        signals = SignalMap(
-            tuple(Signal(name, "", "x") for name in system.state_labels),
-            tuple(Signal(name, "", "u") for name in inputs),
-            source="system",
-        )
+        states = tuple(Signal(name, "", "x") for name in system.state_labels)
+        signals = SignalMap(states, tuple(Signal(name, "", "u") for name in inputs), source="system")
     if recorded:
         X = np.array([float(s.scale) for s in signals.states])
         U = np.array([float(s.scale) for s in signals.controls])
@@ -345,10 +342,9 @@ def _named(data: dict[str, Any], n: int, m: int, blocks: int | None) -> dict[str
         return whole
     counts = _column(data, "transitions", [math.nan] * blocks, "block")
     tied_to = _column(data, "tied_to", [0.0] * blocks, "block")
-    facts = [
-        {"transitions": None if math.isnan(count) else int(count), "tied_to": int(tied) - 1 if tied else None}
-        for count, tied in zip(counts, tied_to, strict=True)
-    ]
+    known = [None if math.isnan(count) else int(count) for count in counts]
+    tied = [int(to) - 1 if to else None for to in tied_to]
+    facts = [{"transitions": count, "tied_to": to} for count, to in zip(known, tied, strict=True)]
     scheduling = _signals(data, "scheduling", "s", len(_texts(data.get("scheduling_names", []))))
     return whole | {"blocks": facts} | ({"scheduling": scheduling} if scheduling else {})
 

@@ -187,9 +187,8 @@ def _domain(data: Any, n: int, m: int, newer: bool) -> Domain:
     box = object_of(data, "domain", set(sizes) | also, sizes)
     limits = {name: _limits(box[name], f"domain.{name}", size) for name, size in sizes.items()}
     measure, step_max, anywhere = (box.get(name) for name in _OF_DOMAIN)
-    if anywhere is not None and not (
-        isinstance(anywhere, list) and [type(each) for each in anywhere] == [bool] * (n + m)
-    ):
+    flags = [type(each) for each in anywhere] if isinstance(anywhere, list) else None
+    if anywhere is not None and flags != [bool] * (n + m):
         raise ModelError(f"field 'domain.anywhere' must be a list of {n + m} of true and false")
     if step_max is not None and ((step_max := checked(step_max, "domain.step_max", (n,))) < 0.0).any():
         raise ModelError("field 'domain.step_max' holds a negative number")

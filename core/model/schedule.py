@@ -168,8 +168,7 @@ class Schedule:
         Both (C, K), C = 1, 2 or 4, the first axis slowest: numbers of blocks, -1 where a mode is not listed or a value
         is NaN, and weights that sum to 1, NaN there.
         """
-        found: tuple[NDArray[np.intp], Array] = self.table.at(s)
-        return found
+        return self.table.at(s)
 
     def weights(self, s: ArrayLike) -> Array:
         """Weights (blocks, K) of every block at normalised s (axes, K); NaN where a mode is not listed or s is NaN."""

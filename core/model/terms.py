@@ -136,10 +136,9 @@ class Elements:
     def tables(self) -> tuple[Array, Array, Array]:
         """Nominal elements and half-widths (n, n + m + 1) on [x; u; 1], and what dt does not multiply (n,)."""
         rows = self.v.shape
-        nominal, half = (
-            np.concatenate([getattr(self, name).reshape(*rows, -1) for name in names], axis=-1)
-            for names in ([term.nominal for term in _RATES], [term.half for term in _RATES])
-        )
+        every = [term.nominal for term in _RATES], [term.half for term in _RATES]
+        each = ([getattr(self, name).reshape(*rows, -1) for name in names] for names in every)
+        nominal, half = (np.concatenate(arrays, axis=-1) for arrays in each)
         return nominal, half, reduce(np.add, [getattr(self, term.half) for term in TERMS if not term.times_dt])
 
     def centre_and_half_at(

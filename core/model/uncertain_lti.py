@@ -222,11 +222,9 @@ class UncertainLTI(Envelope):
             return (own if alike is None else alike) if instead else (given if alike is None else own)
 
         of = {horizon.steps: horizon.residuals for horizon in other.horizons}
-        return self.replace(
-            residuals=chosen(self.residuals, other.residuals),
-            horizons=[h.with_residuals(chosen(h.residuals, of.get(h.steps))) for h in self.horizons],
-            signatures=self.signatures,
-        )
+        residuals = chosen(self.residuals, other.residuals)
+        horizons = [h.with_residuals(chosen(h.residuals, of.get(h.steps))) for h in self.horizons]
+        return self.replace(residuals=residuals, horizons=horizons, signatures=self.signatures)
 
     @cached_property
     def blocks(self) -> tuple[UncertainLTI, ...]:
@@ -274,9 +272,8 @@ class UncertainLTI(Envelope):
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
         signals = replace(self.signals.scheduled_on(()), schedule=())
-        return UncertainLTI(
-            **arrays, signals=signals, sampling=self.sampling, domain=self.domain, alarm_rule=self.alarm_rule
-        )
+        kept = {name: getattr(self, name) for name in ("sampling", "domain", "alarm_rule")}
+        return UncertainLTI(**arrays, signals=signals, **kept)
 
     @property
     def state_names(self) -> tuple[str, ...]:

@@ -264,9 +264,8 @@ class Session(Stream):
         masked, violated = name in self.monitor.masked, period.violations[i]
         values = {"verdicts": str(self.verdicts), "violations": str(self.violations[i]), "masked": str(int(masked))}
         if self.last is not None:
-            values |= {
-                output.name: repr(self.last.numbers(output.position)[i]) for output in JUDGED if output.of == "states"
-            }
+            of_states = [output for output in JUDGED if output.of == "states"]
+            values |= {output.name: repr(self.last.numbers(output.position)[i]) for output in of_states}
             if not period.verdicts:  # the clock is slower than the reports
                 violated = int(self.last.numbers("flags")[i] == 1.0)
         if i in period.frozen:

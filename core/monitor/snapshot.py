@@ -114,11 +114,8 @@ class Scene:
             return writer.channel(writer.schema(kind, "ros2msg", self.definition(kind).encode()), topic)
 
         inputs = {topic: declare(topic, kind) for topic, kind in self.inputs.items()}
-        outputs = {
-            output: declare(self.outputs[output.name], output.type)
-            for output in RECORDED
-            if output.name in self.outputs and (not output.position or output.name in encode)
-        }
+        offered = [o for o in RECORDED if o.name in self.outputs and (not o.position or o.name in encode)]
+        outputs = {output: declare(self.outputs[output.name], output.type) for output in offered}
         reason = outputs.pop(REASON, None)
         log_time, said = 0, ""
         for entry in self.entries:

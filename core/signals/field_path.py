@@ -338,10 +338,9 @@ class FieldPath:
                 raise SignalError(f"{here}: '[{key}]' follows something that is not an array; leave it out")
             if kind == "index" and current.array and int(key) >= current.array:
                 raise SignalError(f"{here}: index {key} is past the end of an array of {current.array}")
-            if kind == "name":
-                if not _are_names(parent.get("name")):
-                    needs = "needs an array of strings called 'name' in the same message"
-                    raise SignalError(f"{here}: '[{key}]' {needs}; give an index instead, for example [0]")
+            if kind == "name" and not _are_names(parent.get("name")):
+                needs = "needs an array of strings called 'name' in the same message"
+                raise SignalError(f"{here}: '[{key}]' {needs}; give an index instead, for example [0]")
             current = replace(current, array=None)
         self._check_leaf(here, current, type_name, topic, type_fields)
 

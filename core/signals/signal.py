@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 import re
 import reprlib
-import struct
 from collections.abc import Callable, Mapping
+from ctypes import c_float
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any, Literal
@@ -89,7 +89,7 @@ class Signal:
     @property
     def ignored(self) -> frozenset[float]:
         """`ignore`, and its values as single precision rounds them."""
-        return frozenset(v for code in self.ignore for v in (code, _single(code)))
+        return frozenset(v for code in self.ignore for v in (code, c_float(code).value))
 
     def check(self, where: str) -> None:
         """Refuse a field that is none, and a number out of range; the sentence begins with where."""
@@ -131,11 +131,6 @@ def memory_of(field: object) -> tuple[Memory | None, str]:
         return parse_memory(str(field))
     except SignalError:
         return None, ""
-
-
-def _single(value: float) -> float:
-    """The nearest number of single precision; infinity beyond its range."""
-    return float(struct.unpack("f", struct.pack("f", value))[0])
 
 
 @dataclass(frozen=True)
@@ -388,9 +383,6 @@ def _own(top: Mapping[str, Any], member: Mapping[str, str]) -> list[dict[str, An
     names = [str(e.get("name")) for e in (*states, *controls)]
     judged = [e for e in controls if e.get("judged") is True]
     rows = [str(e.get("name")) for e in (*states, *judged) if memory_of(e.get("field"))[0] is None]
-    return [
-        {"state": state, "from": other, "nominal": 0, "half_width": 0}
-        for state in rows
-        for other in names
-        if state in member and other in member and member[state] != member[other]
-    ]
+    pairs = ((state, other) for state in rows for other in names if state in member and other in member)
+    apart = ((state, other) for state, other in pairs if member[state] != member[other])
+    return [{"state": state, "from": other, "nominal": 0, "half_width": 0} for state, other in apart]
