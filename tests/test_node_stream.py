@@ -55,6 +55,9 @@ class Input:
     def look(self) -> None:
         pass
 
+    def takes_turns(self) -> bool:
+        return False
+
     def destroy(self) -> None:
         pass
 
