@@ -73,10 +73,8 @@ def html_table(caption: str, header: Sequence[str], rows: Iterable[Sequence[str]
     The first column is aligned to the left, the others to the right.
     """
     head = "".join(f"<th style='{_style(i)}'>{escape(cell)}</th>" for i, cell in enumerate(header))
-    body = "".join(
-        "<tr>" + "".join(f"<td style='{_style(i)}'>{escape(c)}</td>" for i, c in enumerate(row)) + "</tr>"
-        for row in rows
-    )
+    lines = ("".join(f"<td style='{_style(i)}'>{escape(cell)}</td>" for i, cell in enumerate(row)) for row in rows)
+    body = "".join(f"<tr>{line}</tr>" for line in lines)
     notes = "".join(f"<div>{escape(text)}</div>" for text in below)
     return (
         f"<div><div style='overflow-x:auto'><table><caption style='text-align:left'><b>{escape(caption)}</b></caption>"

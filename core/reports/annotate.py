@@ -139,11 +139,8 @@ def annotate(
         writer = McapWriter(stream, f"uncertain-lti {__version__}", compression)
         numbers = [declare(writer, part) for part in contents]
         there = names_of(model.state_names, model.steps, verdicts.statistic_names)
-        channels = {
-            output.name: writer.channel(_schema(writer, contents, output.type), f"{base}/{output.name}")
-            for output in RECORDED
-            if there[output.of]
-        }
+        given = (output for output in RECORDED if there[output.of])
+        channels = {o.name: writer.channel(_schema(writer, contents, o.type), f"{base}/{o.name}") for o in given}
         writer.metadata(METADATA, about)
         blocks: Iterable[Any] = (
             (part.path, lost)
