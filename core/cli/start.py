@@ -99,11 +99,12 @@ def init(options: argparse.Namespace) -> Result:
     reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
     proposal = propose(options.bags, reading, **chosen, like=options.like, table=_layout(options))
     options.progress.note(*proposal.warnings)
-    data: dict[str, Any] = {"output": output}
-    for kind, chosen_of in (("states", proposal.states), ("controls", proposal.controls)):
-        each = ((c, {"name": c.name, "topic": c.topic, "field": c.path}) for c in chosen_of)
-        data[kind] = [entry | {"unit": c.unit, "delay": c.delay} for c, entry in each]
-    data |= {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
+    proposed = {
+        kind: [{"name": c.name, "topic": c.topic, "field": c.path, "unit": c.unit, "delay": c.delay} for c in of_kind]
+        for kind, of_kind in (("states", proposal.states), ("controls", proposal.controls))
+    }
+    more = {"members": list(proposal.members), "warnings": list(proposal.warnings), "text": proposal.text}
+    data = {"output": output, **proposed, **more}
     if output is None:
         return Result(data=data, text=proposal.text.removesuffix("\n"))
     with written(output, SignalError) as stream:

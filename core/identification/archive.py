@@ -205,10 +205,16 @@ def fit_archive(
         return f"transition {index - starts[which]} of {named[which][0]}"
 
     fleet.check_solvable(where, [s.name for s in signals.states])
-    dt_median = fleet.median_dt() if dt is None else float(np.median(dt))
-    asked: dict[str, Any] = {"structure": structure_of(signals, scheduled), "alarm_rule": alarm_rule}
     with contradiction_named(where, signals):
-        model = fit_fleet(fleet, signals, criterion, dt_median=dt_median, progress=progress, **asked)
+        model = fit_fleet(
+            fleet,
+            signals,
+            criterion,
+            structure=structure_of(signals, scheduled),
+            alarm_rule=alarm_rule,
+            progress=progress,
+            dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
+        )
     facts = {
         **model.fit_summary,
         "messages": [*model.fit_summary.get("messages", []), *messages],

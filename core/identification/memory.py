@@ -277,8 +277,9 @@ def _nearest(
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
     wide = np.square(to_half @ psi).sum(axis=0)
     size = np.square(to_nominal @ phi).sum(axis=0) + wide
-    alone = np.arange(len(some)), len(some)
-    *_, room = boxes_of(model.tables, of.z_columns, of.dt, of.next_columns, None, widest, *alone)
+    *_, room = boxes_of(
+        model.tables, of.z_columns, of.dt, of.next_columns, None, widest, np.arange(len(some)), len(some)
+    )
     near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
     near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
     nearest = np.sort(np.argpartition(near, min(count, near.shape[1]) - 1, axis=1)[:, :count], axis=1)

@@ -138,8 +138,9 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
             sampled.append((index, block.every(first, stride)))
         weights, (i, j) = block.weights, np.triu_indices(n)
         factors = None if weights.ndim == 1 else weights.T if weights.ndim == 2 else weights[:, i, j].T
-        given = *_given(block, columns), *columns.extra
-        plain, grams, centre, target, square, width, visits = sums_of(n, *given, factors)
+        plain, grams, centre, target, square, width, visits = sums_of(
+            n, *_given(block, columns), *columns.extra, factors
+        )
         coupled = None
         if weights.ndim == 3:
             parts = np.empty((n, len(plain), n, len(plain)))

@@ -272,8 +272,9 @@ class UncertainLTI(Envelope):
     def _unscheduled(self, arrays: dict[str, Any]) -> UncertainLTI:
         """One block with the signals of this model that are states and controls."""
         signals = replace(self.signals.scheduled_on(()), schedule=())
-        kept = {name: getattr(self, name) for name in ("sampling", "domain", "alarm_rule")}
-        return UncertainLTI(**arrays, signals=signals, **kept)
+        return UncertainLTI(
+            **arrays, signals=signals, sampling=self.sampling, domain=self.domain, alarm_rule=self.alarm_rule
+        )
 
     @property
     def state_names(self) -> tuple[str, ...]:

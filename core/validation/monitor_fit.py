@@ -173,8 +173,16 @@ def _on_some_states(
     u_s, U = np.append(of.u_s, of.x_s[rest]), np.append(of.U, of.X[rest])
     point = replace(of, x_s=of.x_s[kept], X=of.X[kept], u_s=u_s, U=U)
     names, others = ([first.state_names[i] for i in some] for some in (kept, rest))
-    own: dict[str, Any] = {"signals": None, "state_names": names, "control_names": [*first.control_names, *others]}
-    some = [t.replace(x=t.x[:, kept], u=np.hstack([t.u, t.x[:, rest]]), **own) for t in transients]
+    some = [
+        t.replace(
+            x=t.x[:, kept],
+            u=np.hstack([t.u, t.x[:, rest]]),
+            signals=None,
+            state_names=names,
+            control_names=[*t.control_names, *others],
+        )
+        for t in transients
+    ]
     return _promising(some, ways, {**options, "operating_point": point})[0]
 
 

@@ -175,8 +175,8 @@ class Validation:
                 f"inside all bounds: {data['inside']:.3%} of {plural(data['verdicts'], 'verdict')} "
                 f"({data['confidence']:.0%} interval {low:.3%} to {high:.3%})"
             )
-        rule = data["false_alarms"][0]
-        below.append(f"false alarms per hour at {rule['rule']}: {number_text(rule['per_hour'])}")
+        for rule in data["false_alarms"][:1]:
+            below.append(f"false alarms per hour at {rule['rule']}: {number_text(rule['per_hour'])}")
         below += [data["scenario"]["words"], *(f"note: {note}" for note in data["notes"])]
         return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
 
