@@ -232,6 +232,23 @@ def test_what_comes_after_the_recorder_stood_still_is_put_in_the_order_of_sendin
     assert len(numbers) > 3000 and (told or (np.maximum.accumulate(numbers) - numbers).max() < 30)
 
 
+def test_what_publishers_kept_is_put_in_the_order_of_sending(world: World, tmp_path: Path) -> None:
+    """A recorder that comes late gets it one topic after the other, and what is new among it."""
+    kept = QoSProfile(depth=500, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    pair = [world.publisher(Float64, name, kept) for name in ("/command", "/state")]
+    process: Any = None
+    for number in range(2000):
+        for publisher in pair:
+            publisher.publish(Float64(data=float(number)))
+        if number == 500:
+            process = recorder(world, ["/command", "/state"], tmp_path / "out.mcap")
+        time.sleep(0.003)
+    process.signal(signal.SIGINT)
+    process.succeed()
+    numbers = np.array([m.data for _, _, m in Bag(tmp_path / "out.mcap").messages(["/command", "/state"])])
+    assert len(numbers) > 3000 and (np.maximum.accumulate(numbers) - numbers).max() < 30
+
+
 def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     numbers = world.publisher(Float64, "/numbers")
@@ -391,6 +408,15 @@ def test_messages_that_lie_close_together_arrive_all_the_same(world: World, tmp_
     player.succeed()
     assert [m.data for m in heard.count(3000)] == [float(k) for k in range(3000)]
     assert "fell behind" in player.output
+
+
+def test_a_subscriber_that_comes_while_something_is_played_is_told(world: World, tmp_path: Path) -> None:
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 10**7))).save(tmp_path / "in.mcap")
+    heard = world.listen(Float64, "/x")
+    player = world.command("play", bag, "--rate", 0.2)
+    heard.count(1)
+    world.listen(Float64, "/x")
+    assert "/x: a subscriber came after playing began, and lacks what was before; play again" in player.succeed()
 
 
 def test_the_clock_goes_before_each_message(world: World, tmp_path: Path) -> None:

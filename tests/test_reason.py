@@ -22,7 +22,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, StatisticRule
 from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, Schedule
-from uncertain_lti.monitor.alarm import Raised
+from uncertain_lti.monitor.alarm import Arming, Raised
 from uncertain_lti.monitor.reason import Reasons, over_recording
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.sampling.clock import Status
@@ -83,6 +83,19 @@ def test_live_and_over_a_recording_the_words_are_the_same(rules: tuple[Rule, ...
     assert f"alarm: {rules[0].words}: " in every or f"alarm: {rules[-1].words}: x2" in every
 
 
+def test_while_no_alarm_could_be_raised_the_words_say_so() -> None:
+    """Live and over a recording, within the grace."""
+    monitor, transient = EnvelopeMonitor(model_with(RULES["containment"])), recording(0)
+    armed = Arming(None, 2 * 10**9).over(transient.t_ns)
+    changes = dict(over_recording(monitor.check(transient, armed), monitor.model))
+    reasons = Reasons(monitor.model, monitor.alarms.rules)
+    steps = zip(steps_of(transient), armed.counts.tolist(), strict=True)
+    words = [reasons.take(monitor.judge(step, counts), monitor.alarm) for step, counts in steps]
+    assert changes == {k: text for k, text in enumerate(words) if k == 0 or text != words[k - 1]}
+    said = {off: {text for text, on in zip(words, armed.counts, strict=True) if on != off} for off in (True, False)}
+    assert "alarms are off" in said[True] - said[False] and "no alarm" in said[False] - said[True]
+
+
 def test_a_mode_that_is_not_listed_is_named_live_and_over_a_recording() -> None:
     gear = Schedule((Axis("gear", modes=(1.0, 2.0)),))
     named = ["x1", "x2"], ["u1"], ["gear"]
@@ -106,7 +119,7 @@ def test_the_states_blamed_stay_named_while_the_same_rules_hold_the_alarm() -> N
 
     def push(alarm: bool, status: Status, *raised: Raised, unknown: bool = False) -> str:
         verdict: Any = SimpleNamespace(
-            status=status, unknown_regime=unknown, raised=raised, frozen=(), withheld=(), before=[0.0] * 3,
+            status=status, armed=True, unknown_regime=unknown, raised=raised, frozen=(), withheld=(), before=[0.0] * 3,
             numbers=lambda _: [0.0] * 2,
         )  # fmt: skip
         return reasons.take(verdict, alarm)

@@ -20,6 +20,7 @@ from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
 from uncertain_lti.model.terms import ARRAYS
+from uncertain_lti.validation.panel import Evidence
 
 PAPER = {"additive": "noise", "alarm": "containment"}
 
@@ -184,6 +185,9 @@ def test_a_model_that_was_changed_is_refused():
         model.replace(A=1.01 * model.A).update(runs[1])
     damaged = {**model.memory, "kept": {}}
     refuses(FitError, "field 'memory' of the model file is damaged", model.replace(memory=damaged).update, runs[1])
+    stripped = model.replace(fit_summary={})
+    refuses(FitError, "field 'fit' of the model file lacks criterion, .*; fit again", stripped.update, runs[1])
+    refuses(FitError, "field 'memory' of the model file is damaged", Evidence.from_dict, {"hours": [1, "A"]})
     other = Transient(runs[1].t, runs[1].x, runs[1].u, state_names=["a", "b", "c"])
     refuses(FitError, "transient has states a, b, c", model.update, other)
 

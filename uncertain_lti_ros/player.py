@@ -48,7 +48,7 @@ _LOOKED_AT = 10_000  # messages in which a header stamp is looked for
 _CROWD = 2000.0
 """Messages a second up to which a subscriber keeps up; faster only where the recording itself is faster."""
 _SIGNALLED = 128  # exit status of a process that a signal ended: this and its number
-_SETTLE = 0.5  # s without a new subscriber
+_SETTLE = 2.5  # s without a new subscriber; on a busy machine one is found so long after another
 _ACKNOWLEDGED = 10.0  # s to wait at the end until everything sent has been received
 _LOCKSTEP_TIMEOUT = 10.0  # s
 _ASK_AGAIN = 2.0  # s; Fast DDS loses the answer to a request that came before the server found the reader of answers
@@ -111,6 +111,7 @@ def run(args: argparse.Namespace) -> Result:
         messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
         if args.progress.shown:
             messages = args.progress.iterate("playing")(messages, sum(p.count for p in played.values()))
+        heard = _listeners(played)
         began, behind, crowd = time.monotonic(), 0.0, _crowd(bag, played)
         with closing(messages):  # takes the bar away
             if args.lockstep:
@@ -125,6 +126,8 @@ def run(args: argparse.Namespace) -> Result:
             apart = f"to keep messages at least {1e3 / crowd:.2g} ms apart"
             note(f"fell behind the requested rate by up to {behind:.1f} s, {apart}")
         took = time.monotonic() - began
+        if joined := [topic for topic, count in _listeners(played).items() if count > heard[topic]]:
+            note(f"{', '.join(joined)}: a subscriber came after playing began, and lacks what was before; play again")
         if missed := _unconfirmed(life, played):
             note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
@@ -225,6 +228,13 @@ def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[
         note(f"there is no subscriber to {', '.join(played)} after {limit:g} s; playing nevertheless")
     elif unmet:
         note(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
+
+
+def _listeners(played: dict[str, _Played]) -> dict[str, int]:
+    """Subscribers that are connected, of each topic whose messages none gets later."""
+    volatile = DurabilityPolicy.VOLATILE
+    publishers = {topic: p.publisher for topic, p in played.items() if p.publisher.qos_profile.durability == volatile}
+    return {topic: publisher.get_subscription_count() for topic, publisher in publishers.items()}
 
 
 def when_due(

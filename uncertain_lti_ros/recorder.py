@@ -16,7 +16,7 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from enum import Enum
 from pathlib import Path
@@ -31,7 +31,7 @@ from rclpy.qos import QoSProfile
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.cli.command import Result
-from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, Waiting
+from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
 from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition
 
@@ -67,7 +67,7 @@ def run(args: argparse.Namespace) -> Result:
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
         topics = list(dict.fromkeys(resolved_name(life.node, topic) for topic in args.topics))
         types = _wait_for(life, topics, args.wait, args.progress.note)
-        taken = _InOrder(file)
+        taken = _InOrder(file, topics)
         subscriptions = [_subscribe(life.node, topic, types[topic], file, taken) for topic in topics]
         (args.progress.note if args.json else args.say)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
         stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
@@ -154,54 +154,54 @@ def _record(
 
 
 class _InOrder:
-    """Messages as they come to a file; after a stall, what was held up goes in the order in which it was sent.
+    """Messages as they come to a file; at the start and after a stall, what was held up in the order of sending.
 
-    A process that stands still gets the rest later, one topic after another; the live node puts that in order too.
+    A process that stood still, or joins publishers that kept messages for it, gets the rest later, one topic after
+    another; the live node puts that in order too.
 
     `late`: how many came after others that were sent over `LATE` later, and stayed so; `latest`: s at most.
     """
 
-    def __init__(self, file: _File) -> None:
+    def __init__(self, file: _File, topics: Iterable[str]) -> None:
         self._file, self._began_ns = file, time.time_ns()
-        self._came, self._heard, self._least = math.inf, dict[str, float](), dict[str, float]()
-        self._since, self._behind = math.inf, set[str]()
-        self._waiting: list[tuple[Waiting, int, float, float]] = []
+        self._came, self._least = -math.inf, dict[str, float]()
+        self._heard = dict.fromkeys(topics, -math.inf)
+        self._waiting: CatchUp | None = None
         self._newest_ns = 0
         self.late, self.latest = Counter[str](), 0.0
 
     def take(self, topic: str, data: bytes, sent_ns: int) -> None:
         """Take one message as it comes."""
-        now, received_ns, by = time.monotonic(), time.time_ns(), 0.0
-        if sent_ns > self._began_ns:  # what was sent before is late for a good reason
-            way = (received_ns - sent_ns) * 1e-9
-            least = min(way, self._least.get(topic, way))
-            least = self._least[topic] = way if way - least > _CLOCK else least
-            by, sent_ns = way - least, sent_ns + (round(least * 1e9) if abs(least) > LATE else 0)  # by another clock
-        if now - self._came > STALL and not self._waiting:
-            self._since = now
-            self._behind = {other for other, heard in self._heard.items() if heard >= self._came - STALL}
+        now, received_ns = time.monotonic(), time.time_ns()
+        self._file.began = self._file.began or now
+        way = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
+        if now - self._came > STALL and self._waiting is None:
+            lately = [other for other, heard in self._heard.items() if heard >= self._came - STALL]
+            self._waiting = CatchUp(lately, _LONGEST, start=False)
         self._came = self._heard[topic] = now
+        if self._waiting is not None:
+            self._waiting.put((topic, received_ns, data), sent_ns, way, now)
+        else:
+            self._file.write(topic, received_ns, data)
+        if sent_ns <= self._began_ns:
+            return  # it is late for a good reason
+        least = min(way, self._least.get(topic, way))
+        least = self._least[topic] = way if way - least > _CLOCK else least
+        by, sent_ns = way - least, sent_ns + (round(least * 1e9) if abs(least) > LATE else 0)  # by another clock
         behind = (self._newest_ns - sent_ns) * 1e-9
         self._newest_ns = max(self._newest_ns, min(sent_ns, received_ns))
-        if self._since <= now:
-            self._waiting.append(((topic, received_ns, data), sent_ns, by, now))
-            self._behind -= {topic} if by <= LATE else set()
-            return
-        if behind > LATE and by > LATE:
+        if self._waiting is None and behind > LATE and by > LATE:
             self.late[topic] += 1
             self.latest = max(self.latest, behind)
-        self._file.write(topic, received_ns, data)
 
     def release(self, all_of_them: bool = False) -> None:
         """Write what waits, once all topics come in time again."""
-        now, order = time.monotonic(), CatchUp((), 0.0, start=False)
-        if all_of_them or now - self._since > (_LONGEST if self._behind else STALL):
-            held_up = any(by > LATE for *_, by, _ in self._waiting)
-            for message, sent_ns, _, came in self._waiting:
-                order.put(message, sent_ns if held_up else 0, 0.0, came)
-            for message in order.finish(now):
+        if (waiting := self._waiting) is not None:
+            now = time.monotonic()
+            for message in waiting.finish(now) if all_of_them else waiting.ready(now):
                 self._file.write(*message)
-            self._waiting, self._since = [], math.inf
+            if waiting.over:
+                self._waiting = None
 
 
 class _File:
@@ -259,8 +259,8 @@ class _File:
         self._channels[topic] = int(self._writer.register_channel(topic, "cdr", schema, metadata))
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
-        if self.began is None:
-            self.began, self._first = time.monotonic(), log_time
+        if not self.count:
+            self._first = log_time
         self._last = max(log_time, self._last)  # a clock that is set back must not reorder what was received
         self._to_disk(self._writer.add_message, self._channels[topic], self._last, bytes(data), self._last, self.count)
         self.count += 1

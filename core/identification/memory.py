@@ -41,6 +41,7 @@ _STEPS = 254
 _LOOKED_AT = 1000
 """Transitions at least by which a recording is recognised, if it has as many."""
 _AGAIN = "fit again with all recordings"
+_FACTS = ("criterion", "additive", "transitions", "transients", "segments", "sources")  # of its fit, for an update
 
 
 class Recording(NamedTuple):
@@ -191,6 +192,8 @@ class Memory:
                 raise FitError(f"the model {what}, and only a plain one can be updated; {_AGAIN}")
         if not data:
             raise FitError(f"the model keeps nothing of its recordings, so it cannot be updated; {_AGAIN}")
+        if lost := [name for name in _FACTS if name not in facts]:
+            raise FitError(f"field 'fit' of the model file lacks {', '.join(lost)}; {_AGAIN}")
         if data.get("of") != _mark_of(model):
             raise FitError(f"the model was changed after its fit, and what its file keeps is of another; {_AGAIN}")
         try:

@@ -330,7 +330,7 @@ class EnvelopeMonitor:
                 self._runs.reset()
         if judgement is not None and armed:
             alarms.push(step.dt, judgement.violation, self._table(judgement, longer) if alarms.needs_table else None)
-        return Verdict(step, alarms.alarm or self._frozen_alarm, judgement, status, alarms, longer, looked)
+        return Verdict(step, alarms.alarm or self._frozen_alarm, judgement, status, alarms, longer, looked, armed)
 
     @cython.cfunc
     def _table(self, judgement: Any, longer: Any) -> array[float]:

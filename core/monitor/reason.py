@@ -42,6 +42,8 @@ TOO_LARGE = "a value is so large that its bounds are not finite"
 """Why there is none where every signal is there."""
 QUIET = "no alarm"
 """What is said of a verdict without an alarm."""
+OFF = "alarms are off"
+"""What is said of one that could raise none."""
 
 
 def why_not(status: Status, model: UncertainLTI) -> str:
@@ -95,7 +97,7 @@ class Reasons:
         if not judged:
             said.append(f"no verdict: {self.rivals or self._why(verdict)}")
         elif not alarm:
-            said.append(QUIET)
+            said.append(QUIET if verdict.armed else OFF)
         if judged and verdict.withheld:
             said.append(f"no verdict on {', '.join(names[i] for i in verdict.withheld)}")
         if judged and verdict.unknown_regime:
@@ -138,6 +140,7 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
     for k in np.flatnonzero(_may_change(verdicts, model, statuses)).tolist():
         verdict: Any = SimpleNamespace(
             status=statuses[k],
+            armed=verdicts.armed[k],
             unknown_regime=verdicts.unknown_regime[k],
             raised=verdicts.raised(k) if verdicts.alarm[k] else (),
             frozen=[Moved(i, math.nan, math.nan) for i in np.flatnonzero(verdicts.frozen[k]).tolist()],
@@ -153,7 +156,7 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
 
 def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Status]) -> NDArray[np.bool_]:
     """Samples of which something else may be said than of the one before."""
-    rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.unknown_regime, verdicts.rule_alarms]
+    rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.armed, verdicts.unknown_regime, verdicts.rule_alarms]
     rows += [verdicts.frozen, verdicts.withheld]
     if verdicts.alarm.any():
         values, blamed = verdicts.over_thresholds()

@@ -71,6 +71,8 @@ class Verdict:
         Utilisation by the model's horizons, horizon after horizon; for models that have some.
     looked : Looked, optional
         What the step says of repeats.
+    armed : bool, default True
+        Whether the alarm could be raised.
 
     Attributes
     ----------
@@ -79,8 +81,8 @@ class Verdict:
     withheld : tuple of int
         States without a verdict, as their rows need one that is frozen.
     ordinary : bool
-        There is a verdict, and it says that every state is contained, within the fitted domain, without an alarm and
-        without a state that repeats for longer than ever.
+        There is a verdict, and it says that every state is contained, within the fitted domain, without an alarm that
+        could be raised and without a state that repeats for longer than ever.
     """
 
     t_ns = cython.declare(object, visibility="readonly")
@@ -89,6 +91,7 @@ class Verdict:
     outside_domain = cython.declare(cython.bint, visibility="readonly")
     unknown_regime = cython.declare(cython.bint, visibility="readonly")
     alarm = cython.declare(cython.bint, visibility="readonly")
+    armed = cython.declare(cython.bint, visibility="readonly")
     ordinary = cython.declare(cython.bint, visibility="readonly")
     frozen = cython.declare(object, visibility="readonly")
     repeating = cython.declare(object, visibility="readonly")
@@ -110,6 +113,7 @@ class Verdict:
         alarms: Alarm | None = None,
         longer: Any = None,
         looked: Looked | None = None,
+        armed: bool = True,
     ) -> None:
         self.frozen, self.withheld, self.repeating = ((), (), ()) if looked is None else looked
         self.t_ns, self.arrival_ns, self.status = step.t_ns, step.arrival_ns, status or step.status
@@ -117,9 +121,9 @@ class Verdict:
         self.outside_domain = self.unknown_regime = self.ordinary = False
         if judgement is not None:
             self.outside_domain, self.unknown_regime = judgement.outside_domain, judgement.unknown_regime
-            odd = self.outside_domain or alarm or self.withheld or self.repeating
+            odd = self.outside_domain or alarm or not armed or self.withheld or self.repeating
             self.ordinary = judgement.contained and not odd
-        self.alarm = alarm
+        self.alarm, self.armed = alarm, armed
         self._judgement, self._longer = judgement, longer
         self._alarms = alarms
         self._statistics, self._rules = None, ()

@@ -131,8 +131,11 @@ class Evidence:
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> Evidence:
         """Of `to_dict`."""
-        found: dict[str, Any] = {each.name: of_text(data[each.name]) for each in fields(cls)}
-        numbers = {each.name: found[each.name].item() for each in fields(cls) if each.type == "float"}
+        try:
+            found: dict[str, Any] = {each.name: of_text(data[each.name]) for each in fields(cls)}
+            numbers = {each.name: found[each.name].item() for each in fields(cls) if each.type == "float"}
+        except (TypeError, ValueError, KeyError):
+            raise FitError("field 'memory' of the model file is damaged; fit again with all recordings") from None
         return cls(**found | numbers)
 
     def thresholds(self, rules: Sequence[StatisticRule], n: int, what: str) -> list[Array]:
