@@ -129,11 +129,18 @@ def test_parquet_and_feather(shipped, names, tmp_path):
 
 
 def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_path):
-    rows = [f'"{k / 10:.1f}","{1.25 + k:.2f}","{1.5 + k:.3f}"'.replace(".", ",") for k in range(9)]
     path = tmp_path / "a.csv"
-    path.write_text("\n".join(["time,y,z", *rows]))
-    table = read_table(path)
-    assert np.allclose(table.columns["y"], 1.25 + np.arange(9)) and table.columns["z"].dtype == object
+    for time, numbers in (("{:.1f}", True), ("{:.0f}", False)):  # what parts decimals in one column does in each
+        rows = [f'"{time.format(k)}","{1.5 + k:.3f}"'.replace(".", ",") for k in range(9)]
+        path.write_text("\n".join(["time,z", *rows]))
+        read = read_table(path).columns["z"]
+        assert np.array_equal(read, 1.5 + np.arange(9)) if numbers else read.dtype == object
+
+
+def test_points_part_thousands_where_commas_part_decimals_in_another_column(tmp_path):
+    """1.234 was 1.234 between 987 and 1.300."""
+    bag = read_csv(tmp_path, "time;x", [f"{k},5;{f'{980 + 10 * k:,}'.replace(',', '.')}" for k in range(9)])
+    assert np.array_equal(bag.columns_by_field["x"], 980 + 10 * np.arange(9)) and "thousands" in bag.warnings[-1]
 
 
 @pytest.mark.parametrize(
@@ -173,6 +180,14 @@ def test_milliseconds_behind_a_comma_are_of_their_time(names, start, tmp_path):
     bag = read_csv(tmp_path, names, rows)
     assert len(bag.columns_by_field) == 1 + (start > 0) and not bag.warnings
     assert np.diff(bag.times).tolist() == [10**9 if start else 1_037_000_000] * 8
+
+
+def test_a_time_of_day_goes_on_after_midnight(tmp_path):
+    """It went back by a day: alarms were dated a day before the first sample."""
+    seconds = [(86_397 + k) % 86_400 for k in range(9)]
+    clocks = [f"{s // 3600:02}:{s // 60 % 60:02}:{s % 60:02}" for s in seconds]
+    bag = read_csv(tmp_path, "time,x", [f"{clock},{k % 4}.5" for k, clock in enumerate(clocks)])
+    assert np.diff(bag.times).tolist() == 8 * [10**9]
 
 
 @pytest.mark.parametrize("zone", ["", "+02:00"])
@@ -482,7 +497,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
-        ("a.csv", b'time,y\n"1,125","6,2"\n"1,250","7,3"\n', "as one or the other, with a point before decimals"),
+        ("a.csv", b'time,y\n"1,125",6\n"1,250",7\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-11-22T06:28:00,2\n2026-13-22T06:28:01,3\n", "'2026-13-22T06:28:01' is no day or"),
         ("a.csv", b"time,y,z\n1,2,3\n2,3,4\ntime,z,y\n1,2,3\n2,3,4\n", "line 4 names other columns, or in another"),

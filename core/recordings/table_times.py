@@ -218,11 +218,16 @@ def _of_parts(table: RawTable) -> str:
     if good.mean() < 1 - ODD_SHARE:
         return ""
     seconds = np.where(good, [3600.0, 60.0, 1.0] @ clock, np.nan)
-    seconds[good] += 86_400 * np.cumsum(np.diff(seconds[good], prepend=0.0) < -43_200)
+    seconds[good] = _past_midnight(seconds[good], 86_400)
     called = f"{':'.join(name for (name,) in parts)} [s]"
     rest = {name: column for name, column in table.columns.items() if [name] not in parts}
     table.columns = {called: seconds} | rest
     return called
+
+
+def _past_midnight(clock: Column, day: int) -> Column:
+    """Times of day, a day more from where they go back by more than half of one."""
+    return np.asarray(clock + day * np.cumsum(np.diff(clock, prepend=clock[:1]) < -day / 2))
 
 
 def _stands_still(column: Column) -> bool:
@@ -408,6 +413,8 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
         order = " and ".join(filter(None, (order, left_out(len(odd), "time", given))))
     if plain:
         times[list(plain)] = _parsed(where, list(plain.values())) - np.array(shifts)
+    else:
+        times[times != NO_TIME] = _past_midnight(times[times != NO_TIME], 86_400 * 10**9)
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     return times, order
