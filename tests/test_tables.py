@@ -437,6 +437,7 @@ def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
     [
         ("{time: clok}", r"there is no column 'clok', which the signals file names for the time \(is clock meant\?\)"),
         ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
+        ("{time: clock, runs: v}", r"column 'v' has \d+ values in 600 rows, so it names no runs; choose another"),
         ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
         ("{unit: day}", r"s.yaml: table: unit is 'day'.*; write one of s, ms, us, ns, min, h"),
         ("{step: fast}", r"s.yaml: table: step is 'fast'; write a number"),
