@@ -139,8 +139,10 @@ def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_pa
 
 def test_points_part_thousands_where_commas_part_decimals_in_another_column(tmp_path):
     """1.234 was 1.234 between 987 and 1.300."""
-    bag = read_csv(tmp_path, "time;x", [f"{k},5;{f'{980 + 10 * k:,}'.replace(',', '.')}" for k in range(9)])
-    assert np.array_equal(bag.columns_by_field["x"], 980 + 10 * np.arange(9)) and "thousands" in bag.warnings[-1]
+    rows = [f"{k},5;{f'{980 + 10 * k:,}'.replace(',', '.')};{1 + k / 8:.3f}" for k in range(9)]
+    bag = read_csv(tmp_path, "time;x;y", rows)
+    assert np.array_equal(bag.columns_by_field["x"], 980 + 10 * np.arange(9)) and "'x': '.' b" in bag.warnings[-1]
+    assert np.array_equal(bag.columns_by_field["y"], 1 + np.arange(9) / 8)
 
 
 @pytest.mark.parametrize(
@@ -307,6 +309,7 @@ def test_headers_delimiters_and_units(text, tmp_path):
     [
         (["2026-11-22T06:28:01.25Z", "2026-11-22T06:28:01.35Z"], 1795328881250000000),
         (["2026-11-22T08:28:01,250+02:00", "2026-11-22T08:28:01,350+0200"], 1795328881250000000),
+        (["2026-11-22 07:28:01.25+01", "2026-11-22 02:28:01.35-04"], 1795328881250000000),
         (["1795328881.250000001", "1795328881.350000001"], 1795328881250000001),
         (["1795328881250000001", "1795328881350000001"], 1795328881250000001),
         (["1795328881250", "1795328881350"], 1795328881250000000),
@@ -902,6 +905,13 @@ def test_names_that_are_repeated_between_the_rows_are_left_out_and_told(tmp_path
     assert (
         bag.warnings == [f"{bag.path}: 2 lines left out that repeat the names of the columns"] and len(bag.times) == 47
     )
+
+
+def test_a_second_table_below_the_first_is_not_read_as_its_rows(tmp_path):
+    """Its pressure went on as the speed of the first."""
+    rows = [f"{k},{k % 7},{k % 5}" for k in range(30)]
+    with pytest.raises(BagError, match="line 32 names other columns"):
+        read_csv(tmp_path, "time,speed,temp", [*rows, "time,pressure,flow", *rows])
 
 
 def test_signals_have_the_length_of_a_recording_and_not_that_of_its_parameters(tmp_path):

@@ -170,7 +170,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     for line, cells in _rows(path, encoding, shape):
         if known.intersection(map(str.strip, cells[:2])):
             plain = [cell.strip() for cell in cells]
-            if 2 * len(known.intersection(plain)) > wide:
+            if 2 * len(known.intersection(plain)) > wide or (all(plain) and not any(map(_is_value, plain))):
                 if any(a != b and not _is_value(a) for a, b in zip(plain, header, strict=False)):
                     rest = "write the rows from there on to a file of their own"
                     raise BagError(f"{path}: line {line} names other columns, or in another order; {rest}")
@@ -252,7 +252,7 @@ def _thousands(cells: Sequence[str], commas: bool) -> str:
     grouped = [m for m in map(_GROUPED.match, cells) if m]
     alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)] if grouped else []
     other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
-    other |= {"."} if commas else set()
+    other |= {"."} if commas and alone else set()  # without any they may be numbers of three decimals each
     found = {
         m["by"] for m in grouped if m["by"] not in ",." or m["rest"] or m[0].count(m["by"]) > 1 or m["by"] in other
     }

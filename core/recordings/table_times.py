@@ -36,7 +36,7 @@ _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?",
 }  # fmt: skip
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d(?::?\d\d)?)?$")
 _DAY = re.compile(
     r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?"
     r"([+-]\d\d:?\d\d)?"
@@ -436,7 +436,7 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
         raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
     if not zone or zone in ("Z", "UTC"):
         return text, 0
-    hours, minutes = int(zone[1:3]), int(zone[-2:])
+    hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)  # +01, as PostgreSQL writes it
     if hours > _LARGEST_ZONE or minutes > 59:
         raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
     return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1)
