@@ -327,6 +327,17 @@ def test_a_damaged_summary_is_read_without(tmp_path: Path) -> None:
     assert bag.warnings == [f"{tmp_path / 'x.mcap'}: the checksum of its summary is wrong; read without it"]
 
 
+@pytest.mark.parametrize("summary", [True, False])
+def test_a_second_file_that_was_joined_to_the_first_is_told(summary: bool, tmp_path: Path) -> None:
+    """It was left out without a word: a fault in it gave `no alarm`."""
+    first, second = (
+        write([Topic("/a")], ramp("/a", times), Layout(summary=summary)) for times in (range(9), range(9, 20))
+    )
+    bag = Bag(File(first.data + second.data).save(tmp_path / "x.mcap"))
+    assert len(list(bag.raw_messages())) == 9
+    assert f"{len(second.data):,} bytes behind its end".replace(",", " ") in bag.warnings[-1]
+
+
 def test_channels_of_a_damaged_chunk_are_found_in_the_summary(tmp_path: Path) -> None:
     """The channel stands in the first chunk only; without a summary the others belong to no topic."""
     file = chunked()

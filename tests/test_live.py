@@ -501,8 +501,8 @@ def test_a_model_that_cannot_be_is_refused_by_name_and_the_one_at_work_goes_on(b
         (tmp_path / "nowhere.json", "there is no such model file"),
         ("hand.model.json", nowhere),
         ("x" * 5000, nowhere),
-        (tmp_path / "pipe", "is no regular file"),
-        ("/dev/zero", "is no regular file"),
+        (tmp_path / "pipe", "this is a pipe or a device"),
+        ("/dev/zero", "this is a pipe or a device"),
     ):
         accepted, reason = on.world.set(model=str(wrong))
         assert not accepted and reason.startswith(str(wrong)[:100]) and why in reason and len(reason) < 6000

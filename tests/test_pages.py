@@ -14,6 +14,7 @@ import hashlib
 import json
 import re
 import shutil
+import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -311,3 +312,16 @@ def test_the_command_draws_models_recordings_and_checks(engine, tmp_path, cli):
     page.unlink()
     said = cli("plot", model, *other, "--output", page, "-q", status=2).err
     assert "no recording could be checked, so nothing is drawn" in said and not page.exists()
+
+
+@pytest.mark.skipif(not shutil.which("node"), reason="node is not installed")
+def test_a_browser_that_speaks_no_language_draws():
+    """Chromium under LANG=C calls its language en-US@posix, of which uPlot made nothing: the page had no plot."""
+    drawing = re.findall(r"<script>(.*?)</script>", interactive_page("x", []), re.DOTALL)[0]
+    browser = "window = globalThis; Object.defineProperty(window, 'navigator', {value: {language: 'en-US@posix'}});"
+    browser += "matchMedia = addEventListener = dispatchEvent = () => ({addEventListener() {}});"
+    browser += "document = {}; devicePixelRatio = 1;"
+    said = subprocess.run(
+        ["node", "-"], input=f"{browser}{drawing};console.log(typeof uPlot)", capture_output=True, text=True
+    )
+    assert said.stdout == "function\n", said.stderr

@@ -11,6 +11,7 @@
 
 import importlib
 import math
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,7 @@ from hypothesis import strategies as st
 from refusals import refuses
 
 from uncertain_lti.base.errors import SignalError
+from uncertain_lti.base.files import target
 from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import define
 from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields, numeric_paths
@@ -518,3 +520,14 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
 
     read = construct(compose("{a: 010, b: 1:30, c: 1_000, d: 10, f: -0.5, g: 0x10, h: 0}"))
     assert read == {"a": "010", "b": "1:30", "c": "1_000", "d": 10, "f": -0.5, "g": 16, "h": 0}
+
+
+def test_what_is_in_a_pipe_is_neither_waited_for_nor_taken_out(tmp_path):
+    """`--signals <(...)` was said to be empty, and `--output /dev/stdout` waited for ever."""
+    os.mkfifo(tmp_path / "pipe")
+    both = os.open(tmp_path / "pipe", os.O_RDWR)
+    os.write(both, b"#\n" * 4000)
+    refuses(SignalError, "this is a pipe or a device", SignalMap.load, tmp_path / "pipe")
+    target(tmp_path / "pipe", holds=b"{", kind="model file", example="m.model.json")
+    assert len(os.read(both, 9000)) == 8000
+    os.close(both)

@@ -62,6 +62,7 @@ def test_an_edited_signals_file_is_used_as_it_is(folder, cli):
     text = (folder / "m.yaml").read_text()
     (folder / "m.yaml").write_text(text.replace("name: fan_speed", "name: fan"))
     assert "write over it with --force" in cli("start", *HEALTHY, "--output", "m", status=2).err
+    assert "is none; leave it out" in cli("init", *HEALTHY, "--table", "time=t", status=2).err
     assert "m.yaml is there" in cli("start", *HEALTHY, "--output", "m", "--force", "--table", "step=1", status=2).err
     data = cli.json("start", *HEALTHY, "--output", "m", "--force")
     assert "init" not in data and data["exit_status"] == 0 and not data["findings"]["alarm"]

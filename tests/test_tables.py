@@ -130,11 +130,20 @@ def test_parquet_and_feather(shipped, names, tmp_path):
 
 
 def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_path):
-    rows = [f'"{k / 10:.1f}","{1.25 + k:.2f}","{1.5 + k:.3f}"'.replace(".", ",") for k in range(9)]
     path = tmp_path / "a.csv"
-    path.write_text("\n".join(["time,y,z", *rows]))
-    table = read_table(path)
-    assert np.allclose(table.columns["y"], 1.25 + np.arange(9)) and table.columns["z"].dtype == object
+    for time, numbers in (("{:.1f}", True), ("{:.0f}", False)):  # what parts decimals in one column does in each
+        rows = [f'"{time.format(k)}","{1.5 + k:.3f}"'.replace(".", ",") for k in range(9)]
+        path.write_text("\n".join(["time,z", *rows]))
+        read = read_table(path).columns["z"]
+        assert np.array_equal(read, 1.5 + np.arange(9)) if numbers else read.dtype == object
+
+
+def test_points_part_thousands_where_commas_part_decimals_in_another_column(tmp_path):
+    """1.234 was 1.234 between 987 and 1.300."""
+    rows = [f"{k},5;{f'{980 + 10 * k:,}'.replace(',', '.')};{1 + k / 8:.3f}" for k in range(9)]
+    bag = read_csv(tmp_path, "time;x;y", rows)
+    assert np.array_equal(bag.columns_by_field["x"], 980 + 10 * np.arange(9)) and "'x': '.' b" in bag.warnings[-1]
+    assert np.array_equal(bag.columns_by_field["y"], 1 + np.arange(9) / 8)
 
 
 @pytest.mark.parametrize(
@@ -174,6 +183,14 @@ def test_milliseconds_behind_a_comma_are_of_their_time(names, start, tmp_path):
     bag = read_csv(tmp_path, names, rows)
     assert len(bag.columns_by_field) == 1 + (start > 0) and not bag.warnings
     assert np.diff(bag.times).tolist() == [10**9 if start else 1_037_000_000] * 8
+
+
+def test_a_time_of_day_goes_on_after_midnight(tmp_path):
+    """It went back by a day: alarms were dated a day before the first sample."""
+    seconds = [(86_397 + k) % 86_400 for k in range(9)]
+    clocks = [f"{s // 3600:02}:{s // 60 % 60:02}:{s % 60:02}" for s in seconds]
+    bag = read_csv(tmp_path, "time,x", [f"{clock},{k % 4}.5" for k, clock in enumerate(clocks)])
+    assert np.diff(bag.times).tolist() == 8 * [10**9]
 
 
 @pytest.mark.parametrize("zone", ["", "+02:00"])
@@ -293,6 +310,7 @@ def test_headers_delimiters_and_units(text, tmp_path):
     [
         (["2026-11-22T06:28:01.25Z", "2026-11-22T06:28:01.35Z"], 1795328881250000000),
         (["2026-11-22T08:28:01,250+02:00", "2026-11-22T08:28:01,350+0200"], 1795328881250000000),
+        (["2026-11-22 07:28:01.25+01", "2026-11-22 02:28:01.35-04"], 1795328881250000000),
         (["1795328881.250000001", "1795328881.350000001"], 1795328881250000001),
         (["1795328881250000001", "1795328881350000001"], 1795328881250000001),
         (["1795328881250", "1795328881350"], 1795328881250000000),
@@ -423,6 +441,7 @@ def test_without_a_column_of_runs_a_step_back_begins_a_segment(many):
     [
         ("{time: clok}", r"there is no column 'clok', which the signals file names for the time \(is clock meant\?\)"),
         ("{time: clock, runs: run}", "there is no column 'run', which the signals file names for the runs"),
+        ("{time: clock, runs: v}", r"column 'v' has \d+ values in 600 rows, so it names no runs; choose another"),
         ("{when: clock}", r"s.yaml: table: unknown key 'when'"),
         ("{unit: day}", r"s.yaml: table: unit is 'day'.*; write one of s, ms, us, ns, min, h"),
         ("{step: fast}", r"s.yaml: table: step is 'fast'; write a number"),
@@ -484,7 +503,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.csv", b"x,y\n2,3\n1,4\n3,4\n", "no column is called time or looks like it.*columns there: x, y"),
         ("a.csv", b"time,y\n1,2\n2,3,4\n3,4,5\n4,5,6\n5,6\n6,7\n7,8\n", "3 lines with another number of cells"),
         ("a.csv", b"time,y\n22.11.26 at 6,2\n22.11.26 at 7,3\n", "neither a number nor an ISO time"),
-        ("a.csv", b'time,y\n"1,125","6,2"\n"1,250","7,3"\n', "as one or the other, with a point before decimals"),
+        ("a.csv", b'time,y\n"1,125",6\n"1,250",7\n', "as one or the other, with a point before decimals"),
         ("a.csv", b"time,y\n02/01/2026 06,2\n03/01/2026 06,3\n", "do not say which is day and which is month"),
         ("a.csv", b"time,y\n2026-11-22T06:28:00,2\n2026-13-22T06:28:01,3\n", "'2026-13-22T06:28:01' is no day or"),
         ("a.csv", b"time,y,z\n1,2,3\n2,3,4\ntime,z,y\n1,2,3\n2,3,4\n", "line 4 names other columns, or in another"),
@@ -928,6 +947,13 @@ def test_names_that_are_repeated_between_the_rows_are_left_out_and_told(tmp_path
     assert (
         bag.warnings == [f"{bag.path}: 2 lines left out that repeat the names of the columns"] and len(bag.times) == 47
     )
+
+
+def test_a_second_table_below_the_first_is_not_read_as_its_rows(tmp_path):
+    """Its pressure went on as the speed of the first."""
+    rows = [f"{k},{k % 7},{k % 5}" for k in range(30)]
+    with pytest.raises(BagError, match="line 32 names other columns"):
+        read_csv(tmp_path, "time,speed,temp", [*rows, "time,pressure,flow", *rows])
 
 
 def test_signals_have_the_length_of_a_recording_and_not_that_of_its_parameters(tmp_path):

@@ -105,7 +105,7 @@ def target(output: str | os.PathLike[str], *, holds: bytes, kind: str, example: 
         raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
     if path.is_dir():
         raise BagError(f"{path}: is a folder; name a file in it, for example {path / example}")
-    with suppress(OSError), open(path, "rb") as stream:
+    with suppress(OSError), open(path if path.is_file() else os.devnull, "rb") as stream:
         head = stream.read(500)
         if head and holds not in head:
             raise BagError(f"{path}: is there already and is no {kind}; choose another name, or move it away")
@@ -131,6 +131,8 @@ def kind_of(path: str | os.PathLike[str]) -> str:
     """What a file is by its first bytes, or of a table by its name, with an article; "" where that is not known."""
     if os.path.isdir(path):
         return "a folder"
+    if os.path.exists(path) and not os.path.isfile(path):
+        return "a pipe or a device"  # to look into it would empty it, or wait for ever
     try:
         with open(path, "rb") as stream:
             head = stream.read(4000)

@@ -72,6 +72,11 @@ def topics(options: argparse.Namespace) -> Result:
 
 def _layout(options: argparse.Namespace) -> TableLayout:
     """What --table says of the columns of tables."""
+    from uncertain_lti.recordings.table import is_table
+
+    paths = [options.bag] if "bag" in options else [*options.bags, *(getattr(options, "check", None) or [])]
+    if options.table and not any(is_table(Path(path)) for path in paths):
+        raise SignalError(f"--table: says how a table is read, and {shortlist(paths, 3)} is none; leave it out")
     return TableLayout.from_dict(dict(pair.partition("=")[::2] for pair in options.table), "--table")
 
 

@@ -236,10 +236,9 @@ def write(path: str | os.PathLike[str], data: Mapping[str, Any]) -> None:
 def read(path: str | os.PathLike[str]) -> Any:
     """Read the structure of a model file."""
     refuse_other(path, (str, os.PathLike), "the model file", "give its path", ModelError)
-    if os.path.exists(path) and not (os.path.isfile(path) or os.path.isdir(path)):
-        raise ModelError(f"{path}: is no regular file (a pipe or a device), and a model file is one; check the path")
     if (kind := kind_of(path)) and kind != "a model file":
         cures = {"a folder": "name the file in it", "a signals file": "write a model with `uncertain-lti fit`"}
+        cures["a pipe or a device"] = "write it to a file first"
         cure = cures.get(kind, "are the arguments swapped?")
         raise ModelError(f"{path}: this is {kind}, and a model file is wanted here; {cure}")
     try:

@@ -179,6 +179,9 @@ class _Scanner:
                 record = parse(DataEnd, self.stream.read(length)) if opcode == Opcode.DATA_END else None
                 if record and record.data_section_crc not in (0, self.sums) and not self.damaged:
                     self._warn("the checksum of the file is wrong, so a number in it may be; copy it again if you can")
+                if self.closed and (behind := size - self._end(position)) > 0:
+                    joined = "as of a second file that was joined to it: name files one by one"
+                    self._warn(f"{count(behind, 'byte')} behind its end left out, {joined}")
                 return True
             if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
                 position = self._bare(position, end, following)
@@ -197,6 +200,15 @@ class _Scanner:
                     self.sums = crc32(piece, self.sums)
                     left -= len(piece)
             position = end
+
+    def _end(self, position: int) -> int:
+        """Where the first footer from a record on ends, with its magic."""
+        while len(header := self._at(position, RECORD.size)) == RECORD.size:
+            opcode, length = RECORD.unpack(header)
+            position += RECORD.size + length
+            if opcode == Opcode.FOOTER:
+                return position + len(MAGIC)
+        return self.found.size
 
     def _warn(self, text: str) -> None:
         self.found.warnings.append(f"{self.found.path}: {text}")

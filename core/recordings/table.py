@@ -348,8 +348,9 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
         if raw.exact is not None and len(column) and bool((np.abs(column) >= _INEXACT).any()):
             keys = np.asarray(raw.exact(of))
     names, first, rows = np.unique(keys, return_index=True, return_inverse=True)
-    if len(names) > _MOST_RUNS:
-        raise BagError(f"{file}: column '{layout.runs}' has {len(names)} values, so it names no runs; choose another")
+    if len(names) > min(_MOST_RUNS, max(10, len(column) // 2)):
+        values = f"{len(names)} values in {len(column)} rows"
+        raise BagError(f"{file}: column '{layout.runs}' has {values}, so it names no runs; choose another")
     of_each = np.split(np.argsort(rows, kind="stable"), np.cumsum(np.bincount(rows, minlength=len(names)))[:-1])
     found: dict[str, NDArray[np.intp]] = {}
     for i in np.argsort(first, kind="stable").tolist():

@@ -170,7 +170,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     for line, cells in _rows(path, encoding, shape):
         if known.intersection(map(str.strip, cells[:2])):
             plain = [cell.strip() for cell in cells]
-            if 2 * len(known.intersection(plain)) > wide:
+            if 2 * len(known.intersection(plain)) > wide or (all(plain) and not any(map(_is_value, plain))):
                 if any(a != b and not _is_value(a) for a, b in zip(plain, header, strict=False)):
                     rest = "write the rows from there on to a file of their own"
                     raise BagError(f"{path}: line {line} names other columns, or in another order; {rest}")
@@ -194,10 +194,11 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
         notes.append(f"{plural(odd, 'line')} with another number of cells left out, the first is line {first_odd}{cut}")
     found: dict[str, Column] = {}
     noted: dict[str, list[str]] = {}
+    commas = any("," in cell and _has_comma(cell.strip()) for texts_of in columns for cell in texts_of)
     for name, texts_of in zip(names, columns, strict=True):
         if name.startswith("column ") and not any(texts_of):
             continue  # a delimiter at the end of each line
-        found[name], note = _column(texts_of, shape.delimiter)
+        found[name], note = _column(texts_of, commas, shape.delimiter)
         if note:
             noted.setdefault(note, []).append(name)
     for note, of in noted.items():
@@ -206,19 +207,19 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     return RawTable(found, notes, lambda name: [cell.strip() for cell in texts[name]])
 
 
-def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
-    """Numbers where most cells are some, else text; and what was done."""
+def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str]:
+    """Numbers where most cells are some, else text; and what was done; `commas`: whether they part its decimals."""
     plain = [cell.strip().replace("\u2212", "-") for cell in cells]  # the minus of some languages
-    if not any("_" in cell for cell in cells):  # `1_0` is 10 to Python alone
+    grouped = commas and any(map(_GROUPED.match, plain))  # 1.234 is one number to all, and another here
+    if not grouped and not any("_" in cell for cell in cells):  # `1_0` is 10 to Python alone
         with suppress(ValueError):
             return np.array([float(cell) for cell in cells]), ""
         with suppress(ValueError):
             return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
     numbers = np.full(len(plain), np.nan)
-    if by := _thousands(plain):
+    if by := _thousands(plain, commas):
         plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]
-    # in quotes between commas they may part thousands, which nothing but other cells tells
-    decimal = delimiter != "," or any(_WITH_COMMA.match(cell) and not _GROUPED.match(cell) for cell in plain)
+    decimal = delimiter != "," or commas  # in quotes between commas they may part thousands
     comma = missing = odd = 0
     first = ""
     for i, cell in enumerate(plain):
@@ -241,11 +242,17 @@ def _column(cells: list[str], delimiter: str) -> tuple[Column, str]:
     return numbers, " and ".join([left_out(odd, "number", first)] * bool(odd) + read)
 
 
-def _thousands(cells: Sequence[str]) -> str:
+def _has_comma(cell: str) -> bool:
+    """Whether its comma is in front of decimals for certain."""
+    return bool(_WITH_COMMA.match(cell)) and not _GROUPED.match(cell)
+
+
+def _thousands(cells: Sequence[str], commas: bool) -> str:
     """What parts thousands in a column, if cells tell (`1,234.5`, `1 234`, `1.234.567`) and none denies; else ""."""
     grouped = [m for m in map(_GROUPED.match, cells) if m]
     alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)] if grouped else []
     other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
+    other |= {"."} if commas and alone else set()  # without any they may be numbers of three decimals each
     marks = [(m["by"], m["rest"] or m[0].count(m["by"]) > 1) for m in grouped]
     found = {by for by, telling in marks if telling or by not in ",." or by in other}
     by = found.pop() if len(found) == 1 else ""

@@ -37,7 +37,7 @@ _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?", "d": r"days?",
 }  # fmt: skip
-_ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d:?\d\d)?$")
+_ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d(?::?\d\d)?)?$")
 _DAY = re.compile(
     r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?"
     r"([+-]\d\d:?\d\d)?"
@@ -227,11 +227,16 @@ def _of_parts(table: RawTable) -> str:
     if good.mean() < 1 - ODD_SHARE:
         return ""
     seconds = np.where(good, [3600.0, 60.0, 1.0] @ clock, np.nan)
-    seconds[good] += 86_400 * np.cumsum(np.diff(seconds[good], prepend=0.0) < -43_200)
+    seconds[good] = _past_midnight(seconds[good], 86_400)
     called = f"{':'.join(name for (name,) in parts)} [s]"
     rest = {name: column for name, column in table.columns.items() if [name] not in parts}
     table.columns = {called: seconds} | rest
     return called
+
+
+def _past_midnight(clock: Column, day: int) -> Column:
+    """Times of day, a day more from where they go back by more than half of one."""
+    return np.asarray(clock + day * np.cumsum(np.diff(clock, prepend=clock[:1]) < -day / 2))
 
 
 def _stands_still(column: Column) -> bool:
@@ -421,6 +426,8 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
         order = " and ".join(filter(None, (order, left_out(len(odd), "time", given))))
     if plain:
         times[list(plain)] = _parsed(where, list(plain.values())) - np.array(shifts)
+    else:
+        times[times != NO_TIME] = _past_midnight(times[times != NO_TIME], 86_400 * 10**9)
     if (times == NO_TIME).all():
         raise BagError(f"{where}: holds no time in any row; name another column, `table: {{time: COLUMN}}`")
     return times, order
@@ -442,7 +449,7 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
         raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
     if not zone or zone in ("Z", "UTC"):
         return text, 0
-    hours, minutes = int(zone[1:3]), int(zone[-2:])
+    hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)  # +01, as PostgreSQL writes it
     if hours > _LARGEST_ZONE or minutes > 59:
         raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
     return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1)

@@ -52,6 +52,9 @@ MOST_DRAWN = 6
 """Recordings that a report draws and describes; those with most violations."""
 HOLDS = {".html": b"<html", ".png": b"\x89PNG", ".svg": b"<svg", ".pdf": b"%PDF"}
 """Endings of pages and images, and what their files hold near the beginning."""
+_SPEAKING = """\
+try { Intl.NumberFormat(navigator.language) } catch { Object.defineProperty(navigator, "language", { value: "en" }) }
+"""  # uPlot asks for numbers in the language of Chromium without one (LANG=C), which is none
 _TONE = {YES: "good", CARE: "care", UNKNOWN: "care", NO: "bad"}
 
 Placed = tuple[Columns, Panel]
@@ -77,7 +80,7 @@ def write_page(path: str | os.PathLike[str], page: str) -> None:
 def interactive_page(title: str, recordings: Sequence[Plotted], every: int = 0, **more: Any) -> str:
     """The page of some recordings; `every`: ms between two looks of a live one; `more`: of a report."""
     packed = packed_data(recordings, every).replace("<", "\\u003c")
-    scripts = [asset(name).rstrip("\n") for name in ("uPlot.iife.min.js", "plot.js")]
+    scripts = [_SPEAKING + asset("uPlot.iife.min.js").rstrip("\n"), asset("plot.js").rstrip("\n")]
     allowed = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
     views = list(dict.fromkeys(view for recording in recordings for view, _ in recording.views))
     style = Markup(f"{asset('uPlot.min.css')}\n{asset('page.css')}")

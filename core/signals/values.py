@@ -56,7 +56,8 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
     import yaml  # the live node reads signals from the model file and needs no YAML
 
     if (kind := kind_of(path)) and kind != "a signals file":
-        remedy = "name a file in it" if kind == "a folder" else "are the arguments swapped?"
+        cures = {"a folder": "name a file in it", "a pipe or a device": "write it to a file first"}
+        remedy = cures.get(kind, "are the arguments swapped?")
         raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {remedy}")
     try:
         with open(path, encoding="utf-8") as stream:
