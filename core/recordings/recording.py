@@ -30,6 +30,9 @@ from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import Definition, RawMessage
 from uncertain_lti.signals.field_path import FieldPath, TypeFields, has_names, signal_paths
 
+DATED_NS = 10**17
+"""Since 1970, from which on a time is one of a calendar, and not of a run."""
+
 
 @dataclass(frozen=True)
 class TopicInfo:

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import plural, shortlist
-from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo
+from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
 from uncertain_lti.recordings.table_times import (
     NO_TIME,
@@ -51,7 +51,6 @@ _PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*
 _QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*([^\d\s]\S{0,7})")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
-_DATED = 10**17  # ns, from which on a time is of a clock on the wall, and not of a run
 _HOUR = 3_600 * 10**9  # ns
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
@@ -237,7 +236,7 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
         if fastest is not None and 0.8 * step < least * times < 1.25 * step:
             words = f"its steps are {step / least:.4g} times those of {fastest.path}: if its times are in {unit}"
             table._warnings.append(f"{table.path}: {words} and those in s, call its column time_{unit}")
-    dated = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > _DATED]
+    dated = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > DATED_NS]
     alone = [t for t in dated if len(_numbers(t.columns_by_field)) == 1]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:

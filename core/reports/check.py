@@ -47,6 +47,7 @@ from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import NUMBERS, Verdicts
+from uncertain_lti.recordings.recording import DATED_NS
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient, Transitions
@@ -539,7 +540,7 @@ def _when(alarm: Mapping[str, Any]) -> str:
 
 def instant_text(instant: Mapping[str, Any], form: str = ".4f") -> str:
     """When a sample was, s from the first one; its day as well where that is another."""
-    if instant["t"] < 86400 or instant["t_ns"] <= _DATED_NS:
+    if instant["t"] < 86400 or instant["t_ns"] <= DATED_NS:
         return f"{instant['t']:{form}} s"
     day = np.datetime64(instant["t_ns"], "ns").astype("datetime64[s]")
     return f"{day} UTC, {lasting(instant['t'] / 3600)} on"
@@ -549,9 +550,6 @@ def _raised_by(alarm: Mapping[str, Any]) -> list[str]:
     """The line on what raised it; none where containment alone did."""
     by = [r["words"] for r in alarm["raised"] if r["rule"] != "containment"]
     return [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
-
-
-_DATED_NS = 10**17  # since 1970, from which on a time is one of a calendar
 
 
 def episodes_table(data: Mapping[str, Any]) -> Table:

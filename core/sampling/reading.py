@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import core_count
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
-from uncertain_lti.base.text import meant, shortlist
+from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.recordings.recording import Columns, Progress, Recording
+from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording
 from uncertain_lti.sampling.clock import INVALID, LATE, MISSING, TOO_OLD, Status, resolve
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.steady_state import resolve_auto
@@ -256,6 +256,7 @@ def read_transients(
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
     transients = [sample(stream, resolved)[0] for stream in streams]
     refuse_copies(transients)
+    transients = _overlaps_told(transients)
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
         return transients
@@ -278,6 +279,23 @@ def refuse_copies(transients: Iterable[Transient]) -> None:
             if all(np.array_equal(one, other, equal_nan=True) for one, other in pairs):
                 raise copy_of(t.name, twin.name)
         alike.append(t)
+
+
+def _overlaps_told(transients: Sequence[Transient]) -> list[Transient]:
+    """A note on each that holds samples of another one, as snapshots of one stretch do."""
+    found, before = list(transients), None
+    for k in sorted((k for k, t in enumerate(found) if len(t)), key=lambda k: int(found[k].t_ns.min())):
+        t = found[k]
+        if before is not None and DATED_NS < t.t_ns.min() <= before.t_ns.max():
+            _, mine, its = np.intersect1d(t.t_ns, before.t_ns, return_indices=True)
+            same = mine[(t.x[mine] == before.x[its]).all(axis=1)]
+            if 2 * len(same) > len(mine) and np.ptp(t.x[same], axis=0).any():
+                shared = f"{len(same)} of its {plural(len(t), 'sample')} are those of {before.name}"
+                note = f"{t.name}: {shared}: they count twice, and what is left out was fitted; cut or leave out one"
+                found[k] = t.replace(notes=(*t.notes, note))
+        if before is None or t.t_ns.max() > before.t_ns.max():
+            before = t
+    return found
 
 
 def copy_of(name: str, twin: str) -> BagError:
