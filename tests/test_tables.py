@@ -1125,17 +1125,17 @@ def test_files_of_one_signal_each_of_the_same_time_are_said_to_be_no_recordings_
     assert ["if each of them is of another signal" in text for text in said] == [False, True, False]
 
 
-@pytest.mark.parametrize("dated", [True, False])
-def test_recordings_that_share_samples_are_told(tmp_path, dated):
+@pytest.mark.parametrize(("dated", "field", "steady"), [(True, "x", 0), (True, "unwrap(x)", "auto"), (False, "x", 0)])
+def test_recordings_that_share_samples_are_told(tmp_path, dated, field, steady):
     """As snapshots of one stretch do; runs that each begin at 0 may begin alike."""
-    files, values = [], np.random.default_rng(3).normal(size=(700, 2))
+    files, values = [], np.random.default_rng(3).uniform(-1, 1, (700, 2))
     for name, part in (("later", slice(200, 500)), ("first", slice(0, 300)), ("apart", slice(600, 700))):
         rows = [f"{k + 1.7e9 * dated:.1f},{x},{u}" for k, (x, u) in enumerate(values.tolist())][part]
         files.append(tmp_path / f"{name}.csv")
         files[-1].write_text("\n".join(["time_s,x,u", *rows]))
     signals = tmp_path / "signals.yaml"
-    line = "{{name: {0}, topic: /table, field: {0}, steady: 0, scale: 1}}"
-    signals.write_text(f"states: [{line.format('x')}]\ncontrols: [{line.format('u')}]\n")
+    line = "{{name: {0}, topic: /table, field: {1}, steady: {2}, scale: 1}}"
+    signals.write_text(f"states: [{line.format('x', field, steady)}]\ncontrols: [{line.format('u', 'u', 0)}]\n")
     notes = [n for t in read_transients(files, signals) for n in t.notes if "count twice" in n]
     assert len(notes) == dated
     assert all(f"100 of its 300 samples are those of {files[1]}" in n and n.startswith(f"{files[0]}") for n in notes)

@@ -41,6 +41,8 @@ _STEPS = 254
 _LOOKED_AT = 1000
 """Transitions at least by which a recording is recognised, if it has as many."""
 _AGAIN = "fit again with all recordings"
+DAMAGED = f"field 'memory' of the model file is damaged; {_AGAIN}"
+"""Of what an update needs, here and in `validation.panel`."""
 _FACTS = ("criterion", "additive", "transitions", "transients", "segments", "sources")  # of its fit, for an update
 
 
@@ -209,7 +211,7 @@ class Memory:
             boxes = None if data["boxes"] is None else Boxes.from_dict(data["boxes"])
             return cls(kept, rest, boxes, tuple(Recording(*each) for each in data["recordings"]))
         except (TypeError, ValueError, KeyError, AttributeError):
-            raise FitError(f"field 'memory' of the model file is damaged; {_AGAIN}") from None
+            raise FitError(DAMAGED) from None
 
     def unproven(self, boxes: Boxes | None) -> list[str]:
         """Names of recordings of which these, with what room is left, do not prove that all is inside."""

@@ -118,7 +118,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             raise BagError(f"{where}: {none}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
         if unit == "s" and not stated and (step := _coarse(values)):
             doubt, ask = f", {step:.10g} from row to row", "name it time_us or time_ms, or give `--table unit=us`"
-            if step >= _UNLIKELY[_since_1970(values)]:
+            if step >= _UNLIKELY[_since_1970(float(np.nanmedian(values)))]:
                 none = "has no unit, which may be s, ms or us"
                 raise BagError(f"{where}{doubt}: {none}; {ask} (in a signals file `table: {{unit: us}}`)")
             doubt += f": for others {ask}"
@@ -197,13 +197,15 @@ def _grows(column: Column) -> bool:
     """Whether numbers grow from each row to the next, or nearly so and are times since 1970."""
     if column.ndim != 1 or column.dtype.kind not in "iuf" or len(column) < 3:
         return False
-    since = any(_since_1970(column, 10**digits) for digits in (0, 3, 6, 9))  # in s to ns
-    return bool((column[1:] > column[:-1]).all()) or (since and goes_forward(column))
+    if (column[1:] > column[:-1]).all():
+        return True
+    size = float(np.nanmedian(column))
+    return any(_since_1970(size / 10**digits) for digits in (0, 3, 6, 9)) and goes_forward(column)  # in s to ns
 
 
-def _since_1970(column: Column, unit: int = 1) -> bool:
-    """Whether numbers may be times since 1970, from 1998 to 2099; `unit`: how many are a second."""
-    return bool(0.9e9 < float(np.nanmedian(column)) / unit < 4.1e9)
+def _since_1970(seconds: float) -> bool:
+    """Whether they may be since 1970, from 1998 to 2099."""
+    return 0.9e9 < seconds < 4.1e9
 
 
 def _days_beside(table: RawTable, column: str) -> str:

@@ -256,23 +256,25 @@ def read_transients(
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
     transients = [sample(stream, resolved)[0] for stream in streams]
     refuse_copies(transients)
-    transients = _overlaps_told(transients)
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
     if not asked:
-        return transients
+        return _overlaps_told(transients)
     resolved, words = _resolve_operating_point(resolved, transients)
     if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
         transients = [sample(stream, resolved)[0] for stream in streams]
     numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
-    note = f"operating point from {words}: {numbers}"
-    return [t.replace(signals=resolved, notes=(*t.notes, note) if t is transients[0] else t.notes) for t in transients]
+    first = (*transients[0].notes, f"operating point from {words}: {numbers}")
+    return _overlaps_told(
+        [t.replace(signals=resolved, notes=first if t is transients[0] else t.notes) for t in transients]
+    )
 
 
 def refuse_copies(transients: Iterable[Transient]) -> None:
     """A recording that is named together with its copy would count twice, and vouch for itself."""
     seen: dict[tuple[float, ...], list[Transient]] = {}
     for t in filter(len, transients):  # thousands of runs may have the same times
-        some = np.nan_to_num(np.hstack([t.x, t.u])[[0, len(t) // 2, -1]])
+        at = [0, len(t) // 2, -1]
+        some = np.nan_to_num(np.hstack([t.x[at], t.u[at]]))
         alike = seen.setdefault((len(t), int(t.t_ns[0]), int(t.t_ns[-1]), *some.ravel().tolist()), [])
         for twin in alike:
             pairs = (t.t_ns, twin.t_ns), (t.x, twin.x), (t.u, twin.u)
@@ -282,7 +284,7 @@ def refuse_copies(transients: Iterable[Transient]) -> None:
 
 
 def _overlaps_told(transients: Sequence[Transient]) -> list[Transient]:
-    """A note on each that holds samples of another one, as snapshots of one stretch do."""
+    """A note on each that holds samples of another one, as snapshots of one stretch do; by stamps of a calendar."""
     found, before = list(transients), None
     for k in sorted((k for k, t in enumerate(found) if len(t)), key=lambda k: int(found[k].t_ns.min())):
         t = found[k]

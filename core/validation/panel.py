@@ -41,7 +41,7 @@ import numpy as np
 from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, on_cores
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import lasting, plural, shortlist
-from uncertain_lti.identification.memory import as_text, of_text
+from uncertain_lti.identification.memory import DAMAGED, as_text, of_text
 from uncertain_lti.model.alarm_rule import JOINT, Rule, StatisticRule
 from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -135,7 +135,7 @@ class Evidence:
             found: dict[str, Any] = {each.name: of_text(data[each.name]) for each in fields(cls)}
             numbers = {each.name: found[each.name].item() for each in fields(cls) if each.type == "float"}
         except (TypeError, ValueError, KeyError):
-            raise FitError("field 'memory' of the model file is damaged; fit again with all recordings") from None
+            raise FitError(DAMAGED) from None
         return cls(**found | numbers)
 
     def thresholds(self, rules: Sequence[StatisticRule], n: int, what: str) -> list[Array]:
