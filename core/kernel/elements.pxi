@@ -10,7 +10,7 @@
 """Elements of a model in the layout that the sums walk, and the blocks of a schedule that hold at a sample."""
 
 cdef enum:
-    _TOGETHER = 256  # samples whose sums are taken side by side: they stay in the cache
+    _TOGETHER = 112  # samples whose sums are taken side by side: they stay in the cache, as columns a power of two apart do not
     _CORNERS = 4  # blocks that hold at a time, at most
 
 cdef array_of_doubles = array("d")
