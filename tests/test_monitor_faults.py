@@ -16,6 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,6 +37,7 @@ from uncertain_lti.monitor.verdict import Verdict
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 import test_node_stream as stream_cases
+from geometry_msgs.msg import TwistStamped
 from processes import own_domain
 from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -626,6 +628,26 @@ def test_the_type_of_the_enable_topic_follows_its_publishers_and_their_absence_i
     path = str(saved(model, tmp_path))
     assert world.set(model=path, enable="/machine/mod data == 3") == (True, nobody)
     assert world.set(model=path, enable="") == (True, "")
+
+
+def test_the_type_of_a_topic_may_change_while_the_node_runs(world: World, tmp_path: Path) -> None:
+    """Of the enable condition as the user corrects it, and of a control with the next model."""
+    model = by_hand()
+    world.monitor(saved(model, tmp_path))
+    mode = world.publisher(UInt8, "/machine/mode", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
+    mode.publish(UInt8(data=3))
+    for name in ("Int32", "UInt8"):
+        assert world.set(enable="/machine/mode data == 3", enable_type=f"std_msgs/msg/{name}") == (True, "")
+    until(lambda: world.status()["armed"], "the mode")
+    fields = zip(model.signals.controls, ("twist.linear.x", "twist.linear.y"), strict=True)
+    controls = tuple(replace(signal, type="geometry_msgs/msg/TwistStamped", field=field) for signal, field in fields)
+    other = saved(model.replace(signals=replace(model.signals, controls=controls)), tmp_path, "other")
+    assert world.set(model=str(other))[0]
+    control = world.publisher(TwistStamped, CONTROL)
+    world.subscribed(control)
+    control.publish(TwistStamped())
+    until(lambda: world.status()["received"].get(CONTROL) == 1, "a control of the other type")
+    assert world.status()["unexpected_errors"] == 0
 
 
 def test_a_second_node_of_the_same_name_is_told(world: World, tmp_path: Path) -> None:

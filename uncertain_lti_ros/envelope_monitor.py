@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import gc
 import json
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
@@ -35,6 +36,7 @@ from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.outputs import VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
+from uncertain_lti.signals.field_path import full_name
 from uncertain_lti.signals.signal_map import below
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
@@ -186,8 +188,8 @@ class EnvelopeMonitorNode(LifecycleNode):
             self._event_log.turned(self.session, (), time.monotonic(), ", as its rule has changed")
             self.get_logger().info(self.session.whole_rule_text())
             if self.active:
-                self.subscribe()
                 self._find_enable_type()
+                self.subscribe()
                 if self._enable_problem:
                     self.get_logger().warning(self._enable_problem)
         elif isinstance(candidate, Session) and self.session is not None:
@@ -204,8 +206,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.outputs.prepare(session)
         self.snapshots.clear()
         if self.active:
-            self.subscribe()
             self._find_enable_type()
+            self.subscribe()
         name = Path(self.settings["model"]).name
         self.get_logger().info(f"model swapped: {name}: {session.model}; {session.whole_rule_text()}")
         self._event_log.begin(session, time.monotonic())
@@ -330,14 +332,18 @@ class EnvelopeMonitorNode(LifecycleNode):
     # --- messages ---
 
     def subscribe(self) -> None:
-        """Subscribe to exactly the topics needed; existing subscriptions to them are kept."""
+        """Subscribe to exactly the topics needed; existing subscriptions to them are kept.
+
+        The middleware takes no other type before it has let go of the former subscription; the next look does that.
+        """
         assert self.session is not None
-        types = self.session.types
-        for topic in list(self.inputs):
-            if self.inputs[topic].type_name != types.get(topic):
-                self.inputs.pop(topic).destroy()
+        types = {topic: full_name(name) for topic, name in self.session.types.items()}
+        former = [topic for topic, subscription in self.inputs.items() if subscription.type_name != types.get(topic)]
+        for topic in former:
+            self.inputs.pop(topic).destroy()
+            self._looked = -math.inf
         requested = self.settings.requested_qos()
-        for topic in [topic for topic in types if topic not in self.inputs]:
+        for topic in [topic for topic in types if topic not in (*self.inputs, *former)]:
             take = partial(self.intake.message, topic)
             self.inputs[topic] = MatchedSubscription(self, self._there(topic), types[topic], take, requested)
 
@@ -400,6 +406,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.outputs.look()
         self._twin = self.count_publishers(f"~/{VIOLATION.name}") > 1
         self._find_enable_type()
+        if self.active:
+            self.subscribe()
 
     def _find_enable_type(self) -> None:
         session = self.session
@@ -418,11 +426,6 @@ class EnvelopeMonitorNode(LifecycleNode):
             except UncertainLTIError as error:
                 self._enable_problem = f"parameter enable: {error}"
                 return
-            if (former := self.inputs.pop(topic, None)) is not None:
-                former.destroy()
-                return  # the middleware takes no other type before it has let go of the former subscription
-        if session.enable_type and topic not in self.inputs:
-            self.subscribe()
         if why := session.why_no_condition():
             self._enable_problem = f"parameter enable: {why}"
 
