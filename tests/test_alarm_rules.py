@@ -66,6 +66,7 @@ def test_the_containment_rule_is_replaced_among_the_others() -> None:
         ([], "0 rules; an alarm has 1 to"),
         ([AlarmRule(), AlarmRule(2, 2)], "two containment rules for one step"),
         ([StatisticRule("mean", 1.0, 1.0, horizon=3)], "mean is at 3 steps, and the model has bounds over 1, 4"),
+        (["mean"], "alarm: a rule is of type str; give AlarmRule or StatisticRule"),
         ([StatisticRule("mean", 1.0, (1.0,) * 3)], "mean has 3 thresholds for 2 states"),
     ],
 )

@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refuses
 
+import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
 from uncertain_lti.identification import fit, fleet, passes, programmes, solvers, working_set
@@ -341,6 +342,8 @@ def test_wrong_options_are_refused():
         (dict(weights=[np.ones((49, 2))]), r"must be \(50, 2\)"),
         (dict(weights=np.array([1.0, 1j])), "not arrays of real numbers"),
         (dict(operating_point=OperatingPoint.identity(3, 1)), "3 states"),
+        (dict(operating_point=(0.0, 0.0, 1.0, 1.0)), "OperatingPoint is of type tuple; give one"),
+        (dict(structure={"a": 0.0}), "Structure is of type dict; give one"),
         *((dict(additive="noise", discard=budget), "discard is") for budget in (-1, 1.5, np.nan, True)),
     ]
     for options, words in cases:
@@ -348,6 +351,8 @@ def test_wrong_options_are_refused():
     refuses(FitError, "no transients", fit, [])
     other = Transient(transient.t_ns, transient.x, transient.u, state_names=["a", "b"])
     refuses(FitError, "read all recordings with one signals file", fit, [transient, other])
+    fewer = Transient(transient.t_ns, transient.x[:, :1], transient.u)
+    refuses(FitError, "read all recordings with one signals file", uncertain_lti.fit, [transient, fewer])
 
 
 @pytest.mark.parametrize("size", [1e-60, 1e-158, 1e-200])

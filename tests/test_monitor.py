@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refuses
 from steps import steps_of
 from test_model import random_model
 from test_transient import runs
@@ -216,6 +217,10 @@ def test_a_transient_of_other_size_is_refused() -> None:
     transient = Transient([0.0, 1.0], np.zeros((2, 2)), np.zeros((2, 1)), name="run")
     with pytest.raises(ModelError, match="run: 2 states and 1 control, and the model has 1 and 0"):
         EnvelopeMonitor(scalar()).check(transient)
+    monitor = EnvelopeMonitor(a_model(2, 1, 7))
+    transient = transient.replace(state_names=["x1", "x0"])  # by their places one would be judged as the other
+    refuses(ModelError, "run has x1, x0, the model x0, x1; give them in the order", monitor.check, transient)
+    refuses(ModelError, r"have shapes \[\(1,\), .*; the model takes \[\(2,\)", monitor.predict, [1.0], [1.0], 0.1)
 
 
 def test_a_transient_without_samples_has_no_verdict() -> None:

@@ -60,6 +60,7 @@ def test_normalisation_is_as_method_section_1_states_it(data: st.DataObject) -> 
         (([0.0, 1.0], [], [1.0], []), "x_s and X differ in length"),
         (([0.0], [1.0], [1.0], []), "u_s and U differ in length"),
         (([[0.0]], [], [[1.0]], []), "x_s must be a vector"),
+        ((["a"], [], [1.0], []), "x_s must be a vector of real numbers"),
     ],
 )
 def test_a_wrong_operating_point_is_refused(arguments: tuple[list[float], ...], words: str) -> None:

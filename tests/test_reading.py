@@ -466,16 +466,22 @@ def test_a_judged_control_is_read_as_the_control_that_it_is(tmp_path: Path) -> N
     assert again.x.tobytes() == read.x.tobytes() and again.signals.states[1].judged
 
 
-@pytest.mark.parametrize("one_topic", [True, False])
-def test_controls_at_the_arrival_are_read_as_they_are_taken_of_a_recording(one_topic: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("topics", "known"), [(1, 29), (2, 28), (3, 28)])
+def test_controls_at_the_arrival_are_read_as_they_are_taken_of_a_recording(
+    topics: int, known: int, tmp_path: Path
+) -> None:
     """What `Transient.controls_at` makes of a recording is what a signals file says, live and offline."""
-    if one_topic:
+    if topics == 1:
         path = tmp_path / "run.csv"
         path.write_text("t,x,u\n" + "".join(f"{0.1 * k:.1f},{k * k % 7},{k % 5}\n" for k in range(30)))
         signals = SignalMap((Signal("x", "/table", "x"),), (Signal("u", "/table", "u"),))
     else:
         path = float_bag(tmp_path, "a.mcap", range(0, 3000 * MS, 100 * MS), range(0, 3000 * MS, 70 * MS))
         signals = XU
+    if topics == 3:
+        every = [(topic, k * 10 * MS, float64(k % 7)) for k in range(30) for topic in ("/x", "/y", "/u")]
+        path = save(tmp_path, dict.fromkeys(("/x", "/y", "/u"), FLOAT64), every)
+        signals = replace(XU, states=(*XU.states, Signal("y", "/y", "data")))
     (plain,) = read_transients(path, signals)
     at_both = replace(signals, controls=tuple(replace(c, at="both") for c in signals.controls))
     (read,) = read_transients(path, at_both)
@@ -483,7 +489,7 @@ def test_controls_at_the_arrival_are_read_as_they_are_taken_of_a_recording(one_t
     assert taken.signals == read.signals and taken.control_names == read.control_names == ("u", "u at arrival")
     for name in ("k", "dt", "x", "u", "x_next"):
         assert getattr(taken.transitions(), name).tobytes() == getattr(read.transitions(), name).tobytes()
-    assert len(read.transitions().k) == (29 if one_topic else 28), "one more sample decides the last"
+    assert len(read.transitions().k) == known, "one more sample decides the last, unless it is all of one topic"
 
 
 def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:

@@ -501,7 +501,7 @@ def loops(draw: st.DrawFn) -> tuple[SignalMap, list[Sent]]:
 @settings(max_examples=80)
 @given(cases() | cases(tame=True) | loops())
 def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[Sent]]) -> None:
-    """Samples, which message decided each of them, and counts; the last sample has what it knows of itself."""
+    """Samples, which message decided each, and counts; the last sample of a pass has what it knows of itself."""
     signals, messages = case
     topics, n = signals.topics, len(signals.states)
     of = np.array([topics.index(m.topic) for m in messages], dtype=np.int64)
@@ -513,19 +513,28 @@ def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[
     ]
     all_of_them = Sampler(signals)
     (t_ns, x, u), decisions = all_of_them.push_all(of, arrival, stamp, values)
-    each, sampler = run(signals, messages)
+    sampler, each, opened = Sampler(signals), list[list[Step]](), list[list[float]]()
+    for message in messages:
+        each.append(sampler.push(*message))
+        opened += [sampler.latest()[1] for step in each[-1] if not step.status.dropped]
     clock = np.cumsum(of == topics.index(signals.clock)) - 1
     decided = zip(messages, each, clock.tolist(), strict=True)
     expected = [(m.arrival, s.t_ns, s.status.dropped, at) for m, steps, at in decided for s in steps]
     assert list(zip(*(row.tolist() for row in decisions), strict=True)) == expected
     made = [s for s in only(each) if not s.status.dropped]
     assert (t_ns.tolist(), x.tobytes()) == ([s.t_ns for s in made], np.array([s.after for s in made]).tobytes())
-    assert u[:-1].tobytes() == np.array([s.before[n:] for s in made[1:]]).tobytes()
     assert all_of_them.counters == sampler.counters
-    for i in range(n, len(signals)) if made else ():
-        signal, known = signals[i], signals.decided_at_once and i in signals.on(signals.clock)
-        plainly = known and signal.at == "departure" and not signal.delay and signal.memory is None
-        np.testing.assert_equal(u[-1, i - n], sampler.latest()[1][i] if plainly else NAN)
+    if not made:
+        return
+    later = max(max(m.arrival, m.stamp or 0) for m in messages) + TICK
+    (ended,) = sampler.push(signals.clock, later, later, (0.0,) * len(signals.on(signals.clock)))
+    for i in range(n, len(signals)):
+        signal, column = signals[i], [step.before[i] for step in [*made[1:], ended]]
+        if signal.at != "departure" or signal.delay or signal.memory is not None:
+            column[-1] = NAN
+        elif signals.decided_at_once:
+            column = [z[i] for z in opened] if i in signals.on(signals.clock) else [*column[:-1], NAN]
+        np.testing.assert_equal(u[:, i - n], column)
 
 
 def test_an_angle_that_needs_no_turn_loses_only_the_sign_of_its_zero() -> None:

@@ -57,6 +57,13 @@ def test_a_model_that_is_not_worth_having_is_not_sent_to_the_robot(folder, capsy
     assert printed.splitlines()[-1].startswith("not on the robot yet: mend what is said above, in rare.yaml or by")
 
 
+def test_a_name_that_begins_as_an_option_does_is_handed_on(folder, cli):
+    (folder / HEALTHY[0]).rename("-run.mcap")
+    printed = cli("init", "--output=-s.yaml", "--", "-run.mcap").out
+    assert "  uncertain-lti fit ./-run.mcap --signals ./-s.yaml" in printed
+    assert cli("start", "--output=-s", "--quiet", "--", "-run.mcap").out == "" and (folder / "-s.html").exists()
+
+
 def test_an_edited_signals_file_is_used_as_it_is(folder, cli):
     assert cli("start", *HEALTHY, "--output", "m", "--quiet").out == ""
     text = (folder / "m.yaml").read_text()

@@ -244,6 +244,12 @@ def test_a_data_frame_gives_what_its_arrays_give(run: tuple[Any, ...]) -> None:
         assert (got.state_names, got.control_names) == (tuple(states), tuple(controls))
 
 
+def test_masked_values_are_nan() -> None:
+    """As netCDF files give them; what lies under a mask is any number."""
+    masked = np.ma.masked_greater([[1.0], [1e20]], 9.0)
+    np.testing.assert_array_equal(Transient([0.0, 1.0], masked, masked.astype(int)).x, [[1.0], [NAN]])
+
+
 def test_missing_values_of_any_kind_are_nan(pd: Any) -> None:
     frame = pd.DataFrame({"a": pd.array([1.0, None], dtype="Float64"), "b": pd.array([None, 2], dtype="Int64")})
     transient = Transient.from_dataframe(frame, states=["a", "b"], controls=[])

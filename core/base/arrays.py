@@ -33,9 +33,11 @@ Mask = NDArray[np.bool_]
 
 
 def real(values: Any) -> Array:
-    """A copy as real numbers; TypeError for complex ones, whose imaginary part numpy would drop."""
+    """A copy as real numbers, NaN where masked; TypeError for complex ones, whose imaginary part numpy would drop."""
     if np.iscomplexobj(values):
         raise TypeError("complex numbers")
+    if isinstance(values, np.ma.MaskedArray):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
     return np.array(values, dtype=np.float64)
 
 

@@ -97,6 +97,11 @@ def _time(text: str) -> float:
     return seconds
 
 
+def _file(text: str) -> str:
+    """A path that no command which it is handed on to takes for an option."""
+    return f"./{text}" if text.startswith("-") else text
+
+
 def _takes(text: str, metavar: str | None = None, **more: Any) -> dict[str, Any]:
     return {"help": text, "metavar": metavar, **more}
 
@@ -106,21 +111,21 @@ def _flag(text: str) -> dict[str, Any]:
 
 
 OPTIONS: dict[str, dict[str, Any]] = {
-    "model": _takes("model file", "MODEL"),
-    "bag": _takes("recording (MCAP, .db3, .bag, table), or folder of one", "BAG"),
-    "bags": _takes(RECORDINGS, "BAG", nargs="+"),
+    "model": _takes("model file", "MODEL", type=_file),
+    "bag": _takes("recording (MCAP, .db3, .bag, table), or folder of one", "BAG", type=_file),
+    "bags": _takes(RECORDINGS, "BAG", nargs="+", type=_file),
     "shell": _takes(
         'whose; for this session: eval "$(uncertain-lti completion bash)", for each one: put that into ~/.bashrc '
         "or ~/.zshrc",
         choices=("bash", "zsh"),
     ),
-    "--signals": _takes("signals file (YAML): which field is which signal", "FILE", required=True),
+    "--signals": _takes("signals file (YAML): which field is which signal", "FILE", required=True, type=_file),
     "--update": _takes(
         "fit to what this model was fitted to and to these recordings, without the former; it keeps its signals, "
         "criterion and terms",
         "MODEL",
     ),
-    "--output": _takes("model file to write (*.model.json)", "MODEL"),
+    "--output": _takes("model file to write (*.model.json)", "MODEL", type=_file),
     "--force": _flag("write over a model that is there already"),
     "--json": _flag("print JSON"),
     # how to fit

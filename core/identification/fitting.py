@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_cores, one_thread_each, return_memory
-from uncertain_lti.base.errors import FitError, SignalError
+from uncertain_lti.base.errors import FitError, SignalError, refuse_other
 from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.assembly import assemble, median_step
 from uncertain_lti.identification.diagnosis import describe
@@ -89,6 +89,9 @@ def fit(
         raise FitError("method cvxpy states one step; leave horizons out, or use the working-set method")
     if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
         raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
+    for given, kind in ((operating_point, OperatingPoint), (structure, Structure)):
+        if given is not None:
+            refuse_other(given, kind, kind.__name__, f"give one, as {kind.__name__}(...) makes it", FitError)
     signals = common_signals(transients)
     schedule = asked_by(signals) if schedule is None else schedule
     on = signals_of(schedule, [s.name for s in signals.signals])

@@ -17,7 +17,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from uncertain_lti.base.arrays import LARGEST, LONGEST_S
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.horizon import MOST_STEPS
 from uncertain_lti.model.terms import is_number, is_whole, object_of
@@ -205,6 +205,8 @@ def with_containment(rules: Sequence[Rule], rule: AlarmRule) -> tuple[Rule, ...]
 def checked_rules(rules: Sequence[Rule]) -> tuple[Rule, ...]:
     """The rules of one alarm."""
     rules = tuple(rules)
+    for rule in rules:
+        refuse_other(rule, (AlarmRule, StatisticRule), "alarm: a rule", "give AlarmRule or StatisticRule", ModelError)
     if not 1 <= len(rules) <= MOST_RULES:
         raise ModelError(f"alarm: {plural(len(rules), 'rule')}; an alarm has 1 to {MOST_RULES}")
     if sum(isinstance(rule, AlarmRule) and rule.horizon == 1 for rule in rules) > 1:

@@ -96,6 +96,11 @@ class Envelope(Elements):
                 f"and {self.m}; of further scheduling signals it has {further}, and the model {self.q}; read it with "
                 f"the signals of the model"
             )
+        for theirs, of in ((own.state_names, self.signals.states), (own.control_names, self.signals.controls)):
+            ours = tuple(signal.name for signal in of)
+            if theirs != ours and sorted(theirs) == sorted(ours):
+                has = f"{own.name} has {', '.join(theirs)}, the model {', '.join(ours)}"
+                raise ModelError(f"{has}; give them in the order of the model")
         return own
 
     def normalised_columns(self, steps: Transitions) -> Array:

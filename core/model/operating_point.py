@@ -81,7 +81,7 @@ class OperatingPoint:
         for name in ("x_s", "u_s", "X", "U", "s_s", "S"):
             try:
                 value = np.atleast_1d(real(getattr(self, name)))
-            except TypeError:
+            except (TypeError, ValueError):
                 raise TransientError(f"operating point: {name} must be a vector of real numbers") from None
             value.flags.writeable = False
             object.__setattr__(self, name, value)

@@ -201,9 +201,17 @@ class EnvelopeMonitor:
             Lower bound; NaN for a mode that the model does not list.
         array (n,)
             Upper bound.
+
+        Raises
+        ------
+        ModelError
+            x, u or s has another length.
         """
-        z = np.concatenate([np.asarray(a, dtype=np.float64) for a in (x, u, s)])
-        verdict = self.expect(0, z.tolist(), dt)
+        given = [np.asarray(a, dtype=np.float64) for a in (x, u, s)]
+        shapes, own = [a.shape for a in given], [(count,) for count in (self.model.n, self.model.m, self.model.q)]
+        if shapes != own:
+            raise ModelError(f"x, u and s have shapes {shapes}; the model takes {own}")
+        verdict = self.expect(0, np.concatenate(given).tolist(), dt)
         return verdict.lower, verdict.upper
 
     def expect(self, t_ns: int, z: Sequence[float], dt: float) -> Verdict:

@@ -152,6 +152,7 @@ def fit(
     transients = listed_transients(transients)
     if not transients:
         raise FitError("no transients; give at least one recording")
+    fitting.common_signals(transients)
     if criterion is not None:
         check_criterion(criterion)
     _check_alarm(alarm, false_alarms)

@@ -35,7 +35,7 @@ from uncertain_lti.proposal.candidates import size_of
 from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of, thinned
 from uncertain_lti.sampling.clock import longest_step
-from uncertain_lti.sampling.transient import Transient, controls_as
+from uncertain_lti.sampling.transient import Transient, controls_as, listed_transients
 from uncertain_lti.signals.field_path import Memory
 from uncertain_lti.signals.signal_map import Signal, with_rules
 from uncertain_lti.signals.values import Additive
@@ -319,7 +319,7 @@ def tune(
     FitError
         The budget is not positive, or `fit` alone cannot learn a panel.
     """
-    transients = [transients] if isinstance(transients, Transient) else list(transients)
+    transients = listed_transients(transients)
     if not budget > 0:
         raise FitError(f"budget is {budget}; give a positive number of seconds")
     until = time.monotonic() + budget

@@ -136,7 +136,7 @@ cdef class Sampler:
     cdef Topic clock_topic
     cdef bint at_once  # the clock message carries all that the step to it needs
     cdef list at_end  # places of the controls that act as they are at the end of a step
-    cdef list of_last  # places of the controls that the last sample has, although it is not closed
+    cdef list of_last  # places of the controls that the last sample of a pass has, whatever comes
     cdef double period  # s; 0 where Δt is that of the stamps
     cdef object _counters
     cdef Py_ssize_t samples, gaps, resets, missing
@@ -174,9 +174,9 @@ cdef class Sampler:
         self.clock_topic = self.topics[self._places[self.clock]]
         self.others = [topic for topic in self.topics if topic is not self.clock_topic]
         self.at_once, self.at_end = signals.decided_at_once, list(signals.arrivals)
-        held = [i for i in signals.on(signals.clock) if i >= self.n] if self.at_once else []
+        held = signals.on(signals.clock) if self.at_once else range(self.total)
         self.of_last = [
-            i for i in held if signals[i].at == "departure" and not signals[i].delay and not signals[i].memory
+            i for i in held if i >= self.n and signals[i].at == "departure" and not signals[i].delay and not signals[i].memory
         ]
         self.memories = []
         for i, signal in enumerate(signals):
@@ -303,14 +303,18 @@ cdef class Sampler:
                 continue
             for i in range(held if row >= 0 else 0):  # fixed only now that the next sample has arrived
                 controls[row, i] = self.departure[n + i]
+            if self.at_once and row >= 0 and self.status == _RESET:
+                for i in self.of_last:
+                    controls[row, i - n] = self.before[i]
             row += 1
             instants[row] = self.t_ns
             for i in range(n):
                 states[row, i] = self.arrival[i]
         if row >= 0 and self.of_last:
-            self.fix(False, False)
-            for i in self.of_last:
-                controls[row, i - n] = self.z[i]
+            if self.at_once:
+                self.fix(False, False)
+            for i in self.of_last if self.at_once or self.open_status != _RESET else ():
+                controls[row, i - n] = self.z[i] if self.at_once else self.before[i]
         return (t_ns[: row + 1], x[: row + 1], u[: row + 1]), (came[:number], when[:number], gone[:number], by[:number])
 
     cdef bint take(self, Py_ssize_t place, Message* message) except -1:

@@ -229,8 +229,8 @@ class Panel:
                 room = evidence.factor * size * math.sqrt(max(round(rule.window_s / evidence.dt), 1))
                 unit = usual if residuals.relative else model.operating_point.X
                 certain = np.linalg.norm(residuals.whitening(np.ones(n, dtype=bool)), axis=0)
-                known = certain > 0.0
-                biases[known] = np.minimum(biases, unit * room / np.maximum(certain, 1e-300))[known]
+                with np.errstate(all="ignore"):  # no limit for a state that it says nothing of
+                    biases = np.fmin(biases, unit * room / certain)
         figure = float(np.exp(np.log(np.maximum(median * window, 1e-300)).mean()))
         learnt, limit = evidence.learnt(rules, what), _limit(evidence, len(rules))
         return cls(learnt, limit, what, biases, figure, evidence, tuple(unlike), asked, residuals)
