@@ -360,6 +360,17 @@ def test_the_number_of_a_picture_is_no_state_and_a_coarse_reading_no_switch(tmp_
     assert "frame_id: grows as a clock or a counter does" in proposal.text
 
 
+def test_an_altitude_that_is_held_is_measured(tmp_path):
+    """It was a copter's control by correlation, with which nothing could be wrong."""
+    rng, yaw, rows = np.random.default_rng(4), 0.0, []
+    for k, altitude in enumerate(np.repeat(rng.normal(size=60).round(2), 10).tolist()):
+        rows.append([0.1 * k, f"{yaw:.4f}", altitude])
+        yaw += 0.1 * (altitude - yaw) + 0.01 * rng.normal()
+    for name, control in (("altitude_m", []), ("offset_m", [("/table", "offset_m")])):
+        found = propose([csv(tmp_path / f"{name}.csv", ["time", "yaw", name], rows)])
+        assert signals_of(found)[1] == control, found.text
+
+
 def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_told_and_no_signals(tmp_path):
     """Of an engine's log at two rates no transition was left, and its gearbox was the command, which stood still."""
     rng, rows, speed = np.random.default_rng(6), [], 1000.0

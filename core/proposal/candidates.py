@@ -360,7 +360,7 @@ _FORCE, _ESC = re.compile(r"thrust.*_(g|gf|kgf?|k?n|lbf?)$"), re.compile(r"throt
 _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 _TOLD = re.compile(
-    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
+    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|alt(itude)?|heading|height|humidity|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
 )
 """Likewise, of what is measured or reckoned, in the names of columns."""
 
