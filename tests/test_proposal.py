@@ -251,6 +251,8 @@ def test_what_is_desired_is_a_reference(column, role):
         ("ESC_signal_µs Servo_1_us loop_us pump_duty", "ESC_signal_µs Servo_1_us pump_duty"),
         ("ESC_signal_µs Thrust_gf", "ESC_signal_µs"), ("Thrust_N Speed", "Thrust_N"), ("pwm thrust", "pwm thrust"),
         ("Pos_AccPedal drive_axle_speed DE_drive_end drive_cmd", "Pos_AccPedal drive_cmd"),
+        ("pitch_input pitch_setpoint fin_output", "fin_output"), ("Input Setpoint Output", "Output"),
+        ("setpoint error temperature output", "output"), ("input output", "input"), ("setpoint output", ""),
         ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
@@ -343,6 +345,30 @@ def test_a_reading_that_flickers_is_no_switch_and_a_demand_a_command(tmp_path):
     proposal = propose([path])
     assert signals_of(proposal)[1] == [("/table", "I_req")], proposal.text
     assert "way: grows as a clock or a counter does" in proposal.text  # of three digits
+
+
+def test_the_number_of_a_picture_is_no_state_and_a_coarse_reading_no_switch(tmp_path):
+    """A camera's frame was a state, and the humidity in whole percent a control, so that a fault of it was none."""
+    rng, x, rows = np.random.default_rng(2), 0.0, []
+    for k in range(600):
+        rows.append([60 * k, k // 3, f"{x:.3f}", 50 + round(2 * math.sin(k / 40)), 20 + k // 50 % 3])
+        x += 0.1 * (rows[-1][4] - 20 - x) + 0.01 * rng.normal()
+    path = csv(tmp_path / "a.csv", ["time", "frame_id", "Temp", "Humidity", "fan_stage"], rows)
+    proposal = propose([path])
+    assert signals_of(proposal)[1] == [("/table", "fan_stage")], proposal.text
+    assert [c.path for c in proposal.states] == ["Temp", "Humidity"]
+    assert "frame_id: grows as a clock or a counter does" in proposal.text
+
+
+def test_an_altitude_that_is_held_is_measured(tmp_path):
+    """It was a copter's control by correlation, with which nothing could be wrong."""
+    rng, yaw, rows = np.random.default_rng(4), 0.0, []
+    for k, altitude in enumerate(np.repeat(rng.normal(size=60).round(2), 10).tolist()):
+        rows.append([0.1 * k, f"{yaw:.4f}", altitude])
+        yaw += 0.1 * (altitude - yaw) + 0.01 * rng.normal()
+    for name, control in (("altitude_m", []), ("offset_m", [("/table", "offset_m")])):
+        found = propose([csv(tmp_path / f"{name}.csv", ["time", "yaw", name], rows)])
+        assert signals_of(found)[1] == control, found.text
 
 
 def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_told_and_no_signals(tmp_path):

@@ -185,6 +185,18 @@ def test_milliseconds_behind_a_comma_are_of_their_time(names, start, tmp_path):
     assert np.diff(bag.times).tolist() == [10**9 if start else 1_037_000_000] * 8
 
 
+@pytest.mark.parametrize(("names", "by"), [("", " "), ("", ","), ("pos1\tvolt", "\t")])
+def test_the_time_that_a_serial_monitor_writes_before_an_arrow_is_read(names, by, tmp_path):
+    """As Arduino's does: it was part of the first number, and the file refused."""
+    rows = [f"23:59:5{k}.010 -> {by.join([str(k), f'{k}.5'])}{2 * by}"[: None if by == " " else -2] for k in range(9)]
+    path = tmp_path / "a.txt"
+    path.write_text("\r\n".join([f"23:59:50.002 -> {names}"] * bool(names) + rows))
+    bag = open_recording(path)
+    assert np.diff(bag.times).tolist() == 8 * [10**9] and not bag.warnings
+    assert list(bag.columns_by_field) == (names.split() or ["column_2", "column_3"])
+    assert bag.columns_by_field[(names.split() or ["column_3"])[-1]].tolist() == [k + 0.5 for k in range(9)]
+
+
 def test_a_time_of_day_goes_on_after_midnight(tmp_path):
     """It went back by a day: alarms were dated a day before the first sample."""
     seconds = [(86_397 + k) % 86_400 for k in range(9)]
@@ -799,6 +811,17 @@ def test_days_beside_times_of_day_are_theirs(day, clock, tmp_path, capsys):
     assert set(np.diff(bag.times).tolist()) == {60 * 10**9}
     assert bag.warnings[0].startswith(f"{path}: column 'Time': its days are those of column 'Date'")
     assert main(["init", str(path)]) == 0 and "runs:" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("names", ["date,hour,x", "", "logged (txt),since (txt),x"])
+def test_times_of_day_are_found_beside_days_whatever_they_are_called(names, tmp_path):
+    """Of the days alone the rows of each came evenly, and without a header there was no time."""
+    start = datetime(2026, 3, 13, 23)
+    times = [start + timedelta(seconds=20 * k + k % 2) for k in range(400)]
+    form = "%Y-%m-%d %H:%M:%S,2026-03-12 22:00:00" if "txt" in names else "%Y.%m.%d,%H:%M:%S"
+    bag = read_csv(tmp_path, names, [f"{t.strftime(form)},{k % 7}.5" for k, t in enumerate(times)])
+    assert bag.times.tolist() == [np.datetime64(t, "ns").astype(int) for t in times]
+    assert len(bag.warnings) == ("txt" not in names) and "words" not in " ".join(propose([bag.path]).warnings)
 
 
 def test_runs_that_are_named_as_no_file_is(tmp_path):

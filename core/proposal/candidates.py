@@ -360,7 +360,7 @@ _FORCE, _ESC = re.compile(r"thrust.*_(g|gf|kgf?|k?n|lbf?)$"), re.compile(r"throt
 _ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 _TOLD = re.compile(
-    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
+    r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|alt(itude)?|heading|height|humidity|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
 )
 """Likewise, of what is measured or reckoned, in the names of columns."""
 
@@ -425,6 +425,11 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
     if _BODY[0].issubset(beside) and not _BODY[1].isdisjoint(beside):
         if low in _BODY[0] or _EFFECTOR.fullmatch(low):
             return "state" if low in _BODY[0] else "control"
+    loop = {b for b in beside if "setpoint" in b and b.replace("setpoint", "input") in beside}  # of a PID's log
+    if "input" in low and low.replace("input", "setpoint") in loop:
+        return "state"
+    if low.endswith("output") and (loop or {"setpoint", "error"}.issubset(beside)):
+        return "control"
     if _ANSWER.search(low) or (_FORCE.search(low) and any(map(_ESC.search, beside))):
         return "state"
     if _REFERENCE.search(low) or (low == "r" and {"u", "y"}.issubset(beside) and {"v", "x", "p"}.isdisjoint(beside)):

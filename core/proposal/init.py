@@ -59,7 +59,7 @@ from uncertain_lti.proposal.tune import choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
-from uncertain_lti.recordings.table_times import called_time
+from uncertain_lti.recordings.table_times import called_time, may_be
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
@@ -84,7 +84,7 @@ _RUN = re.compile(
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
 _CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
 _TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
-_COUNTER = {"count", "counter", "cycle", "cycles"}  # likewise, of whole numbers
+_COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
@@ -171,7 +171,7 @@ def _in_words(bags: Sequence[Recording], runs: str | None) -> list[str]:
     found: dict[str, set[str]] = {}
     for table in (bag for bag in bags if isinstance(bag, Table)):
         for name, column in table.columns_by_field.items():
-            if column.dtype.kind == "O" and name != runs and not is_label(name):
+            if column.dtype.kind == "O" and name != runs and not is_label(name) and not may_be(column):
                 found.setdefault(name, set()).update(str(cell) for cell in set(column.tolist()) if cell)
     few = {name: sorted(words) for name, words in found.items() if 1 < len(words) <= MOST_WORDS}
     return [f"{name} ({shortlist(words, 3)})" for name, words in few.items()]

@@ -50,6 +50,7 @@ _WIDE = {  # by which of a text's first four bytes are not 0
     b"\1\0\1\0": "utf-16-le", b"\0\1\0\1": "utf-16-be",
 }  # fmt: skip
 _CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
+_ARROW = re.compile(r"(\d\d:\d\d:\d\d\.\d{3}) -> (.*)", re.DOTALL)  # as the serial monitor of Arduino writes a line
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
@@ -91,7 +92,7 @@ def read_table(path: Path) -> RawTable:
 class _Shape:
     """How a CSV file is laid out: its delimiter, the lines before the data, and the names of its columns.
 
-    `cut_times`: whether its commas part milliseconds from their time as well.
+    `mend`: what each line goes through first, where a tool writes times in a way of its own.
     """
 
     delimiter: str
@@ -99,7 +100,7 @@ class _Shape:
     names: tuple[str, ...]
     units: tuple[str, ...] = ()
     note: str = ""
-    cut_times: bool = False
+    mend: Callable[[str], str] | None = None
 
 
 def _read_csv(path: Path) -> RawTable:
@@ -118,9 +119,10 @@ def _read_csv(path: Path) -> RawTable:
     whole, decimals = start.rpartition("\n")[0], [match[2] for match in _CUT_TIME.finditer(start)]
     cut_times = any(three.startswith("0") for three in decimals)  # which numbers do not
     cut_times = cut_times and len(_CUT_TIME.findall(whole)) == len(re.findall(r"\d:\d\d:\d\d", whole))
-    start = _CUT_TIME.sub(r"\1.", start) if cut_times else start
     lines = re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES]
-    shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), cut_times=cut_times)
+    mend = partial(_CUT_TIME.sub, r"\1.") if cut_times else _without_arrow if any(map(_ARROW.match, lines)) else None
+    lines = list(map(mend, lines)) if mend else lines
+    shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), mend=mend)
     names, notes = _unique(shape.names), [shape.note] * bool(shape.note)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
     values = np.empty((0, 0))
@@ -135,6 +137,14 @@ def _read_csv(path: Path) -> RawTable:
     return RawTable(found, notes, exact, units)
 
 
+def _without_arrow(line: str) -> str:
+    """A line with its time as the first cell, or with a name for it above the others' names."""
+    if not (match := _ARROW.match(line)):
+        return line
+    delimiter = next((delimiter for delimiter in _DELIMITERS if delimiter in match[2]), " ")
+    return f"{match[1] if any(map(_is_value, _split(match[2], delimiter))) else 'time'}{delimiter}{match[2]}"
+
+
 def _texts(path: Path, encoding: str, shape: _Shape, names: Sequence[str], name: str) -> Sequence[str]:
     """The cells of one column as they stand, read when they are asked for."""
     where = names.index(name)
@@ -146,7 +156,7 @@ def _rows(path: Path, encoding: str, shape: _Shape) -> Iterator[tuple[int, list[
     with open(path, encoding=encoding, errors="replace", newline="") as text:
         for _ in range(shape.skip):
             text.readline()
-        lines = (_CUT_TIME.sub(r"\1.", line) for line in text) if shape.cut_times else text
+        lines = map(shape.mend, text) if shape.mend else text
         reader = csv.reader(lines, delimiter=shape.delimiter, skipinitialspace=True)
         before = 0
         try:

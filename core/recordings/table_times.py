@@ -140,10 +140,11 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     called = [name for name in called if name not in still and not _of_a_minute(name, table.columns[name])]
     if likely := [name for name in called if may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
-        return called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0], ""
+        taken = called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0]
+        return _clock_beside(table, taken) or taken, ""
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and may_be(table.columns[name])]
-    if len(dated) == 1:
-        return dated[0], ""
+    if len(dated) == 1 or (len(dated) == 2 and dated[0] == names[0]):
+        return _clock_beside(table, dated[0]) or dated[0], ""
     if parts := _of_parts(table):
         return parts, "it is put together of these columns, a day more where it goes back"
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
@@ -214,6 +215,12 @@ def _days_beside(table: RawTable, column: str) -> str:
     first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts}
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
     return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
+
+
+def _clock_beside(table: RawTable, days: str) -> str:
+    """The one column of times of day alone, where this one has the days; else nothing."""
+    clocks = [n for n, c in table.columns.items() if c.dtype.kind == "O" and _days_beside(table, n) == days]
+    return clocks[0] if len(clocks) == 1 else ""
 
 
 def _of_parts(table: RawTable) -> str:
