@@ -1099,6 +1099,8 @@ def test_the_unit_of_a_clock_is_in_its_name_or_asked_for(head, step, seconds, wo
 
 def test_a_clock_whose_rows_are_far_apart_in_no_unit_is_refused_until_its_unit_is_given(tmp_path):
     """Of a quadrotor at 83 rows a second a plant's model was fitted, of a row in three hours."""
+    rows = [f"{17 * k + k % 2},{k % 7}" for k in range(60)]
+    refuses(BagError, "1[68] from row to row: has no unit.*--table unit=ms", read_csv, tmp_path, "t,x", rows)
     rows = [f"{112574307 + 11999 * k + k % 3},{k % 7}" for k in range(60)]
     refuses(BagError, "12000 from row to row: has no unit.*--table unit=us", read_csv, tmp_path, "timestamp,x", rows)
     (bag,) = group_recordings([tmp_path / "a.csv"], layout=TableLayout(unit="us"))

@@ -62,6 +62,7 @@ _LARGEST_ZONE = 14  # hours
 _CALENDARS = (20_000, 80_000, 25_569), (690_000, 800_000, 719_529)  # days of these decades: Excel, MATLAB; 1970-01-01
 _HARDLY = 1e-4  # s from row to row, below which numbers such as days of a spreadsheet hardly are s
 _UNLIKELY = 100, 1000  # s from row to row, not whole minutes, from which on it hardly is in s; the other: since 1970
+_ODD = 10  # the same of those that are no multiple of 5 s, not since 1970
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
 
@@ -117,10 +118,12 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             none = "has no unit, which may be s or days"
             raise BagError(f"{where}: {none}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
         if unit == "s" and not stated and (step := _coarse(values)):
-            doubt, ask = f", {step:.10g} from row to row", "name it time_us or time_ms, or give `--table unit=us`"
-            if step >= _UNLIKELY[_since_1970(float(np.nanmedian(values)))]:
+            doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
+            ask = f"name it time_us or time_ms, or give `--table unit={likely}`"
+            dated = _since_1970(float(np.nanmedian(values)))
+            if step >= _UNLIKELY[dated] or (step >= _ODD and step % 5 and not dated):
                 none = "has no unit, which may be s, ms or us"
-                raise BagError(f"{where}{doubt}: {none}; {ask} (in a signals file `table: {{unit: us}}`)")
+                raise BagError(f"{where}{doubt}: {none}; {ask} (in a signals file `table: {{unit: {likely}}}`)")
             doubt += f": for others {ask}"
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
