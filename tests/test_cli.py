@@ -373,6 +373,7 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, cli):
         (["chek", "m", "b"], "(is check meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--additive", "noies"], "(is noise meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--discard", "abc"], "neither a whole number nor a share"),
+        (["check", "m", ""], "argument BAG: the name is empty"),
         *(
             (["fit", "b", "--signals", "s", "--output", "m", "--schedule", given], said)
             for given, said in (

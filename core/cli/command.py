@@ -98,7 +98,9 @@ def _time(text: str) -> float:
 
 
 def _file(text: str) -> str:
-    """A path that no command which it is handed on to takes for an option."""
+    """A path that no command which it is handed on to takes for an option; an empty one would be this folder."""
+    if not text:
+        raise argparse.ArgumentTypeError("the name is empty, as of a variable of the shell that is not set")
     return f"./{text}" if text.startswith("-") else text
 
 
