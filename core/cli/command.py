@@ -126,6 +126,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "fit to what this model was fitted to and to these recordings, without the former; it keeps its signals, "
         "criterion and terms",
         "MODEL",
+        type=_file,
     ),
     "--output": _takes("model file to write (*.model.json)", "MODEL", type=_file),
     "--force": _flag("write over a model that is there already"),
@@ -188,7 +189,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
     "--workers": _takes("fit on a Dask cluster of N workers on this machine", "N", type=int),
     "--budget": _takes("stop after 90s, 10m or 1h with the best so far", "TIME", type=_time, default=math.inf),
     # how to judge
-    "--rules": _takes(f"alarm: the rules of another model file, or of JSON as its field alarm has them {_OWN}", "FILE"),
+    "--rules": _takes(
+        f"alarm: the rules of another model file, or of JSON as its field alarm has them {_OWN}", "FILE", type=_file
+    ),
     "--violations": _takes(f"alarm: number of violations {_OWN}", type=int),
     "--window": _takes(f"alarm: number of last verdicts they are counted in {_OWN}", type=int),
     "--margin": _takes(f"factor on the half-widths {_OWN}", type=float),
@@ -241,7 +244,9 @@ OPTIONS: dict[str, dict[str, Any]] = {
         nargs="+",
         default=[],
     ),
-    "--check": _takes("recordings to report on (default: those that are fitted)", "BAG", nargs="+", default=[]),
+    "--check": _takes(
+        "recordings to report on (default: those that are fitted)", "BAG", nargs="+", default=[], type=_file
+    ),
     # layouts
     "--foxglove": _takes("for Foxglove and Lichtblick", "FILE.json"),
     "--plotjuggler": _takes("for PlotJuggler", "FILE.xml"),

@@ -214,16 +214,22 @@ def _since_1970(seconds: float) -> bool:
 
 def _days_beside(table: RawTable, column: str) -> str:
     """The one column of days alone, where this one has times of day alone; else nothing."""
-    texts = [(name, cells.tolist()) for name, cells in table.columns.items() if cells.dtype.kind == "O"]
-    first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts}
+    days, clocks = _days_and_clocks(table)
+    return days[0] if len(days) == 1 and column in clocks else ""
+
+
+def _clock_beside(table: RawTable, column: str) -> str:
+    """The one column of times of day alone, where this one alone has days alone; else nothing."""
+    days, clocks = _days_and_clocks(table)
+    return clocks[0] if days == [column] and len(clocks) == 1 else ""
+
+
+def _days_and_clocks(table: RawTable) -> tuple[list[str], list[str]]:
+    """Columns of days alone, and those of times of day alone, by their first cells."""
+    texts = {name: cells for name, cells in table.columns.items() if cells.dtype.kind == "O"}
+    first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts.items()}
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
-    return days[0] if len(days) == 1 and _CLOCK.match(first[column]) else ""
-
-
-def _clock_beside(table: RawTable, days: str) -> str:
-    """The one column of times of day alone, where this one has the days; else nothing."""
-    clocks = [n for n, c in table.columns.items() if c.dtype.kind == "O" and _days_beside(table, n) == days]
-    return clocks[0] if len(clocks) == 1 else ""
+    return days, [name for name, text in first.items() if _CLOCK.match(text)]
 
 
 def _of_parts(table: RawTable) -> str:

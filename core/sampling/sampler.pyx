@@ -310,11 +310,13 @@ cdef class Sampler:
             instants[row] = self.t_ns
             for i in range(n):
                 states[row, i] = self.arrival[i]
-        if row >= 0 and self.of_last:
-            if self.at_once:
-                self.fix(False, False)
-            for i in self.of_last if self.at_once or self.open_status != _RESET else ():
-                controls[row, i - n] = self.z[i] if self.at_once else self.before[i]
+        if row >= 0 and self.at_once:
+            self.fix(False, False)
+            for i in self.of_last:
+                controls[row, i - n] = self.z[i]
+        elif row >= 0 and self.open_status != _RESET:
+            for i in self.of_last:
+                controls[row, i - n] = self.before[i]
         return (t_ns[: row + 1], x[: row + 1], u[: row + 1]), (came[:number], when[:number], gone[:number], by[:number])
 
     cdef bint take(self, Py_ssize_t place, Message* message) except -1:
