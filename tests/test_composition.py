@@ -111,9 +111,13 @@ def test_inputs_under_a_prefix_and_their_enable_condition(world: World, tmp_path
 def test_a_required_monitor_ends_if_its_model_is_wrong_and_a_prefix_is_a_name(world: World, tmp_path: Path) -> None:
     (tmp_path / "wrong.model.json").write_text("{}")
     process = world.run_node("envelope_monitor", {"model": str(tmp_path / "wrong.model.json"), "required": True})
+    rule = {"model": str(saved(by_hand(), tmp_path)), "violations": 3, "window": 1, "required": True}
+    ruled = world.run_node("envelope_monitor", rule, "-r", "__node:=ruled")
     odd = world.run_node("envelope_monitor", {"model": str(saved(by_hand(), tmp_path)), "topic_prefix": "/robot 1"})
-    assert process.wait() == 2
-    assert "not configured" in process.output and "Traceback" not in process.output
+    for ended in (process, ruled):
+        assert ended.wait() == 2
+        assert "not configured" in ended.output and "Traceback" not in ended.output
+        assert "as soon as" not in ended.output, "which it will not be there for"
     odd.says("parameter topic_prefix is '/robot 1'")
 
 

@@ -167,6 +167,9 @@ def test_from_a_time_on_the_condition_is_the_last_that_was_heard(values):
     ("options", "words"),
     [
         (["--masked", "nobody"], "masked state 'nobody' is not in the model"),
+        (["--masked", ","], "masked is ',', which names no state"),
+        (["--write", "out.csv"], "out.csv: is neither a folder nor called *.mcap"),
+        (["--enable", f"{STATE} position[fan_speed] > nan"], "write TOPIC FIELD OPERATOR NUMBER"),
         (["--enable", "mode is 3"], "write TOPIC FIELD OPERATOR NUMBER"),
         (["--enable", "/nowhere data == 3"], "there is no topic /nowhere"),
         (["--enable", f"{STATE} position[fan_sped] > 1"], "there is no 'fan_sped' in the message's names"),

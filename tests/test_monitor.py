@@ -90,13 +90,15 @@ def test_the_alarm_counts_violations_in_its_window_and_only_those_that_count(dat
         assert EnvelopeMonitor(model, margin=0.5, masked=masked).check(transient).alarm[-1] == verdict.alarm
 
 
-def test_masks_are_held_against_the_states() -> None:
+def test_masks_and_rules_are_held_against_the_model() -> None:
     model = a_model(2, 0, 7)
     assert EnvelopeMonitor(model, masked=["x1"]).masked == ("x1",)
     with pytest.raises(ModelError, match="masked state 'x2' is not in the model; its states are x0, x1"):
         EnvelopeMonitor(model, masked=["x2"])
     with pytest.raises(ModelError, match="every state of the model is masked"):
         EnvelopeMonitor(model, masked=["x0", "x1"])
+    with pytest.raises(ModelError, match=r"violations is 1.5 of window 3; it takes whole numbers"):
+        EnvelopeMonitor(model, violations=1.5, window=3)
 
 
 # --- transients with every disorder --------------------------------------------------------------------------

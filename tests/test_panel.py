@@ -18,7 +18,7 @@ from refusals import refuses
 from scipy.special import stdtrit
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification import fitting
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
 from uncertain_lti.model.horizon import Residuals
@@ -355,6 +355,12 @@ def test_a_rare_event_of_one_recording_does_not_silence_the_alarm(runs):
     without = fit([with_switch(run, False) for run in runs], "lp", additive="noise")
     rare = fit([with_switch(run, number == 3) for number, run in enumerate(runs)], "lp", additive="noise")
     assert rare.fit_summary["alarm"]["biases"][1] < 2 * without.fit_summary["alarm"]["biases"][1]
+
+
+def test_a_recording_does_not_vouch_for_itself():
+    one, other = plant(1), plant(2)
+    with pytest.raises(BagError, match="holds the samples of .*; name each recording once"):
+        fit([one, other, one])
 
 
 def test_what_is_not_worth_having_is_said_first():

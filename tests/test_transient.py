@@ -205,6 +205,8 @@ def test_an_empty_run_and_a_single_sample_have_no_transition() -> None:
         ((np.array([2**63, 2**63 + 10**9], np.uint64), [1.0, 2.0], []), {}, "past what 64 bits hold"),
         (([0.0, 1e-9], [1.0, 2.0], []), {}, "steps of 1e-09 s are too short for a nanosecond clock"),
         (([0.0, 1.0], [1.0, 2.0], []), {"max_gap": -1.0}, "max_gap is -1.0; it must be a positive number of seconds"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"max_gap": "1"}, "max_gap is of type str; give a number of seconds"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"signals": "x.yaml"}, "signals is of type str; load_signals reads a file"),
         (([0.0, 1.0], [1.0, 2.0], []), {"min_step": -1.0}, "min_step is -1.0; it must be 0 s or more"),
         (([0.0, 1.0], [1.0, 2.0], []), {"state_names": ["a", "b"]}, "2 names for 1 column of x"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": "ab"}, "give a list, one for each"),

@@ -258,7 +258,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.intake.session = None
             self.reason = str(error) if isinstance(error, UncertainLTIError) else f"unexpected: {error!r}"
             then = "; start the node again with another" if fixed else ""
-            if self._starts_itself and not fixed:
+            if self._starts_itself and not fixed and not self.settings["required"]:
                 then = "; the node starts as soon as its parameters are set right"
             self.get_logger().error(f"not configured: {self.reason}{then}")
             self.report()

@@ -216,6 +216,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "write a copy of the recording with bounds, utilisation and flags on topics of their own; for several "
         "recordings a folder",
         "OUT.mcap",
+        type=_file,
     ),
     # how to validate
     "--blocks": _takes("leave out blocks: their number per recording (a single one: 10)", type=int),

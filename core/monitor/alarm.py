@@ -285,6 +285,8 @@ class Condition:
             word = match["value"].lower()
             value = _WORDS[word] if word in _WORDS else float(word)
             path = FieldPath(match["field"])
+            if value != value:  # NaN compares with nothing
+                raise ValueError
         except (ValueError, SignalError):
             raise ModelError(
                 f"parameter enable is {text!r}; write TOPIC FIELD OPERATOR NUMBER, for example "

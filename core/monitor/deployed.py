@@ -67,7 +67,10 @@ class Rule:
 
 def listed_states(text: str) -> list[str]:
     """Names of states, separated by commas."""
-    return [name.strip() for name in text.split(",") if name.strip()]
+    names = [name.strip() for name in text.split(",") if name.strip()]
+    if text and not names:
+        raise ModelError(f"masked is {text!r}, which names no state; write their names, separated by commas")
+    return names
 
 
 @dataclasses.dataclass(frozen=True)

@@ -48,6 +48,7 @@ def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed) -> list[tuple[int, int]]
 _OK, _RESET = Status.OK, Status.RESET  # an enum looks its members up at each use
 _BEYOND_NS = 2**63 - 1  # later than any instant
 _PIECE = 200_000  # numbers that one thread takes at a time
+Whole = int  # C would make a whole number of an `int` that is none
 
 
 @cython.cclass
@@ -110,8 +111,8 @@ class EnvelopeMonitor:
     def __init__(
         self,
         model: UncertainLTI,
-        violations: int | None = None,
-        window: int | None = None,
+        violations: Whole | None = None,
+        window: Whole | None = None,
         margin: float | None = None,
         masked: Sequence[str] = (),
         rules: Sequence[Rule] | None = None,

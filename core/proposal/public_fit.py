@@ -164,6 +164,8 @@ def fit(
     messages: list[str] = []
     for_controls_as_they_are = (weights, transient_weights, operating_point, structure)
     learns = alarm == "panel" and method == "working-set"
+    if learns:
+        refuse_copies(t for t in transients if isinstance(t, Transient))
     if learns and all(given is None for given in for_controls_as_they_are):
         at, why = choose_ends(transients, groups=groups, **options)
         if why:

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from uncertain_lti import __version__
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.files import sha256, try_to_write, written
+from uncertain_lti.base.files import TABLES, sha256, try_to_write, written
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, VerdictRecords, names_of, text_message
@@ -84,7 +84,7 @@ def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[P
             raise BagError(f"{path}: the folder {path.parent} is not there; make it first")
         try_to_write(path)
         chosen = [path]
-    elif path.exists() and not path.is_dir():
+    elif not path.is_dir() and (path.exists() or path.suffix.lower() in (*SUFFIXES, *TABLES)):
         raise BagError(f"{path}: is neither a folder nor called *.mcap; choose another name")
     else:
         chosen, taken = [], Counter[str]()

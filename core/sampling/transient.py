@@ -16,6 +16,7 @@ import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from numbers import Real
 from typing import Any, Literal
 
 import numpy as np
@@ -171,6 +172,7 @@ class Transient:
         notes: Sequence[str] = (),
     ) -> None:
         self.name = name
+        refuse_other(signals, (SignalMap, type(None)), f"{name}: signals", "load_signals reads a file", TransientError)
         self.signals = signals
         t_ns = nanoseconds(t, name, recorded=signals is not None)
         self.x = matrix(x, len(t_ns), "x", name)
@@ -187,6 +189,8 @@ class Transient:
         self.counters = Counters(counters or {})
         self.sources = tuple(os.fspath(s) for s in sources)
         self.notes = tuple(notes)
+        for what, value in (("max_gap", 1.0 if max_gap is None else max_gap), ("min_step", min_step)):
+            refuse_other(value, Real, f"{name}: {what}", "give a number of seconds", TransientError)
         if max_gap is not None and not (0 < max_gap <= LONGEST_S or max_gap == math.inf):
             must = f"it must be a positive number of seconds up to {LONGEST_S:g}, or inf"
             raise TransientError(f"{name}: max_gap is {max_gap}; {must}")
