@@ -26,7 +26,7 @@ from processes import bounded
 from refusals import refuses
 from test_signals import quaternion
 
-from uncertain_lti import SignalMap, fit, read_transients
+from uncertain_lti import EnvelopeMonitor, SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.proposal import init
@@ -35,6 +35,7 @@ from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose,
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
+from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.signals.field_path import KINDS, FieldPath, Memory
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
@@ -939,9 +940,9 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
     rng = np.random.default_rng(0)
     b = np.repeat(rng.normal(size=(20, 1)), 20, axis=0)  # both in one topic
     table = table_of(tmp_path / "a.csv", {"A": answers(rng, b)[:, 0], "B": b[:, 0], "C": rng.normal(size=len(b))})
-    for more in (["/table:A"], ["/table:*"]):
-        proposal = propose([table], states=more, controls=["/table:B"])
-        assert signals_of(proposal) == ([("/table", "A")], [("/table", "B")])
+    for more in ("A", "*"):  # of which one is noise
+        proposal = propose([table], states=[f"/table:{more}"], controls=["/table:B"])
+        assert signals_of(proposal) == ([("/table", c) for c in more.replace("*", "AC")], [("/table", "B")])
     for asked in ({"states": ["/none"]}, {"controls": ["/other/cmd:date"]}):
         refuses(BagError, "meets nothing that moves", propose, [path], **asked)
 
@@ -1236,6 +1237,26 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     noise = [message for message in model.fit_summary["messages"] if "'Temp' moves like noise" in message]
     assert noise and "leave it out" not in noise[0] and "its level is judged" in noise[0]  # as the proposal has it
     assert "its level is judged, how it moves needs faster rows" in remedies(noise, "noise", "Temp")
+
+
+def test_what_a_fast_table_measures_is_judged_also_where_it_is_noise(tmp_path):
+    """Of a motor on a stand at 10 rows a second the temperatures, which a fault shows in, were left out."""
+
+    def recorded(name, seed, heated=0.0):
+        rng, rows, speed = np.random.default_rng(seed), [], 0.0
+        for k in range(1500):
+            command = 10.0 + 5.0 * (k // 100 % 3)
+            rows.append((k / 10, command, speed + 0.1 * rng.normal(), 60 + 0.3 * rng.normal() + heated * (k > 700)))
+            speed += 0.2 * (command - speed)
+        return csv(tmp_path / name, ["time", "motor_cmd", "speed", "Temp"], rows)
+
+    run = recorded("healthy.csv", 1)
+    proposal = propose([run])
+    assert [c.name for c in proposal.states] == ["speed", "temp"] and "its level is judged" in proposal.text
+    model = fitted([run], proposal)
+    healthy, hot = (read_as_fitted(recorded(f"{h}.csv", 2, h), model.signals) for h in (0.0, 3.0))
+    assert not EnvelopeMonitor(model).check(healthy).alarm.any()
+    assert EnvelopeMonitor(model).check(hot).alarm[702:].any()
 
 
 def test_a_measurement_that_begins_at_0_with_its_command_is_a_state(tmp_path):

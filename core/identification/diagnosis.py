@@ -516,12 +516,10 @@ def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
     moving = np.ptp(problem.z[:, :n], axis=0) > 0
     slow = float(np.median(problem.dt)) * FASTEST >= 1.0
-    remedy = (
-        "its level is judged, how it moves needs faster rows" if slow else "leave it out, or record the machine at work"
-    )
+    more = "how it moves needs faster rows" if slow else "leave it out where that says nothing, or record it at work"
     return {
         i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "
-        f"variance at the next; {remedy}"
+        f"variance at the next; its level is judged, {more}"
         for i in np.flatnonzero(moving & (share < NOISE)).tolist()
     }
 

@@ -98,6 +98,9 @@ def functions(X: Array) -> NDArray[np.bool_]:
     return found
 
 
+_NOISE = "noise"
+
+
 def drop_noise(
     pool: list[Candidate], every: dict[str, Source], used: Sequence[Candidate]
 ) -> tuple[list[Candidate], str]:
@@ -120,7 +123,7 @@ def drop_noise(
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
             told = f"{max(0.0, known):.0%}"
-            candidate.reason = f"noise: one sample predicts {told} of the variance at the next, controls included"
+            candidate.reason = f"{_NOISE}: one sample predicts {told} of the variance at the next, controls included"
             candidate.ready = "state"
     return [c for c in pool if not c.reason], ""
 
@@ -289,6 +292,10 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     drop_idle_controls(steps_of(keep, every, used), used, _driven(keep, every, used, 0)[1:].max(axis=1, initial=0.0))
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
+    levels = [c for c in main.candidates if c.reason.startswith(_NOISE) and main.type == TYPE]  # a table's are measured
+    for candidate in levels[: max(0, states_room.most - len(keep))]:
+        candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
+        keep.append(candidate)
     return keep, doubt
 
 

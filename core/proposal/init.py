@@ -506,7 +506,7 @@ def propose(
     further = ([c for c in ready if c.ready == kind] for kind in ("state", "control"))
     name_signals(*([*some, *more] for some, more in zip((chosen, used), further, strict=True)))
     set_operating_point(chosen, used, sources)
-    for candidate in ready:
+    for candidate in [*ready, *(c for c in chosen if c.why)]:
         set_own_scale(candidate)
     warnings += [doubt] * bool(doubt)
     if not commands:
