@@ -573,12 +573,14 @@ def test_joints_that_come_in_messages_of_their_own_are_named(tmp_path, cli):
 def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     """Nothing before tells of its changes: `fit` said to take away the `judged: true` that `init` wrote."""
     rng, x, rows = np.random.default_rng(0), 0.0, []
+    feeds = np.repeat(rng.uniform(0.2, 1.0, 180), 5).round(4).tolist()
     for k, speed in enumerate(np.repeat(rng.uniform(0.2, 1.0, 15), 60).tolist()):
         valve = 0.5 + 0.1 * (1.0 - x)  # by a controller
-        rows.append((k, f"{speed:.3f}", f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
-        x += 0.2 * (speed + valve - x)
-    proposal = propose([csv(tmp_path / "a.csv", ["time", "Pump_speed_cmd", "Valve_cmd", "Flow"], rows)])
-    assert {c.path: c.judged for c in proposal.controls} == {"Pump_speed_cmd": False, "Valve_cmd": True}
+        rows.append((k, f"{speed:.3f}", feeds[k], f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
+        x += 0.2 * (speed + feeds[k] + valve - x)
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "Pump_speed_cmd", "Feed_cmd", "Valve_cmd", "Flow"], rows)])
+    judged = {c.path: c.judged for c in proposal.controls}
+    assert judged == {"Pump_speed_cmd": False, "Feed_cmd": False, "Valve_cmd": True}
     assert "not judged, as it changes in 1.6% of the rows only" in proposal.text
     assert [c.path for c in proposal.states] == ["Flow"]
     (tmp_path / "s.yaml").write_text(proposal.text)

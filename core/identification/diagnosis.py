@@ -28,6 +28,7 @@ from uncertain_lti.identification.evidence import (
     FASTEST,
     NOISE,
     autocorrelation,
+    held_for,
     lagged_states,
     late_controls,
     lost,
@@ -391,19 +392,14 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     if len(successive(problem)) < 0.5 * problem.N:
         return []
     for i, signal in enumerate(signals[: problem.n]):
-        instants = np.flatnonzero(problem.x_next[:, i] != problem.z[:, i])
-        if not 10 <= len(instants) <= 0.7 * problem.N:
-            continue
-        period = float(np.median(np.diff(instants)))
-        # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
-        even = period * len(instants) > 0.5 * problem.N  # a coarse sensor is new often for a while, and then not at all
-        if period >= 2 and even and len(np.unique(problem.x_next[instants, i])) > 0.5 * len(instants):
+        before, after = problem.z[:, i], problem.x_next[:, i]
+        if rows := held_for(before, after):
             alone = len({other.topic for other in signals}) == 1
             remedy = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
             remedy = "take `judged: true` away" if signal.judged else remedy
             messages.append(
-                f"'{signal.name}' repeats its last value in {1 - len(instants) / problem.N:.0%} of the steps and is "
-                f"new about every {period:.0f} samples: its topic or its sensor is slower than the clock, and its row "
+                f"'{signal.name}' repeats its last value in {np.mean(after == before):.0%} of the steps and is "
+                f"new about every {rows} samples: its topic or its sensor is slower than the clock, and its row "
                 f"is fitted to jumps; {remedy}"
             )
     return messages

@@ -72,6 +72,17 @@ def unexplained(gram: Array, cross: Array, total: Array) -> tuple[Array, NDArray
     return np.asarray(left), np.asarray(keep.sum(axis=-1))
 
 
+def held_for(before: Array, after: Array) -> int:
+    """Samples for which a slower sensor, or who sets it, holds each value of a signal; 0 where it is not held (N,)."""
+    instants = np.flatnonzero(after != before)
+    if not 10 <= len(instants) <= 0.7 * len(after):
+        return 0
+    period = float(np.median(np.diff(instants)))
+    # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
+    even = period * len(instants) > 0.5 * len(after)  # a coarse sensor is new often for a while, and then not at all
+    return round(period) if period >= 2 and even and len(np.unique(after[instants])) > 0.5 * len(instants) else 0
+
+
 def predicted(X: Array, U: Array, after: Array) -> Array:
     """Share of the variance that least squares on [X, U, 1] predicts.
 

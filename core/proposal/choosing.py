@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.identification.evidence import FASTEST, LONGEST_DELAY, NOISE, lags, predicted
+from uncertain_lti.identification.evidence import FASTEST, LONGEST_DELAY, NOISE, held_for, lags, predicted
 from uncertain_lti.proposal.candidates import (
     FAINT,
     FEWEST,
@@ -493,8 +493,8 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.reason = f"answers within a row: the controls of the same row tell {share:.0%} of it"
             candidate.ready = "state"
     for candidate in (c for c in controls if c.judged):
-        moves = np.concatenate([np.diff(v) != 0 for v in candidate.values]).mean()
-        if moves <= RARE:
+        now, after = (np.concatenate([v[side] for v in candidate.values]) for side in (slice(-1), slice(1, None)))
+        if (moves := np.mean(now != after)) <= RARE or held_for(now, after):
             candidate.judged = False
             candidate.why = f"{_BY_NAME}not judged, as it changes in {moves:.1%} of the rows only"
     states = [c for c in free if c not in controls and not c.reason]
