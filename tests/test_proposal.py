@@ -1453,3 +1453,15 @@ def test_a_night_between_two_runs_in_one_file_does_not_make_the_rows_rare(tmp_pa
         x += 0.1 * (u - x) + 0.002 * rng.normal()
     proposal = propose([csv(tmp_path / "a.csv", ["time", "speed", "throttle_cmd"], rows)])
     assert "instants: 10 a second" in proposal.text and "Process data" not in proposal.text
+
+
+def test_motors_at_rest_are_no_missing_numbers(tmp_path):
+    """Of an aircraft a sixth of the verdicts was lost: its throttle was closed, at the 1000 that other servos had."""
+    rng, x, rows = np.random.default_rng(5), 0.0, []
+    for k, u in enumerate(np.repeat(rng.uniform(1500, 1560, 60), 15).tolist()):
+        pwm = [1000] * 4 if k < 200 else [round(u + rng.normal() + n) for n in range(4)]
+        rows.append([f"{0.02 * k:.2f}", f"{x:.5f}", *pwm])
+        x += 0.05 * ((pwm[0] - 1000) / 100 - x) + 0.002 * rng.normal()
+    columns = ["time", "height_m", *(f"servo_output_raw.servo{n}_raw" for n in range(1, 5))]
+    proposal = propose([csv(tmp_path / "a.csv", columns, rows)])
+    assert proposal.controls and "ignore" not in proposal.text

@@ -266,7 +266,8 @@ def _sift(source: Source) -> None:
             c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
-    shared = shared_codes(list(each.values())) if source.type == TYPE else set()
+    measured = source.type == TYPE and source.role != "control"  # a command stands at its least, and no sensor failed
+    shared = shared_codes(list(each.values())) if measured else set()
     for candidate in source.free:
         values = each[id(candidate)]
         found = {*codes(values), *(code for code in shared if (values == code).any())}

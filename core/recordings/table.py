@@ -389,23 +389,26 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
 
 def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
     """Fields and rows of each topic: of a log whose lines are of several messages by turns, those of each message."""
+    one = {TOPIC: (list(columns), np.arange(number))}
     names: dict[bytes, list[str]] = {}  # by where they have a number
     for name, column in columns.items():
         if column.dtype.kind not in "OM":
             there = np.isfinite(column) if column.ndim == 1 else np.ones(number, np.bool_)
+            if there.all() or len(names) > _MOST_KINDS:
+                return one
             names.setdefault(there.tobytes(), []).append(name)
     empty = names.pop(bytes(number), [])
     known = {kind: np.frombuffer(kind, np.bool_) for kind in names}
     rows = {kind: np.count_nonzero(there) for kind, there in known.items()}
     groups: list[list[bytes]] = []
-    for kind in known if len(known) <= _MOST_KINDS and bytes([1]) * number not in known else ():
+    for kind in known:
         shared = {other: np.count_nonzero(known[kind] & known[other]) for group in groups for other in group}
         of = {other for other, both in shared.items() if both >= _SHARED * min(rows[kind], rows[other])}
         tied = [group for group in groups if not of.isdisjoint(group)]
         groups = [group for group in groups if group not in tied] + [[*chain(*tied), kind]]
     rows_of = [np.flatnonzero(np.any([known[kind] for kind in group], axis=0)) for group in groups]
     if sum(1 + np.count_nonzero(np.diff(of) > 1) >= _ROWS_EACH for of in rows_of) < 2:
-        return {TOPIC: (list(columns), np.arange(number))}
+        return one
     fields = [[name for kind in group for name in names[kind]] for group in groups]
     begun = [(commonprefix(group), group[0]) for group in fields]
     fields[0] += empty
