@@ -19,7 +19,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import chain, pairwise, product
-from operator import itemgetter
 from os.path import commonprefix
 from pathlib import Path
 from types import SimpleNamespace
@@ -176,27 +175,27 @@ class Table(Recording):
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Rows, one after the other."""
-        for topic, row in self._in_order(self._require(topics)):
-            numbers = {name: self.columns_by_field[name][row] for name in self._fields[topic]}
-            yield topic, int(self.times[row]), SimpleNamespace(**numbers)
+        wanted = list(dict.fromkeys(self._require(topics)))
+        fields = [{name: self.columns_by_field[name] for name in self._fields[topic]} for topic in wanted]
+        order = zip(*self._in_order(wanted), strict=True)
+        rows = ((k, int(row), {name: c[row] for name, c in fields[k].items()}) for k, row in order)
+        return ((wanted[k], int(self.times[row]), SimpleNamespace(**numbers)) for k, row, numbers in rows)
 
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
         """Numbers at some paths."""
         self._require(topics)
-        nothing, values = np.empty(0, dtype=np.int64), []
+        values = []
         for topic, wanted in zip(topics, paths, strict=True):
             values.append(np.empty((len(self._rows[topic]), len(wanted))))
             for column, path in zip(values[-1].T, wanted, strict=True):
                 column[:] = self._values(topic, path)
-        of = np.concatenate([nothing, *(np.full(len(v), k) for k, v in enumerate(values))])
-        rows = np.concatenate([nothing, *(self._rows[topic] for topic in topics)])
-        order = np.argsort(rows, kind="stable")
+        of, rows = self._in_order(topics)
         if progress is not None:
             for _ in progress(range(len(rows)), len(rows)):
                 pass
-        return Columns(of[order], self.times[rows[order]], np.full(len(rows), -1, dtype=np.int64), values)
+        return Columns(of, self.times[rows], np.full(len(rows), -1, dtype=np.int64), values)
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Rate, gaps and columns."""
@@ -218,10 +217,13 @@ class Table(Recording):
         gap = float(steps.max()) * 1e-9 if len(steps) else None
         return TopicFacts(self.topics[topic], 1e9 / step if step > 0 else None, gap, fields, "none", None)
 
-    def _in_order(self, topics: Iterable[str]) -> list[tuple[str, int]]:
-        """Topics and their rows, as they come in the file."""
-        rows = [(topic, row) for topic in dict.fromkeys(topics) for row in self._rows[topic].tolist()]
-        return sorted(rows, key=itemgetter(1))
+    def _in_order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+        """Position of the topic of each message among some, and its row, as they come in the file."""
+        every = [self._rows[topic] for topic in topics]
+        of = np.repeat(np.arange(len(every), dtype=np.int64), [len(rows) for rows in every])
+        rows = np.concatenate([np.empty(0, dtype=np.intp), *every])
+        order = np.argsort(rows, kind="stable")
+        return of[order], rows[order]
 
     def _values(self, topic: str, path: FieldPath) -> Any:
         """What `FieldPath.read` gives for every row of a topic."""
