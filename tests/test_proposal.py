@@ -1449,3 +1449,42 @@ def test_a_number_below_all_others_of_several_columns_stands_for_no_value(code, 
     walks[rng.random((400, 4)) < 0.05] = code
     found = propose([table_of(tmp_path / "a.csv", dict(zip("abcd", walks.T, strict=True)))])
     assert [state.ignore for state in found.states] == [(code,) if shared else ()] * 4
+
+
+def test_the_outputs_of_an_autopilot_are_controls_and_what_it_is_to_follow_is_none(tmp_path):
+    """Set points of its log were states, and its outputs to the motors measurements."""
+    rng, rows, rate = np.random.default_rng(8), [], 0.0
+    for k, desired in enumerate(np.repeat(rng.uniform(-30, 30, 40), 15).tolist()):
+        output = 1500 + 4 * (desired - rate) + 3 * rng.normal()
+        rows.append([f"{0.1 * k:.3f}", f"{desired:.3f}", f"{rate:.4f}", "", ""])
+        rows.append([f"{0.1 * k + 0.02:.3f}", "", "", f"{output:.1f}", f"{3000 - output + 9 * rng.normal():.1f}"])
+        rate += 0.1 * (0.3 * (output - 1500) - rate) + 0.05 * rng.normal()
+    path = csv(tmp_path / "a.csv", ["timestamp", "RATE.RDes", "RATE.R", "RCOU.C1", "RCOU.C2"], rows)
+    states, controls = signals_of(propose([path]))
+    assert states == [("/table/RATE", "RATE_R")]
+    assert ("/table/RCOU", "RCOU_C1") in controls and {topic for topic, _ in controls} == {"/table/RCOU"}
+    assert [role_of_column(f"SERVO_OUTPUT_RAW_servo{n}_raw") for n in (1, 12)] == ["control"] * 2
+    assert role_of_column("ATT_DesRoll") == role_of_column("RATE_YDes") == "reference"
+    assert role_of_column("Design_flow") == role_of_column("Desk") == "state"
+
+
+def test_a_night_between_two_runs_in_one_file_does_not_make_the_rows_rare(tmp_path):
+    """Ten rows a second with a pause were taken for process data of a row in a quarter of an hour."""
+    rng, x, rows = np.random.default_rng(3), 0.0, []
+    for k, u in enumerate(np.repeat(rng.choice([0.0, 1.0, 2.0], 60), 20).tolist()):
+        rows.append([f"{0.1 * k + 43_200 * (k >= 600):.1f}", f"{x:.5f}", u])
+        x += 0.1 * (u - x) + 0.002 * rng.normal()
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "speed", "throttle_cmd"], rows)])
+    assert "instants: 10 a second" in proposal.text and "Process data" not in proposal.text
+
+
+def test_motors_at_rest_are_no_missing_numbers(tmp_path):
+    """Of an aircraft a sixth of the verdicts was lost: its throttle was closed, at the 1000 that other servos had."""
+    rng, x, rows = np.random.default_rng(5), 0.0, []
+    for k, u in enumerate(np.repeat(rng.uniform(1500, 1560, 60), 15).tolist()):
+        pwm = [1000] * 4 if k < 200 else [round(u + rng.normal() + n) for n in range(4)]
+        rows.append([f"{0.02 * k:.2f}", f"{x:.5f}", *pwm])
+        x += 0.05 * ((pwm[0] - 1000) / 100 - x) + 0.002 * rng.normal()
+    columns = ["time", "height_m", *(f"servo_output_raw.servo{n}_raw" for n in range(1, 5))]
+    proposal = propose([csv(tmp_path / "a.csv", columns, rows)])
+    assert proposal.controls and "ignore" not in proposal.text

@@ -30,6 +30,7 @@ from uncertain_lti.recordings.formats import group_recordings, open_recording
 from uncertain_lti.recordings.table import Table
 from uncertain_lti.recordings.table_files import _of_arrays, read_table
 from uncertain_lti.sampling.reading import refuse_copies
+from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.values import TableLayout
 
 SHIPPED = ROOT / "bags/turbofan_pulses_up_large_noise.mcap"
@@ -1164,3 +1165,35 @@ def test_recordings_that_share_samples_are_told(tmp_path, dated, field, steady):
     notes = [n for t in read_transients(files, signals) for n in t.notes if "count twice" in n]
     assert len(notes) == dated
     assert all(f"100 of its 300 samples are those of {files[1]}" in n and n.startswith(f"{files[0]}") for n in notes)
+
+
+def test_messages_by_turns_in_one_table_are_topics(tmp_path):
+    """What a log of several messages in one table held was told to be filled downwards, and stood between its rows."""
+    rows = []
+    for k in range(100):
+        roll = f"{math.sin(0.1 * k):.6f}"
+        rows += [f"{0.1 * k:.2f},{roll},{k % 7},,,", f"{0.1 * k + 0.03:.2f},,,{1500 + k % 9},,"]
+        rows += [f"{0.1 * k + 0.05:.2f},,,,{12 - 0.01 * k:.2f},"] * (k % 4 == 0)
+    path = write(tmp_path / "a.csv", "timestamp,ATT.Roll,ATT.Pitch,RCOU.C1,BAT.Volt,BAT.Curr", *rows)
+    table = open_recording(path)
+    counts = {topic: info.count for topic, info in table.topics.items()}
+    assert counts == {"/table/ATT": 100, "/table/RCOU": 100, "/table/BAT": 25}
+    assert [fact.rate for fact in table.facts()] == pytest.approx([10.0, 10.0, 2.5])
+    assert "BAT_Curr" in table.facts()[0].fields  # empty all through, and not forgotten
+    paths = [[FieldPath("RCOU_C1")], [FieldPath("ATT_Roll")]]
+    columns = table.columns(["/table/RCOU", "/table/ATT"], paths)
+    assert columns.values[0][:, 0].tolist() == [1500 + k % 9 for k in range(100)]
+    messages = table.messages(["/table/ATT", "/table/RCOU"])
+    in_order = [(int(topic == "/table/ATT"), at) for topic, at, _ in messages]
+    assert in_order == list(zip(columns.topic.tolist(), columns.arrival.tolist(), strict=True))
+    refuses(BagError, "there is no topic /table; it has /table/ATT, /table/RCOU", table.columns, ["/table"], [[]])
+
+
+def test_columns_that_lack_numbers_now_and_then_or_one_after_the_other_are_of_one_topic(tmp_path):
+    rng = np.random.default_rng(1)
+    lost = [",".join([f"{0.1 * k:.1f}", *np.where(rng.random(3) < 0.3, "", "1.5")]) for k in range(300)]
+    halves = [f"{0.1 * k:.1f},{'2.5,,1' if k < 150 else ',3.5,1'}" for k in range(300)]
+    slow = [f"{0.1 * k:.1f},{k % 5},{k % 3},{k if k % 10 == 0 else ''}" for k in range(300)]
+    for number, rows in enumerate((lost, halves, slow)):
+        path = write(tmp_path / f"{number}.csv", "time,a,b,c", *rows)
+        assert list(open_recording(path).topics) == ["/table"]

@@ -128,11 +128,8 @@ class Source:
     @cached_property
     def rate(self) -> float:
         """Messages per second, by the usual step (`usual_step`), 1/s."""
-        runs = [a for a in self.arrival if len(a) > 1]
-        steps = np.concatenate([np.diff(a) for a in runs]) if runs else np.empty(0)
-        span = float(steps[steps > 0].sum())  # of a table, time may step back to another run
-        step, _ = usual_step(float(np.median(steps)), span, len(steps)) if span > 0 else (0.0, False)
-        return 1e9 / step if step > 0 else 0.0
+        steps = np.concatenate([np.zeros(0, np.int64), *map(np.diff, self.arrival)])
+        return 1e9 / step if (step := usual_step(steps)[0]) > 0 else 0.0
 
     def instants(self, clock: Source, number: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Times of this topic's messages and another one's by one clock: stamps where both have them, else arrival.
@@ -340,7 +337,10 @@ def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: 
 _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|pedal|joy|ackermann|trajectory"
 _COMMANDS += "|drive(?!n|_?(train|axle|shaft|wheel|end))"  # parts of a machine are none
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
-_COLUMN = re.compile(r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$)")
+_COLUMN = re.compile(
+    r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
+)
+_DESIRED = re.compile(r"(^|_)(Des[A-Z]|[A-Z]Des$)")  # as the log of an autopilot spells what its controllers follow
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
 _LABEL = re.compile(
     r"(anomal|attack|att_?flag|(?<!de)fault|label|^class$|change_?point|ground_?truth|is_?normal|"
@@ -432,7 +432,8 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
         return "control"
     if _ANSWER.search(low) or (_FORCE.search(low) and any(map(_ESC.search, beside))):
         return "state"
-    if _REFERENCE.search(low) or (low == "r" and {"u", "y"}.issubset(beside) and {"v", "x", "p"}.isdisjoint(beside)):
+    followed = _REFERENCE.search(low) or _DESIRED.search(name)
+    if followed or (low == "r" and {"u", "y"}.issubset(beside) and {"v", "x", "p"}.isdisjoint(beside)):
         return "reference"
     return "control" if _COMMAND.search(low) or _COLUMN.search(low) or _SET.search(name) else "state"
 

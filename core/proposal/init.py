@@ -266,7 +266,8 @@ def _sift(source: Source) -> None:
             c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
-    shared = shared_codes(list(each.values())) if source.type == TYPE else set()
+    measured = source.type == TYPE and source.role != "control"  # a command stands at its least, and no sensor failed
+    shared = shared_codes(list(each.values())) if measured else set()
     for candidate in source.free:
         values = each[id(candidate)]
         found = {*codes(values), *(code for code in shared if (values == code).any())}
@@ -366,7 +367,8 @@ def _drop_computed(sources: Sequence[Source]) -> None:
     some = {c: np.concatenate(c.values)[:: 1 + len(c.values[0]) // 1000] / np.ptp(c.finite) for c in pool if named}
     for candidate in named:
         known = np.isfinite(some[candidate])
-        others = [c for c in pool if c is not candidate and not c.reason and np.isfinite(some[c][known]).all()]
+        others = [c for c in pool if c is not candidate and not c.reason and c.topic == candidate.topic]
+        others = [c for c in others if np.isfinite(some[c][known]).all()]
         y, X = some[candidate][known], np.column_stack([some[c] for c in others] + [np.ones(len(known))])[known]
         share = np.linalg.lstsq(X, y, rcond=None)[0]
         if len(y) > 2 * len(share) and np.abs(X @ share - y).max() < 1e-3:
@@ -472,7 +474,8 @@ def propose(
     if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
         few = "few rows, or no two in a row, have a number of"
         warnings.append(f"{few} {shortlist(rare, 4)}; where it holds until the next one, {_FILL}")
-    if not (states or controls or like) and is_plant(sources):  # names are those of the columns
+    one_topic = len({s.topic for s in sources}) == 1  # whose rows hold every column
+    if not (states or controls or like) and one_topic and is_plant(sources):  # names are those of the columns
         chosen, used = plant_signals(sources)
         if not chosen:
             raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")

@@ -11,7 +11,6 @@
 
 from __future__ import annotations
 
-import itertools
 from abc import ABC, abstractmethod
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -152,7 +151,8 @@ class Recording(ABC):
 
 
 _FIRST = 50  # messages of a topic that are looked at for the names of its entries
-_BURSTS = 10  # times that the mean step is longer than the median one where messages come in bursts
+_BURSTS = 10  # times that the mean step is longer than the median one where messages come in bursts, and each pause
+_MOST_IN_BURST = 200  # messages; after more, a pause is one between sessions
 
 
 class _Seen:
@@ -197,8 +197,9 @@ def _facts(info: TopicInfo, seen: _Seen) -> TopicFacts:
         return signal_paths(definition.fields, definition.type_name, definition.decode(raw.data))
 
     times, offsets, zeros = seen.times, seen.offsets, seen.zeros
-    steps = [b - a for a, b in itertools.pairwise(times)]
-    step, bursts = usual_step(median(steps), times[-1] - times[0], len(steps)) if steps else (0.0, False)
+    t_ns: NDArray[np.int64] = np.array(times, dtype=np.int64)
+    steps = t_ns[1:] - t_ns[:-1]
+    step, bursts = usual_step(steps)
     fields: tuple[str, ...] = ()
     elsewhere: dict[str, None] = {}
     if seen.longest:
@@ -209,7 +210,7 @@ def _facts(info: TopicInfo, seen: _Seen) -> TopicFacts:
     return TopicFacts(
         info,
         rate=1e9 / step if step else None,
-        largest_gap=max(steps) * 1e-9 if steps else None,
+        largest_gap=float(steps.max()) * 1e-9 if len(steps) else None,
         fields=fields,
         stamps="mixed" if zeros and offsets else "usable" if offsets else "zero" if zeros else "none",
         stamp_offset=median(offsets) if offsets else None,
@@ -218,7 +219,11 @@ def _facts(info: TopicInfo, seen: _Seen) -> TopicFacts:
     )
 
 
-def usual_step(middle: float, span: float, steps: int) -> tuple[float, bool]:
+def usual_step(steps: NDArray[np.int64]) -> tuple[float, bool]:
     """Step that a topic's rate is that of: the median one, or the mean where most messages come in bursts."""
-    mean = span / steps
-    return (mean, True) if 0 <= middle * _BURSTS < mean else (middle, False)
+    if not len(steps):
+        return 0.0, False
+    middle, mean = float(np.median(steps)), float(np.maximum(steps, 0).sum()) / len(steps)
+    pauses = np.count_nonzero(steps > _BURSTS * middle)
+    bursts = 0 <= middle * _BURSTS < mean and pauses * _MOST_IN_BURST >= len(steps)
+    return (mean, True) if bursts else (middle, False)

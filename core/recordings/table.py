@@ -7,7 +7,10 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Table: a file of columns as a recording with one topic, whose messages are its rows, each at its time."""
+"""Table: a file of columns as a recording, whose messages are its rows, each at its time.
+
+It has one topic, but for a log of several messages in one table, whose lines hold the numbers of one of them each.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,8 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import pairwise, product
+from itertools import chain, pairwise, product
+from os.path import commonprefix
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,7 +47,7 @@ from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, Field
 from uncertain_lti.signals.values import TableLayout
 
 TOPIC = "/table"
-"""The topic of a table."""
+"""The topic of a table; those of the messages of a log are below it."""
 TYPE = "table"
 """Its message type."""
 
@@ -55,7 +59,9 @@ _HOUR = 3_600 * 10**9  # ns
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
-_ROWS_EACH = 20  # that a unit has at least
+_ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has
+_MOST_KINDS = 100  # of messages
+_SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
 
 
 def is_table(path: Path) -> bool:
@@ -69,6 +75,7 @@ class Table(Recording):
     Rows are taken in the order of the file: where the time steps back, another run may begin, and the rules of sampling
     decide. Rows without a time are left out. A column is a field of the topic `/table`, by its name with everything but
     letters, digits and underscores replaced; a matrix is an array, and four of a quaternion are one field besides.
+    Where columns have their numbers in rows of their own by turns, each group of them is a topic below.
 
     `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run.
     """
@@ -125,7 +132,6 @@ class Table(Recording):
         fields = zip(once(map(field_name, names), "_"), names, strict=True)
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
         self._quaternions = _quaternions(self.columns_by_field)
-        first, last = (int(self.times[0]), int(self.times[-1])) if len(kept) else (None, None)
         reason = ""
         if not names:
             reason = f"there is no column but the time, '{time}'; choose another file"
@@ -139,7 +145,13 @@ class Table(Recording):
         kind = file.suffix[1:].lower()
         others = [name for name, column in self.columns_by_field.items() if column.dtype.kind in "OM"]
         words = reason or f"text or instants, which are no signals: {', '.join(others)}" * bool(others)
-        self.topics = {TOPIC: TopicInfo(TOPIC, TYPE, len(kept), kind, not reason, words, first, last)}
+        every = _by_message(self.columns_by_field, len(kept))
+        self._fields = {topic: fields for topic, (fields, _) in every.items()}
+        self._rows = {topic: rows for topic, (_, rows) in every.items()}
+        self.topics = {}
+        for topic, rows in self._rows.items():
+            first, last = (int(self.times[rows[0]]), int(self.times[rows[-1]])) if len(rows) else (None, None)
+            self.topics[topic] = TopicInfo(topic, TYPE, len(rows), kind, not reason, words, first, last)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""
@@ -148,8 +160,9 @@ class Table(Recording):
     def type_fields(self, topic: str) -> TypeFields:
         """Columns as fields."""
         self._require([topic])
-        fields = {name: _field_type(column) for name, column in self.columns_by_field.items()}
-        fields |= {base: FieldType("message", _QUATERNION) for base in self._quaternions}
+        fields = {name: _field_type(self.columns_by_field[name]) for name in self._fields[topic]}
+        whole = [base for base, names in self._quaternions.items() if fields.keys() >= set(names)]
+        fields |= {base: FieldType("message", _QUATERNION) for base in whole}
 
         def of(type_name: str) -> Mapping[str, FieldType]:
             if type_name == _QUATERNION:
@@ -162,68 +175,81 @@ class Table(Recording):
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Rows, one after the other."""
-        rows = enumerate(self.times if self._require(topics) else ())
-        columns = self.columns_by_field.items()
-        return ((TOPIC, int(time), SimpleNamespace(**{name: c[row] for name, c in columns})) for row, time in rows)
+        wanted = list(dict.fromkeys(self._require(topics)))
+        fields = [{name: self.columns_by_field[name] for name in self._fields[topic]} for topic in wanted]
+        order = zip(*self._in_order(wanted), strict=True)
+        rows = ((k, int(row), {name: c[row] for name, c in fields[k].items()}) for k, row in order)
+        return ((wanted[k], int(self.times[row]), SimpleNamespace(**numbers)) for k, row, numbers in rows)
 
     def columns(
         self, topics: Sequence[str], paths: Sequence[Sequence[FieldPath]], progress: Progress | None = None
     ) -> Columns:
         """Numbers at some paths."""
         self._require(topics)
-        number = len(self.times)
-        if not topics:
-            nothing = np.empty(0, dtype=np.int64)
-            return Columns(nothing, nothing, nothing, [])
-        values = np.empty((number, len(paths[0])))
-        for column, path in zip(values.T, paths[0], strict=True):
-            column[:] = self._values(path)
+        values = []
+        for topic, wanted in zip(topics, paths, strict=True):
+            values.append(np.empty((len(self._rows[topic]), len(wanted))))
+            for column, path in zip(values[-1].T, wanted, strict=True):
+                column[:] = self._values(topic, path)
+        of, rows = self._in_order(topics)
         if progress is not None:
-            for _ in progress(range(number), number):
+            for _ in progress(range(len(rows)), len(rows)):
                 pass
-        none = np.full(number, -1, dtype=np.int64)
-        return Columns(np.zeros(number, dtype=np.int64), self.times, none, [values])
+        return Columns(of, self.times[rows], np.full(len(rows), -1, dtype=np.int64), values)
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Rate, gaps and columns."""
-        steps = np.diff(self.times)
+        return [self._facts(topic) for topic in self.topics]
+
+    def _facts(self, topic: str) -> TopicFacts:
+        steps = np.diff(self.times[self._rows[topic]])
         step = float(np.median(steps)) if len(steps) else 0.0
-        numbers = [(name, c) for name, c in self.columns_by_field.items() if _field_type(c).kind == "number"]
-        numbered = [base for base in self._quaternions if f"{base}_0" in self.columns_by_field]
-        parts = {name for base, names in self._quaternions.items() if base not in numbered for name in names}
+        columns = {name: self.columns_by_field[name] for name in self._fields[topic]}
+        quaternions = {base: names for base, names in self._quaternions.items() if columns.keys() >= set(names)}
+        numbers = [(name, c) for name, c in columns.items() if _field_type(c).kind == "number"]
+        numbered = [base for base in quaternions if f"{base}_0" in columns]
+        parts = {name for base, names in quaternions.items() if base not in numbered for name in names}
         whole = [(name, c) for name, c in numbers if name not in parts]
         fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in whole)
-        for base in self._quaternions:
+        for base in quaternions:
             axes = "" if base in numbered else "xyzw"
             fields += (*(f"{base}.{axis}" for axis in axes), *(f"{name}({base})" for name in of_quaternion()))
         gap = float(steps.max()) * 1e-9 if len(steps) else None
-        return [TopicFacts(self.topics[TOPIC], 1e9 / step if step > 0 else None, gap, fields, "none", None)]
+        return TopicFacts(self.topics[topic], 1e9 / step if step > 0 else None, gap, fields, "none", None)
 
-    def _values(self, path: FieldPath) -> Any:
-        """What `FieldPath.read` gives for every row."""
-        steps = path.steps
+    def _in_order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+        """Position of the topic of each message among some, and its row, as they come in the file."""
+        every = [self._rows[topic] for topic in topics]
+        of = np.repeat(np.arange(len(every), dtype=np.int64), [len(rows) for rows in every])
+        rows = np.concatenate([np.empty(0, dtype=np.intp), *every])
+        order = np.argsort(rows, kind="stable")
+        return of[order], rows[order]
+
+    def _values(self, topic: str, path: FieldPath) -> Any:
+        """What `FieldPath.read` gives for every row of a topic."""
+        steps, rows = path.steps, self._rows[topic]
         if parts := self._quaternions.get(str(steps[0][1])):
-            columns = [self.columns_by_field[name] for name in parts]
+            columns = [self.columns_by_field[name][rows] for name in parts]
             if path.function is None:
                 return columns["xyzw".index(str(steps[1][1]))]
             return list(map(path.function.of_parts, *(column.tolist() for column in columns)))
-        column = self.columns_by_field.get(str(steps[0][1]), np.empty(0))
-        if not column.size and len(self.times):
-            there = shortlist(list(self.columns_by_field), 50)
+        if str(steps[0][1]) not in self._fields[topic] and len(self.times):
+            there = shortlist(list(self._fields[topic]), 50)
             raise BagError(f"{self.path}: there is no column '{steps[0][1]}'; columns there: {there}")
+        column = self.columns_by_field.get(str(steps[0][1]), np.empty(len(self.times)))[rows]
         if path.function is None and len(steps) == 1:
             return column
         if path.function is None and len(steps) == 2 and steps[1][0] == "index":
             where = int(steps[1][1])
             return column[:, where] if where < column.shape[1] else math.nan
-        return [path.read(row) for _, _, row in self.messages([TOPIC])]
+        return [path.read(row) for _, _, row in self.messages([topic])]
 
     def _require(self, topics: Iterable[str]) -> list[str]:
         wanted = list(topics)
-        if other := next((topic for topic in wanted if topic != TOPIC), None):
-            raise BagError(f"{self.path}: there is no topic {other}; a table has one, {TOPIC}")
-        if wanted and not self.topics[TOPIC].readable:
-            raise BagError(f"{self.path}: cannot be used: {self.topics[TOPIC].reason}")
+        if other := next((topic for topic in wanted if topic not in self.topics), None):
+            raise BagError(f"{self.path}: there is no topic {other}; it has {shortlist(list(self.topics), 20)}")
+        if unread := next((self.topics[topic].reason for topic in wanted if not self.topics[topic].readable), ""):
+            raise BagError(f"{self.path}: cannot be used: {unread}")
         return wanted
 
 
@@ -361,6 +387,35 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
         else:
             found[name] = own
     return found
+
+
+def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
+    """Fields and rows of each topic: of a log whose lines are of several messages by turns, those of each message."""
+    one = {TOPIC: (list(columns), np.arange(number))}
+    names: dict[bytes, list[str]] = {}  # by where they have a number
+    for name, column in columns.items():
+        if column.dtype.kind not in "OM":
+            there = np.isfinite(column) if column.ndim == 1 else np.ones(number, np.bool_)
+            if there.all() or len(names) > _MOST_KINDS:
+                return one
+            names.setdefault(there.tobytes(), []).append(name)
+    empty = names.pop(bytes(number), [])
+    known = {kind: np.frombuffer(kind, np.bool_) for kind in names}
+    rows = {kind: np.count_nonzero(there) for kind, there in known.items()}
+    groups: list[list[bytes]] = []
+    for kind in known:
+        shared = {other: np.count_nonzero(known[kind] & known[other]) for group in groups for other in group}
+        of = {other for other, both in shared.items() if both >= _SHARED * min(rows[kind], rows[other])}
+        tied = [group for group in groups if not of.isdisjoint(group)]
+        groups = [group for group in groups if group not in tied] + [[*chain(*tied), kind]]
+    rows_of = [np.flatnonzero(np.any([known[kind] for kind in group], axis=0)) for group in groups]
+    if sum(1 + np.count_nonzero(np.diff(of) > 1) >= _ROWS_EACH for of in rows_of) < 2:
+        return one
+    fields = [[name for kind in group for name in names[kind]] for group in groups]
+    begun = [(commonprefix(group), group[0]) for group in fields]
+    fields[0] += empty
+    topics = once((begin.rpartition("_")[0] or begin or first for begin, first in begun), "_")
+    return {f"{TOPIC}/{topic}": of for topic, of in zip(topics, zip(fields, rows_of, strict=True), strict=True)}
 
 
 def _names_signals(columns: Mapping[str, Column]) -> str:
