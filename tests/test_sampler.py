@@ -526,7 +526,7 @@ def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[
     assert all_of_them.counters == sampler.counters
     if not made:
         return
-    later = max(max(m.arrival, m.stamp or 0) for m in messages) + TICK
+    later = max(max(m.arrival, m.stamp or 0) for m in messages) + max(TICK, round(signals.min_step * 1e9))
     (ended,) = sampler.push(signals.clock, later, later, (0.0,) * len(signals.on(signals.clock)))
     for i in range(n, len(signals)):
         signal, column = signals[i], [step.before[i] for step in [*made[1:], ended]]
