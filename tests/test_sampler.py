@@ -663,8 +663,7 @@ def flooded() -> Sampler:
     for stamp in range(3, 3 * BUFFERED_MESSAGES):
         sampler.push("/u", stamp, stamp, [float(stamp)])
         if stamp % (BUFFERED_MESSAGES // 10) == 2:  # half of them go as 10002 comes
-            kept = sampler.kept("/u")
-            assert len(kept) <= BUFFERED_MESSAGES and kept[-1][0] == stamp
+            assert len(kept := sampler.kept("/u")) <= BUFFERED_MESSAGES and kept[-1][0] == stamp
     return sampler
 
 
