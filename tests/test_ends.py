@@ -41,12 +41,10 @@ def plant(run: int, share: float, gain: float = 0.0, noise: float = 0.02) -> Tra
 @pytest.mark.parametrize(("share", "found"), [(0.0, "departure"), (0.5, "both"), (1.0, "arrival")])
 @pytest.mark.parametrize("gain", [0.0, 0.5])
 def test_the_end_at_which_a_command_acts_is_found(share: float, found: str, gain: float) -> None:
-    at, why = choose_ends([plant(run, share, gain) for run in range(4)], **WAY)
+    runs = [plant(run, share, gain) for run in range(4)]
+    at, why = choose_ends(runs, **WAY)
     assert at == found and bool(why) == (at != "departure")
-
-
-def test_two_recordings_say_too_little_of_it() -> None:
-    assert choose_ends([plant(run, 1.0) for run in range(2)], **WAY) == ("departure", "")
+    assert choose_ends(runs[:2], **WAY) == ("departure", ""), "two recordings say too little of it"
 
 
 def test_a_controllers_answer_to_the_arrival_is_not_taken() -> None:

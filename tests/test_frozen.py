@@ -467,6 +467,7 @@ def test_a_session_names_what_is_frozen() -> None:
     assert monitor.level == b.level == ERROR and "alarm: frozen: b repeats exactly for 0." in monitor.message
     assert "every state needs one that is frozen" in monitor.message and b.message.startswith("frozen: repeats exactly")
     assert a.level != ERROR and int(monitor.values["frozen"]) > 30 and monitor.values["alarm"] == "1"
+    rig.send(30, frozen=1)
     monitor, *_ = rig.session.report(rig.now + 20.0, 10.0)
     assert "frozen" not in monitor.message.split(";")[0], "nothing arrives, so nothing is known to be frozen"
     rig.send(5)

@@ -269,6 +269,8 @@ def test_too_few_transitions():
     t = drawn(small_plant(1, 3, 2), 9, 1)
     refuses(FitError, "9 usable transitions for 10 unknowns per row", fit, t)
     refuses(FitError, "9 usable transitions for 12 unknowns per row", fit, t, additive="disturbance")
+    words = "which leaves 6 transitions for 7 unknowns per row; discard 1 at most"
+    refuses(FitError, words, fit, drawn(small_plant(1), 8, 1), additive="noise", discard=2)
 
 
 def test_rest_with_a_moving_successor_names_sample_and_remedy():
@@ -659,11 +661,6 @@ def test_discards_are_the_best_single_ones(criterion, seed):
     assert effects[chosen["k"]] >= max(effects) - (0.01 if criterion == "qp" else 1e-6)
     if criterion == "lp":
         assert chosen["effect"] == pytest.approx(max(effects), rel=1e-5)
-
-
-def test_discards_leave_as_many_transitions_as_unknowns():
-    with pytest.raises(FitError, match="which leaves 6 transitions for 7 unknowns per row; discard 1 at most"):
-        fit(drawn(small_plant(1), 8, 1), additive="noise", discard=2)
 
 
 def test_a_weight_beside_the_largest_width_that_is_too_large_is_seen(monkeypatch):

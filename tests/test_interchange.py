@@ -212,6 +212,7 @@ def test_results_print_on_one_line_and_as_a_table():
         assert any("<x0>" in cell for row in rows for cell in row), "names are escaped, and come back"
     first = rows_of(model._repr_html_())[1]
     assert first[1] == f"{model.A[0, 0]:.4g} ± {model.dA[0, 0]:.3g}"
+    assert "inside all bounds: " in validation._repr_html_()
     assert "100.000% inside" in repr(verdicts) and "no alarm" in repr(verdicts)
 
 

@@ -146,7 +146,7 @@ def test_the_file_grows_by_a_megabyte_at_most(tmp_path):
 
 def test_combinations_that_were_seen_stay_seen():
     wide, narrow = runs_of(5, (3000, 3000))
-    narrow = Transient(narrow.t, 0.3 * narrow.x, 0.3 * narrow.u, name="narrow")
+    narrow = Transient(narrow.t, 0.3 * narrow.x + 5.0, 0.3 * narrow.u, name="apart")
     model = fit(narrow, "qp", **PAPER)
     updated = model.update([wide])
     for run in (narrow, wide):

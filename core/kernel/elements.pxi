@@ -18,10 +18,7 @@ cdef array_of_doubles = array("d")
 
 cdef arrays.array doubles(values):
     """A copy of some numbers, with the address for C."""
-    cdef arrays.array found = array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
-    if not len(found):
-        found.append(0.0)
-    return found
+    return array("d", np.ascontiguousarray(values, dtype=np.float64).tobytes())
 
 
 @cython.final

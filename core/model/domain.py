@@ -158,6 +158,10 @@ class Domain:
         """Greatest [x; u] (n + m,)."""
         return self._end((self.x_max, self.u_max), LARGEST)
 
+    def span(self, X: Array) -> Array:
+        """Recorded range of each state (n,), by the scale of each."""
+        return (self.x_max - self.x_min) * X
+
     def _end(self, of: tuple[Array, Array], beyond: float) -> Array:
         ends = np.concatenate(of)
         return ends if self.anywhere is None else np.where(self.anywhere, beyond, ends)

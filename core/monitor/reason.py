@@ -164,7 +164,7 @@ def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Stat
         before = np.concatenate([np.full((1, model.n), np.nan), verdicts.transient.x[:-1]])
         rows.append((jumps(model, before, verdicts.transient.x)[0] != 0.0) & (verdicts.flags == 1.0))
         table = np.abs(verdicts.horizon_utilisation)
-        over = (r for r in verdicts.alarms.rules if isinstance(r, AlarmRule) and r.horizon > 1)
+        over = (r for r in verdicts.alarms.rules if isinstance(r, AlarmRule))
         rows += [table[:, row_of(rule, model)] > rule.margin for rule in over]
     number = {status: i for i, status in enumerate(Status)}
     transient = verdicts.transient

@@ -387,7 +387,7 @@ def _missed(model: UncertainLTI, setting: Setting, faulty: Mapping[str, Sequence
 
 def _row(words: str, size: float, base: float, model: UncertainLTI) -> dict[str, Any]:
     """One way in the table: sizes of jumps, widths over the ranges, false alarms."""
-    span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    span = model.domain.span(model.operating_point.X)
     width = np.asarray(model.fit_summary["mean_width_recorded"])
     share = np.divide(width, span, out=np.full(model.n, np.inf), where=span > 0)
     return {

@@ -478,7 +478,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
 
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
     """
-    found = [match for cell in cells if cell if (match := _DAY.fullmatch(cell))]
+    found = [match for cell in cells if (match := _DAY.fullmatch(cell))]
     if not found or len(found) < (1 - ODD_SHARE) * sum(map(bool, cells)):
         return cells, ""
     orders = {}

@@ -340,7 +340,7 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     alarm = model.fit_summary.get("alarm")
     if isinstance(alarm, dict) and (alarm.get("worth") == "none" or data["alarm"] and alarm.get("worth") == "unproven"):
         return f"the model is {alarm['headline']}"
-    fitted = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    fitted = model.domain.span(model.operating_point.X)
     fitted[np.isinf(fitted)] = 0.0  # of a model that was given
     hardly = np.minimum(MOVES * fitted, [s["mean_width"] or 0.0 for s in data["states"].values()])
     moved = np.ptp(verdicts.transient.x[verdicts.judged], axis=0)

@@ -167,7 +167,7 @@ def _widths(model: UncertainLTI) -> list[Block]:
     facts, blocks = model.fit_summary, list[Block]()
     mean, largest = (numbers_of(facts.get(f"{which}_width_recorded"), model.n) for which in ("mean", "max"))
     if mean and largest:
-        spans = ((model.domain.x_max - model.domain.x_min) * model.operating_point.X).tolist()
+        spans = model.domain.span(model.operating_point.X).tolist()
         rows = []
         for signal, width, most, span in zip(model.signals.states, mean, largest, spans, strict=True):
             of = [number(span), share(width / span, 2)] if 0 < span < math.inf else ["-", "-"]

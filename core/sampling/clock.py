@@ -90,7 +90,7 @@ def to_ns(seconds: float) -> int:
     """Seconds to whole nanoseconds."""
     if abs(seconds) < LONGEST_NS * 1e-9:
         return round(seconds * 1e9)
-    return -LONGEST_NS if math.isfinite(seconds) and seconds < 0 else LONGEST_NS
+    return -LONGEST_NS if seconds < 0 else LONGEST_NS
 
 
 def median_step_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:

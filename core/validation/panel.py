@@ -472,7 +472,7 @@ def _limit(evidence: Evidence, rules: int) -> float:
 
 def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     """What the model is worth: `good`, `some`, `unproven` or `none`, and one line that says so."""
-    span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    span = model.domain.span(model.operating_point.X)
     names = model.state_names
     still = [name for name, s in zip(names, span.tolist(), strict=True) if not s > 0]
     share = np.divide(panel.biases, span, out=np.full(model.n, np.inf), where=span > 0)
@@ -520,7 +520,7 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
 
 def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list[str]:
     """What the panel promises, a sentence each: false alarms, jumps seen, and what rate was asked for."""
-    span = (model.domain.x_max - model.domain.x_min) * model.operating_point.X
+    span = model.domain.span(model.operating_point.X)
     evidence = panel.evidence
     of = list(zip(model.signals.states, panel.biases.tolist(), (panel.biases < _FAR * span).tolist(), strict=True))
     each = [f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "") for s, b, near in of if near]
