@@ -283,7 +283,7 @@ def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> t
     for name, column in columns.items():
         if column.ndim > 1:
             continue
-        names, which = np.unique(column, return_inverse=True)
+        names, which = np.unique(column.astype(str) if column.dtype.kind == "O" else column, return_inverse=True)
         if 2 <= len(names) <= 2 * number and len(np.unique(np.column_stack([times, which]), axis=0)) == len(times):
             return number, name
     return number, ""
