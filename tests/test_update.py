@@ -19,6 +19,7 @@ from refusals import refuses
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.model.signature import Signature
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.validation.panel import Evidence
 
@@ -224,3 +225,6 @@ def test_the_command_updates(tmp_path, capsys):
     capsys.readouterr()
     assert main(["info", names[1], "--json"]) == 0
     assert "memory" not in json.loads(capsys.readouterr().out)
+    old.replace(signatures=[Signature("worn", [1], [np.eye(old.n)])]).save(names[0])
+    assert main(["fit", bags[2], "--update", names[0], "--output", names[1], "--force"]) == 0
+    assert "its signatures" in capsys.readouterr().err

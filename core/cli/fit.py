@@ -107,6 +107,11 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
     transients = _read(options, model.signals)
     with options.progress.stage("fitting") as step:
         updated = model.update(transients, step)
+    if model.signatures:
+        lost = (
+            f"its signatures ({len(model.signatures)}) are of the bounds of before and are left out; learn them again"
+        )
+        options.progress.note(f"{options.update}: {lost}")
     there = model.fit_summary["sources"]
     new = [file for file in _files(transients) if file["file"] not in [source["file"] for source in there]]
     return _with_sources(updated, [*there, *new])
