@@ -260,6 +260,19 @@ def test_a_lost_worker_costs_time_and_nothing_else(bags):
             equal(fit_archive(paths, signals, client=client), model)
 
 
+def test_a_worker_that_cannot_start_is_a_sentence(bags, tmp_path, monkeypatch, capsys):
+    from uncertain_lti.cli.main import main
+
+    def refuse(**options):
+        raise RuntimeError("Nanny failed to start.")
+
+    monkeypatch.setattr("distributed.LocalCluster", refuse)
+    signals, paths = bags
+    arguments = ["--signals", str(signals), "--output", str(tmp_path / "a.json"), "--workers", "2"]
+    assert main(["fit", *map(str, paths), *arguments]) == 2
+    assert "could not be started (Nanny failed to start.); start again" in capsys.readouterr().err
+
+
 @pytest.mark.slow
 def test_errors_of_workers_are_sentences(bags, cluster, tmp_path):
     signals, paths = bags

@@ -19,6 +19,7 @@ from refusals import refuses
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.main import main
+from uncertain_lti.model.signature import Signature
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.validation.panel import Evidence
 
@@ -49,6 +50,8 @@ def equal(one, other):
     for name in ("transitions", "transients", "segments"):
         assert one.fit_summary[name] == other.fit_summary[name]
     assert one.fit_summary["mean_width"] == pytest.approx(other.fit_summary["mean_width"], rel=1e-7)
+    widest = np.asarray(one.fit_summary["max_width"]) / other.fit_summary["max_width"]
+    assert (widest > 1.0 - 1e-7).all() and (widest < 1.05).all()  # at most so wide
     assert np.array_equal(one.domain.x_min, other.domain.x_min) and np.array_equal(one.domain.u_max, other.domain.u_max)
     assert one.domain.step_max == pytest.approx(other.domain.step_max)
 
@@ -73,6 +76,17 @@ def test_an_update_is_the_fit_of_all(criterion, additive):
         assert all((model.bounds(r.x[:-1], r.u[:-1], 0.02)[0] <= r.x[1:]).all() for r in there)
     assert model.fit_summary["updates"] == 3 and refused < 3
     assert model.fit_summary["violations"] == 0
+
+
+def test_what_the_recordings_lack_is_still_known():
+    """Of all recordings what their sums show; of the earlier ones what was found in them."""
+    runs = [t.replace(x=t.x[:, [0, 1, 0]], u=t.u * [1, 0]) for t in runs_of(5, (3000, 900))]
+    whole, first = fit(runs, "qp", **PAPER), fit(runs[0], "qp", **PAPER)
+    facts = first.fit_summary | {"messages": [*first.fit_summary["messages"], "'x1' is odd"]}
+    updated = first.replace(fit_summary=facts).update(runs[1]).fit_summary
+    assert updated["rank"] == whole.fit_summary["rank"] == 3
+    assert updated["messages"] == ["'x1' is odd", *whole.fit_summary["messages"]]
+    assert any("never moved" in text for text in updated["messages"])
 
 
 def test_what_was_not_kept_is_never_left_outside():
@@ -211,3 +225,6 @@ def test_the_command_updates(tmp_path, capsys):
     capsys.readouterr()
     assert main(["info", names[1], "--json"]) == 0
     assert "memory" not in json.loads(capsys.readouterr().out)
+    old.replace(signatures=[Signature("worn", [1], [np.eye(old.n)])]).save(names[0])
+    assert main(["fit", bags[2], "--update", names[0], "--output", names[1], "--force"]) == 0
+    assert "its signatures" in capsys.readouterr().err

@@ -20,6 +20,7 @@ from typing import Any
 
 LONGEST = 2000
 """Letters of a sentence as it is shown."""
+_NAMED = 6  # names in a sentence
 
 
 def printable(text: str, limit: int = LONGEST) -> str:
@@ -196,3 +197,11 @@ def finite_data(value: Any) -> Any:
     if hasattr(value, "tolist"):
         return finite_data(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def quoted(names: Sequence[str]) -> str:
+    """'a', 'b' and 'c'; of many names the first ones, and how many others there are."""
+    marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
+    if len(marked) > _NAMED + 1:
+        return f"{', '.join(marked[:_NAMED])} and {len(marked) - _NAMED} others"
+    return marked[0] if len(marked) == 1 else ", ".join(marked[:-1]) + " and " + marked[-1]

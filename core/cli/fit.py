@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, FitError, ModelError
+from uncertain_lti.cli import interrupted
 from uncertain_lti.cli.command import (
     OPTIONS,
     RECORDINGS,
@@ -106,6 +107,11 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
     transients = _read(options, model.signals)
     with options.progress.stage("fitting") as step:
         updated = model.update(transients, step)
+    if model.signatures:
+        lost = (
+            f"its signatures ({len(model.signatures)}) are of the bounds of before and are left out; learn them again"
+        )
+        options.progress.note(f"{options.update}: {lost}")
     there = model.fit_summary["sources"]
     new = [file for file in _files(transients) if file["file"] not in [source["file"] for source in there]]
     return _with_sources(updated, [*there, *new])
@@ -148,7 +154,15 @@ def _local_cluster(dask: Any, workers: int) -> Any:
     with children_ignore_ctrl_c():
         quiet = logging.CRITICAL  # of work that is broken off; what goes wrong comes back as an error
         given = {"threads_per_worker": 1, "host": "127.0.0.1", "dashboard_address": None, "silence_logs": quiet}
-        return dask.LocalCluster(n_workers=workers, **given)
+        try:
+            return dask.LocalCluster(n_workers=workers, **given)
+        except (RuntimeError, TimeoutError, OSError) as error:
+            if interrupted(error):
+                raise
+            why = str(error.__cause__ or error) or type(error).__name__
+            raise FitError(
+                f"a worker could not be started ({why}); start again, with fewer workers, or with --cache"
+            ) from None
 
 
 def _asked(options: argparse.Namespace) -> dict[str, Any] | None:
@@ -221,9 +235,10 @@ def tune(options: argparse.Namespace) -> Result:
         given = {"budget": options.budget, "groups": options.group, "faulty": faulty, "progress": step}
         tuned = tune(transients, options.false_alarms, **given)
     data = tuned.to_dict()
-    options.say("\n".join((headline_text(tuned.model), tune_text(data), alarm_text(tuned.model))))
     if output is not None:
         _with_sources(tuned.model, _files(transients), options.group).save(output)
+    options.say("\n".join((headline_text(tuned.model), tune_text(data), alarm_text(tuned.model))))
+    if output is not None:
         options.say(f"model written to {output}")
     return Result(data={"model": options.output, "tune": data})
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, runs
-from uncertain_lti.base.text import moment, plural
+from uncertain_lti.base.text import moment, plural, quoted
 from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.evidence import (
@@ -36,6 +36,7 @@ from uncertain_lti.identification.evidence import (
     successive,
     unexplained,
 )
+from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.operating_point import recorded
@@ -54,8 +55,8 @@ WIDE = 0.5
 """Mean width, as a share of the state's own range, above which few faults can show."""
 COLLINEAR = 1e-3
 """Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""
-MOST_GROUPS, MOST_NAMES, MOST_TIED = 3, 6, 5
-"""Combinations of signals, names in a sentence, and blocks with elements of another that are named."""
+MOST_GROUPS, MOST_TIED = 3, 5
+"""Combinations of signals, and blocks with elements of another, that are named."""
 FED_BACK = 0.9
 """Share of a control's changes explained by the states, from which on that is reported."""
 FROZEN = 25
@@ -79,7 +80,7 @@ _REMEDIES = (  # words of a message on the state, or on any signal; what narrows
 )
 
 
-def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
+def _rank(problem: Fleet | Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
     names = [*names, "the disturbance c"] if problem.columns.drift else list(names)
     dead = sums.phi_scale == 0
@@ -87,7 +88,7 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
     messages = []
     if constant := [names[j] for j in np.flatnonzero(still[: problem.n])]:
         messages.append(
-            f"rank deficient: {_quoted(constant)} never moved, so what follows from it is not identifiable; record the "
+            f"rank deficient: {quoted(constant)} never moved, so what follows from it is not identifiable; record the "
             f"machine moving it, or leave it out"
         )
     free = np.flatnonzero(~dead)
@@ -98,7 +99,7 @@ def _rank(problem: Problem, sums: Moments, names: Sequence[str]) -> tuple[int, l
         if value <= limit:
             part = [names[moving[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
             messages.append(
-                f"rank deficient: {_quoted(part)} move together in every transition, so their columns cannot be told "
+                f"rank deficient: {quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
     return int(np.count_nonzero(values > limit)), list(dict.fromkeys(messages))
@@ -148,14 +149,21 @@ def describe(
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
     messages += _wide(sums, mean_width, names)
-    if still := [names[j] for j in range(problem.n, problem.p) if sums.high[j] == sums.low[j]]:
-        messages.append(f"{_quoted(still)} {CONSTANT}, so what a move would do is unknown")
     if problem.columns.names == {"c", "v"}:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return rank, messages
 
 
-def _tied(model: UncertainLTI, problem: Problem, sums: Moments) -> list[str]:
+def of_sums(model: UncertainLTI, fleet: Fleet | Problem, sums: Moments, mean_width: Array) -> tuple[int, list[str]]:
+    """`describe` of what sums alone show, where the transitions are not at hand together."""
+    signals = (*model.signals.states, *model.signals.controls)
+    names, tied, sums = [s.name for s in signals], _tied(model, fleet, sums), sums.one_block()
+    rank, messages = _rank(fleet, sums, names)
+    messages += [*tied, *_collinear(fleet, sums, names, lagged_states(signals, model.n))]
+    return rank, messages + _wide(sums, mean_width, names)
+
+
+def _tied(model: UncertainLTI, problem: Fleet | Problem, sums: Moments) -> list[str]:
     """Blocks that share the elements of another."""
     columns = problem.columns
     if columns.regimes is None:
@@ -199,7 +207,7 @@ def _beyond_knots(model: UncertainLTI, problem: Problem) -> list[str]:
     return messages
 
 
-def _collinear(problem: Problem, sums: Moments, names: Sequence[str], past: Collection[int]) -> list[str]:
+def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], past: Collection[int]) -> list[str]:
     """Signals that nearly move together, and the recording that would separate them."""
     free = np.flatnonzero(sums.phi_scale[: problem.p] > 0)
     free = free[~np.isin(free, list(past))]
@@ -210,13 +218,13 @@ def _collinear(problem: Problem, sums: Moments, names: Sequence[str], past: Coll
             continue
         states, controls = [names[j] for j in part if j < problem.n], [names[j] for j in part if j >= problem.n]
         if not states:
-            cure = f"record {_quoted(controls[:1])} moving while {_quoted(controls[1:])} rests"
+            cure = f"record {quoted(controls[:1])} moving while {quoted(controls[1:])} rests"
         elif controls:
-            cure = f"record steps of {_quoted(controls)} that are sharper than {_quoted(states)} can follow"
+            cure = f"record steps of {quoted(controls)} that are sharper than {quoted(states)} can follow"
         else:
             cure = "excite them by other controls or from other initial states; the bounds hold as they are"
         messages.append(
-            f"{_quoted([names[j] for j in part])} nearly move together (all but {value**0.5:.2%} of their size), so "
+            f"{quoted([names[j] for j in part])} nearly move together (all but {value**0.5:.2%} of their size), so "
             f"their columns are poorly told apart and their elements may trade places: {cure}"
         )
     if (groups := len(messages)) > MOST_GROUPS:
@@ -331,7 +339,7 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
         flips = np.flatnonzero((np.square(one).sum(axis=1) > 0.1) & (total < 0.02 * apart))
         if len(flips) and max(np.abs(one).max(), np.abs(other).max()) < 1.01:  # of a unit quaternion
             messages.append(
-                f"{_quoted([states[i].name for i in those])} change sign together in {plural(len(flips), 'step')} "
+                f"{quoted([states[i].name for i in those])} change sign together in {plural(len(flips), 'step')} "
                 f"({_where(problem, flips.tolist(), transients)}): q and -q are one attitude, so that jump is no "
                 f"movement, and the envelope is fitted to it; use roll, pitch or yaw instead, unwrap(yaw(...))"
             )
@@ -558,17 +566,18 @@ def _complex(value: complex) -> str:
 
 
 def _wide(sums: Moments, mean_width: Array, names: Sequence[str]) -> list[str]:
-    """States whose envelope is as wide as what they do."""
-    span = (sums.high - sums.low)[: len(mean_width)]
-    wide = np.flatnonzero((span > 0) & (mean_width > WIDE * span)).tolist()
-    if not wide:
-        return []
+    """States whose envelope is as wide as what they do, and controls that never moved."""
+    span, n = sums.high - sums.low, len(mean_width)
+    wide = np.flatnonzero((span[:n] > 0) & (mean_width > WIDE * span[:n])).tolist()
     listed = ", ".join(f"'{names[i]}' ({mean_width[i] / span[i]:.0%})" for i in wide)
-    return [
+    messages = [
         f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show there: "
         f"what moves it is not among the controls, one step is long for it, or the noise is as large; without an "
         f"additive term noise near rest alone does it (--additive noise)"
-    ]
+    ] * bool(wide)
+    if still := [name for name, moved in zip(names[n:], span[n:].tolist(), strict=True) if not moved]:
+        messages.append(f"{quoted(still)} {CONSTANT}, so what a move would do is unknown")
+    return messages
 
 
 def remedies(messages: Sequence[str], additive: str, state: str) -> str:
@@ -581,11 +590,3 @@ def remedies(messages: Sequence[str], additive: str, state: str) -> str:
     about = [(remedy.format(state), words, named if own else messages) for words, own, remedy in _REMEDIES]
     found = [remedy for remedy, words, told in about if any(words in m for m in told)]
     return ", or ".join(dict.fromkeys([*found, *(["try --additive noise"] if additive == "none" else [])]))
-
-
-def _quoted(names: Sequence[str]) -> str:
-    """'a', 'b' and 'c'; of many names the first ones, and how many others there are."""
-    marked = [n if n.startswith("the ") else f"'{n}'" for n in names]
-    if len(marked) > MOST_NAMES + 1:
-        return f"{', '.join(marked[:MOST_NAMES])} and {len(marked) - MOST_NAMES} others"
-    return marked[0] if len(marked) == 1 else ", ".join(marked[:-1]) + " and " + marked[-1]

@@ -25,7 +25,7 @@ from uncertain_lti.base.arrays import LARGEST, WORTH_THREADS, Array, Index, on_c
 from uncertain_lti.base.errors import FitError, SignalError, refuse_other
 from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.assembly import assemble, median_step
-from uncertain_lti.identification.diagnosis import describe
+from uncertain_lti.identification.diagnosis import describe, of_sums
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
@@ -148,7 +148,7 @@ def fit(
                 f"discard {problem.N - unknowns} at most, or record more"
             )
         with contradiction_named(where, signals):
-            before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure)
+            before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure, describe_data=False)
         chosen = choose_discards(problem, criterion, structure, budget, progress)
         for index, effect in chosen:
             of, k = transients[problem.source[index]], int(problem.k[index])
@@ -168,7 +168,8 @@ def fit(
             alarm_rule=alarm_rule,
             progress=progress,
             dt_median=median_step(problem.dt),
-            describe_on=problem if describe_data else None,
+            describe_data=describe_data,
+            describe_on=problem,
             transients=transients,
             discarded=len(discarded),
             seek_carriers=seek_carriers,
@@ -227,6 +228,7 @@ def fit_fleet(
     alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
     dt_median: float | None = None,
+    describe_data: bool = True,
     describe_on: Problem | None = None,
     transients: Sequence[Transient] = (),
     discarded: int = 0,
@@ -236,7 +238,8 @@ def fit_fleet(
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
 
-    `remember`: what the model's file keeps, of the model and `WorkingSet.nearest`.
+    `describe_on`: the transitions, where they are all at hand; `remember`: what the model's file keeps, of the model
+    and `WorkingSet.nearest`.
     """
     if large := fleet.N * fleet.p * fleet.n > _LARGE:
         return_memory()
@@ -299,8 +302,11 @@ def fit_fleet(
         facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
 
     def said() -> tuple[int, list[str]] | None:
-        if describe_on is None:
+        if not describe_data:
             return None
+        if describe_on is None:
+            rank, messages = of_sums(model, fleet, sums, found.mean_width)
+            return rank, messages + distance_in_words(found.gap)
         whole = describe_on.N == sums.count and method == "working-set"
         few = None
         if seek_carriers and whole:

@@ -100,13 +100,7 @@ class Boxes:
     def after(self, columns: Columns, before: UncertainLTI, model: Any, widths: Array) -> Boxes:
         """With the room that another model leaves at least, whose largest widths are `widths` (n,)."""
         theta, d = map(np.subtract, elements_of(model, columns), elements_of(before, columns))
-        ones, even = np.ones(len(self.source)), [-1] * len(columns.nominal)
-        nearer = np.maximum(np.maximum(self.low, -self.high), 0.0)
-        farther = np.maximum(np.abs(self.low), np.abs(self.high))
-        steps = [term.times_dt for term in columns.half]
-        least, largest = (
-            np.vstack([end[:-1], *(end[-1] if times_dt else ones for times_dt in steps)]) for end in (nearer, farther)
-        )
+        even, (least, largest) = [-1] * len(columns.nominal), self._sizes(columns)
         z_low, z_high = (np.vstack([end[:-1], end[even]]) for end in (self.low, self.high))
         (falls, rises), (less, more) = _products(theta, z_low, z_high), _products(d, least, largest)
         changes = [falls + less, less - rises]
@@ -114,6 +108,17 @@ class Boxes:
             wider = 0.5 * (widths - np.asarray(before.fit_summary["max_width"]))
             changes.append(wider[:, None] - more + 1e-12 * widths[:, None])
         return replace(self, room=self.room + np.vstack(changes))
+
+    def widest(self, columns: Columns, model: Any) -> Array:
+        """Width per step (n,) that a model has at most in one of them."""
+        return np.asarray(2.0 * (elements_of(model, columns)[1].T @ self._sizes(columns)[1]).max(axis=1))
+
+    def _sizes(self, columns: Columns) -> list[Array]:
+        """Least and largest regressors of the half-widths, (q, K) each."""
+        nearer = np.maximum(np.maximum(self.low, -self.high), 0.0)
+        farther = np.maximum(np.abs(self.low), np.abs(self.high))
+        ones, steps = np.ones(len(self.source)), [term.times_dt for term in columns.half]
+        return [np.vstack([end[:-1], *(end[-1] if of else ones for of in steps)]) for end in (nearer, farther)]
 
     def to_dict(self, recordings: int) -> dict[str, Any]:
         """As it is in the file, rounded to the side of less room."""

@@ -21,6 +21,7 @@ from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.assembly import assemble, is_constant, median_step
+from uncertain_lti.identification.diagnosis import of_sums
 from uncertain_lti.identification.fitting import common_signals, contradiction_in, distance_in_words, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.memory import Boxes, Memory, Recording, remembered
@@ -59,7 +60,10 @@ class _Updated(Fleet):
                 f"what the model keeps does not prove the optimum of all recordings; give {', '.join(names)} again, "
                 f"together with the new ones"
             )
-        return judged
+        boxes = self._memory.boxes
+        if boxes is None or self._model.fit_summary["criterion"] == "lp":  # whose largest widths the room has proven
+            return judged
+        return replace(judged, largest=np.maximum(judged.largest, boxes.widest(self.columns, model)))
 
     def boxes_after(self, model: Any, widths: Array) -> Boxes | None:
         """What is known of the others, with the room that a model of these largest widths (n,) leaves."""
@@ -96,6 +100,8 @@ def updated(
     """`UncertainLTI.update` but for the alarm, which stays, and the recordings that are new."""
     memory, facts = Memory.of(model), model.fit_summary
     columns, point = memory.kept.columns, model.operating_point
+    sums = moments(memory.kept)[0] if memory.rest is None else moments(memory.kept)[0] + memory.rest
+    of_them = of_sums(model, memory.kept, sums, np.asarray(facts["mean_width"]))[1]
     marks = {recording.mark: number for number, recording in enumerate(memory.recordings)}
     known, fresh = dict[int, Problem](), list[Problem]()
     every, runs = list(memory.recordings), list[Transient]()
@@ -143,10 +149,12 @@ def updated(
     except InfeasibleError as error:
         number = int(np.concatenate([here.source, new.source])[error.index])
         raise contradiction_in(error, f"a step of {every[number].name}", model.signals) from None
-    gap = found.fit_summary["optimality_gap"]
     same = ("additive", "weights", "count", "structure", "group", "alarm")
+    gap = facts["optimality_gap"]
+    of_them += distance_in_words(np.inf if gap is None else gap)
+    others = [text for text in facts.get("messages", []) if text not in of_them]
     summary = {name: facts[name] for name in same if name in facts} | {
-        "messages": distance_in_words(np.inf if gap is None else gap),
+        "messages": others + found.fit_summary["messages"],
         "transients": facts["transients"] + len(runs),
         "segments": facts["segments"] + sum(t.segments for t in runs),
         "sources": [*facts["sources"], *({"file": t.name} for t in runs)],

@@ -454,7 +454,8 @@ class UncertainLTI(Envelope):
             criterion and terms. Rules of the alarm stay, but that thresholds of a learnt panel are raised to the
             largest values that the new recordings reach by this model, which was fitted without them, within the
             ranges of its fit; a fit of all may learn others. Residuals of `chi2` and exact repeats are those of the
-            earlier recordings by the model of then, with those of the new ones by the model of now.
+            earlier recordings by the model of then, with those of the new ones by the model of now. Signatures, which
+            are of the bounds of before, are left out.
 
         Raises
         ------
