@@ -1261,6 +1261,23 @@ def test_what_a_fast_table_measures_is_judged_also_where_it_is_noise(tmp_path):
     assert EnvelopeMonitor(model).check(hot).alarm[702:].any()
 
 
+def test_what_is_noise_does_not_move_the_operating_point(tmp_path):
+    """No stretch was still with it, and medians that are no equilibrium made the bounds three times as wide."""
+    rng, x, rows, proposals = np.random.default_rng(2), 0.0, [], []
+    for k in range(2000):
+        command = 10.0 * (k % 100 >= 60)
+        rows.append((k / 10, command, round(x, 4), round(60 + 0.3 * rng.normal(), 3)))
+        x += 0.1 * (command - x) + 0.01 * rng.normal()
+    for number in (3, 4):
+        path = csv(tmp_path / f"{number}.csv", ["time", "motor_cmd", "v", "Temp"][:number], [r[:number] for r in rows])
+        proposals.append(propose([path]))
+    without, also = proposals
+    assert [c.name for c in also.states] == ["v", "temp"]
+    assert [c.steady for c in (*also.states[:1], *also.controls)] == [
+        c.steady for c in (*without.states, *without.controls)
+    ]
+
+
 def test_a_measurement_that_begins_at_0_with_its_command_is_a_state(tmp_path):
     """Of a heater that was off in its first row alone nothing was left that is measured."""
     rows, heat = [(0, 0, 0.0)], 800.0
