@@ -38,7 +38,7 @@ from uncertain_lti.proposal.candidates import (
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
-from uncertain_lti.recordings.table import TOPIC, TYPE
+from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.recordings.table_times import field_name
 from uncertain_lti.signals.field_path import FieldPath
 
@@ -219,7 +219,7 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     """Whether names of columns differ in their digits alone, as of parts that do the same: each may fail alone."""
     names = {re.sub(r"\d+", "#", c.path) for c in (one, other)}
     given = "[" not in one.path and names != {"column_#"}  # by who wrote the file, and not by its reader
-    return one.topic == other.topic and one.topic.startswith(TOPIC) and len(names) == 1 and given
+    return one.topic == other.topic and of_table(one.topic) and len(names) == 1 and given
 
 
 def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
