@@ -1218,3 +1218,5 @@ def test_an_index_or_a_label_of_each_row_does_not_make_messages_by_turns_one(tmp
     assert [fact.fields for fact in table.facts()] == [("CMD_u", "more"), ("ATT_roll",)]
     temperature = _by_turns(400, lambda k: f",{20 + math.sin(0.01 * k):.4f}")
     assert list(open_recording(write(tmp_path / "b.csv", "time,CMD.u,ATT.roll,T", *temperature)).topics) == ["/table"]
+    named = _by_turns(400, lambda k: f",{('ATT', 'CMD')[k % 2]}")
+    assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.roll,type", *named)).warnings  # no units

@@ -142,7 +142,9 @@ class Table(Recording):
             reason = f"there is no column but the time, '{time}'; choose another file"
         elif of := _names_signals(self.columns_by_field):
             reason = f"column '{of}' names the signal of a row's one number; write a column for each signal"
-        texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if not reason else []
+        every = _by_message(self.columns_by_field, len(kept))
+        one = len(every) == 1 and not reason
+        texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
         turns = ((name, _take_turns(column.tolist())) for name, column in texts if len(texts) < len(names))
         if of := next((f"{number} '{name}'" for name, number in turns if number), ""):
             say = "say so in the signals file, `table: {runs: COLUMN}`, or write a file for each"
@@ -150,7 +152,6 @@ class Table(Recording):
         kind = file.suffix[1:].lower()
         others = [name for name, column in self.columns_by_field.items() if column.dtype.kind in "OM"]
         words = reason or f"text or instants, which are no signals: {', '.join(others)}" * bool(others)
-        every = _by_message(self.columns_by_field, len(kept))
         self._fields = {topic: fields for topic, (fields, _) in every.items()}
         self._rows = {topic: rows for topic, (_, rows) in every.items()}
         self.topics = {}
