@@ -576,7 +576,7 @@ def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     feeds = np.repeat(rng.uniform(0.2, 1.0, 180), 5).round(4).tolist()
     for k, speed in enumerate(np.repeat(rng.uniform(0.2, 1.0, 15), 60).tolist()):
         valve = 0.5 + 0.1 * (1.0 - x)  # by a controller
-        rows.append((k, f"{speed:.3f}", feeds[k], f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
+        rows.append((k, f"{speed:.3f}", feeds[k] if k % 7 else "", f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
         x += 0.2 * (speed + feeds[k] + valve - x)
     proposal = propose([csv(tmp_path / "a.csv", ["time", "Pump_speed_cmd", "Feed_cmd", "Valve_cmd", "Flow"], rows)])
     judged = {c.path: c.judged for c in proposal.controls}

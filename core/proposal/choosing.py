@@ -494,6 +494,8 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.ready = "state"
     for candidate in (c for c in controls if c.judged):
         now, after = (np.concatenate([v[side] for v in candidate.values]) for side in (slice(-1), slice(1, None)))
+        known = np.isfinite(now) & np.isfinite(after)
+        now, after = now[known], after[known]
         if (moves := np.mean(now != after)) <= RARE or held_for(now, after):
             candidate.judged = False
             candidate.why = f"{_BY_NAME}not judged, as it changes in {moves:.1%} of the rows only"
