@@ -1261,6 +1261,17 @@ def test_what_a_fast_table_measures_is_judged_also_where_it_is_noise(tmp_path):
     assert EnvelopeMonitor(model).check(hot).alarm[702:].any()
 
 
+def test_noise_with_rare_bursts_is_no_state(tmp_path):
+    """No level shows in it, and every burst that is larger than those recorded was an alarm."""
+    rng = np.random.default_rng(4)
+    command = np.repeat(rng.uniform(-1, 1, (60, 1)), 20, axis=0)
+    bursts, even = rng.standard_t(2, 1200), rng.normal(size=1200)
+    columns = {"v": answers(rng, command)[:, 0], "motor_cmd": command[:, 0], "Current": bursts, "Temp": even}
+    proposal = propose([table_of(tmp_path / "a.csv", columns)])
+    assert [c.path for c in proposal.states] == ["v", "Temp"]
+    assert "# - {name: current" in proposal.text  # a person may have it
+
+
 def test_what_is_noise_does_not_move_the_operating_point(tmp_path):
     """No stretch was still with it, and medians that are no equilibrium made the bounds three times as wide."""
     rng, x, rows, proposals = np.random.default_rng(2), 0.0, [], []

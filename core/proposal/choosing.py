@@ -99,6 +99,7 @@ def functions(X: Array) -> NDArray[np.bool_]:
 
 
 _NOISE = "noise"
+_BURSTS = 5  # times the range of nearly all samples that of all is, from which on rare bursts hide the level of noise
 
 
 def drop_noise(
@@ -293,6 +294,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
     levels = [c for c in main.candidates if c.reason.startswith(_NOISE) and main.type == TYPE]  # a table's are measured
+    levels = [c for c in levels if np.ptp(c.finite) <= _BURSTS * np.ptp(np.percentile(c.finite, (1, 99)))]
     for candidate in levels[: max(0, states_room.most - len(keep))]:
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
