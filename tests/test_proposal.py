@@ -576,7 +576,7 @@ def test_a_command_of_a_plant_that_is_set_now_and_then_is_not_judged(tmp_path):
     feeds = np.repeat(rng.uniform(0.2, 1.0, 180), 5).round(4).tolist()
     for k, speed in enumerate(np.repeat(rng.uniform(0.2, 1.0, 15), 60).tolist()):
         valve = 0.5 + 0.1 * (1.0 - x)  # by a controller
-        rows.append((k, f"{speed:.3f}", feeds[k], f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
+        rows.append((k, f"{speed:.3f}", feeds[k] if k % 7 else "", f"{valve:.4f}", f"{x + 0.01 * rng.normal():.4f}"))
         x += 0.2 * (speed + feeds[k] + valve - x)
     proposal = propose([csv(tmp_path / "a.csv", ["time", "Pump_speed_cmd", "Feed_cmd", "Valve_cmd", "Flow"], rows)])
     judged = {c.path: c.judged for c in proposal.controls}
@@ -1259,6 +1259,34 @@ def test_what_a_fast_table_measures_is_judged_also_where_it_is_noise(tmp_path):
     healthy, hot = (read_as_fitted(recorded(f"{h}.csv", 2, h), model.signals) for h in (0.0, 3.0))
     assert not EnvelopeMonitor(model).check(healthy).alarm.any()
     assert EnvelopeMonitor(model).check(hot).alarm[702:].any()
+
+
+def test_noise_with_rare_bursts_is_no_state(tmp_path):
+    """No level shows in it, and every burst that is larger than those recorded was an alarm."""
+    rng = np.random.default_rng(4)
+    command = np.repeat(rng.uniform(-1, 1, (60, 1)), 20, axis=0)
+    bursts, even = rng.standard_t(2, 1200), rng.normal(size=1200)
+    columns = {"v": answers(rng, command)[:, 0], "motor_cmd": command[:, 0], "Current": bursts, "Temp": even}
+    proposal = propose([table_of(tmp_path / "a.csv", columns)])
+    assert [c.path for c in proposal.states] == ["v", "Temp"]
+    assert "# - {name: current" in proposal.text  # a person may have it
+
+
+def test_what_is_noise_does_not_move_the_operating_point(tmp_path):
+    """No stretch was still with it, and medians that are no equilibrium made the bounds three times as wide."""
+    rng, x, rows, proposals = np.random.default_rng(2), 0.0, [], []
+    for k in range(2000):
+        command = 10.0 * (k % 100 >= 60)
+        rows.append((k / 10, command, round(x, 4), round(60 + 0.3 * rng.normal(), 3)))
+        x += 0.1 * (command - x) + 0.01 * rng.normal()
+    for number in (3, 4):
+        path = csv(tmp_path / f"{number}.csv", ["time", "motor_cmd", "v", "Temp"][:number], [r[:number] for r in rows])
+        proposals.append(propose([path]))
+    without, also = proposals
+    assert [c.name for c in also.states] == ["v", "temp"]
+    assert [c.steady for c in (*also.states[:1], *also.controls)] == [
+        c.steady for c in (*without.states, *without.controls)
+    ]
 
 
 def test_a_measurement_that_begins_at_0_with_its_command_is_a_state(tmp_path):

@@ -1197,3 +1197,26 @@ def test_columns_that_lack_numbers_now_and_then_or_one_after_the_other_are_of_on
     for number, rows in enumerate((lost, halves, slow)):
         path = write(tmp_path / f"{number}.csv", "time,a,b,c", *rows)
         assert list(open_recording(path).topics) == ["/table"]
+
+
+def _by_turns(rows, more=lambda k: ""):
+    return [f"{0.05 * k:.2f},{f'{k % 9},' if k % 2 else f',{math.sin(0.1 * k):.5f}'}{more(k)}" for k in range(rows)]
+
+
+def test_a_short_log_of_messages_by_turns_has_the_topics_of_a_long_one(tmp_path):
+    """A model of a long log refused one of a second: it had the one topic `/table`."""
+    for rows in (14, 400):
+        path = write(tmp_path / f"{rows}.csv", "time,CMD.u,ATT.roll", *_by_turns(rows))
+        assert list(open_recording(path).topics) == ["/table/CMD", "/table/ATT"]
+
+
+@pytest.mark.parametrize("more", [lambda k: k, lambda k: 7, lambda k: int(k > 250)], ids=["index", "constant", "label"])
+def test_an_index_or_a_label_of_each_row_does_not_make_messages_by_turns_one(tmp_path, more):
+    path = write(tmp_path / "a.csv", "time,CMD.u,ATT.roll,more", *_by_turns(400, lambda k: f",{more(k)}"))
+    table = open_recording(path)
+    assert {topic: info.count for topic, info in table.topics.items()} == {"/table/CMD": 200, "/table/ATT": 200}
+    assert [fact.fields for fact in table.facts()] == [("CMD_u", "more"), ("ATT_roll",)]
+    temperature = _by_turns(400, lambda k: f",{20 + math.sin(0.01 * k):.4f}")
+    assert list(open_recording(write(tmp_path / "b.csv", "time,CMD.u,ATT.roll,T", *temperature)).topics) == ["/table"]
+    named = _by_turns(400, lambda k: f",{('ATT', 'CMD')[k % 2]}")
+    assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.roll,type", *named)).warnings  # no units

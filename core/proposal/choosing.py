@@ -38,7 +38,7 @@ from uncertain_lti.proposal.candidates import (
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
-from uncertain_lti.recordings.table import TOPIC, TYPE
+from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.recordings.table_times import field_name
 from uncertain_lti.signals.field_path import FieldPath
 
@@ -99,6 +99,7 @@ def functions(X: Array) -> NDArray[np.bool_]:
 
 
 _NOISE = "noise"
+_BURSTS = 5  # times the range of nearly all samples that of all is, from which on rare bursts hide the level of noise
 
 
 def drop_noise(
@@ -219,7 +220,7 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     """Whether names of columns differ in their digits alone, as of parts that do the same: each may fail alone."""
     names = {re.sub(r"\d+", "#", c.path) for c in (one, other)}
     given = "[" not in one.path and names != {"column_#"}  # by who wrote the file, and not by its reader
-    return one.topic == other.topic and one.topic.startswith(TOPIC) and len(names) == 1 and given
+    return one.topic == other.topic and of_table(one.topic) and len(names) == 1 and given
 
 
 def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
@@ -293,6 +294,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
     levels = [c for c in main.candidates if c.reason.startswith(_NOISE) and main.type == TYPE]  # a table's are measured
+    levels = [c for c in levels if np.ptp(c.finite) <= _BURSTS * np.ptp(np.percentile(c.finite, (1, 99)))]
     for candidate in levels[: max(0, states_room.most - len(keep))]:
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
@@ -494,6 +496,8 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.ready = "state"
     for candidate in (c for c in controls if c.judged):
         now, after = (np.concatenate([v[side] for v in candidate.values]) for side in (slice(-1), slice(1, None)))
+        known = np.isfinite(now) & np.isfinite(after)
+        now, after = now[known], after[known]
         if (moves := np.mean(now != after)) <= RARE or held_for(now, after):
             candidate.judged = False
             candidate.why = f"{_BY_NAME}not judged, as it changes in {moves:.1%} of the rows only"

@@ -508,7 +508,8 @@ def propose(
     ready = [c for s in sources for c in s.candidates if c.ready]
     further = ([c for c in ready if c.ready == kind] for kind in ("state", "control"))
     name_signals(*([*some, *more] for some, more in zip((chosen, used), further, strict=True)))
-    set_operating_point(chosen, used, sources)
+    settled = [c for c in chosen if not c.why]  # what is mostly noise is never still
+    set_operating_point(settled or chosen, used, sources)
     for candidate in [*ready, *(c for c in chosen if c.why)]:
         set_own_scale(candidate)
     warnings += [doubt] * bool(doubt)

@@ -25,7 +25,7 @@ from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, held
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.recordings.table import TOPIC, TYPE
+from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.sampling.clock import coarse_ns, longest_pause
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
@@ -73,8 +73,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     inner = re.sub(rf"^({'|'.join(FUNCTIONS)})\(|\)$", "", inner)
     words = [w for w in words_of(inner) if w not in _DULL]
     if all(len(w) == 1 or w.isdigit() for w in words):
-        of_table = candidate.kind if "[" in candidate.path else ""  # whose topic says nothing
-        of_topic = of_table if candidate.topic == TOPIC else candidate.topic.rstrip("/").rpartition("/")[2]
+        array = candidate.kind if "[" in candidate.path else ""  # of a table, whose topic says nothing more
+        of_topic = array if of_table(candidate.topic) else candidate.topic.rstrip("/").rpartition("/")[2]
         words = [*words_of(of_topic), *words]
     return words or ["signal"]
 

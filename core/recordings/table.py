@@ -59,9 +59,14 @@ _HOUR = 3_600 * 10**9  # ns
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
-_ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has
+_ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has, of a short log fewer
 _MOST_KINDS = 100  # of messages
 _SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
+
+
+def of_table(topic: str) -> bool:
+    """Whether a topic is that of a table, or of a message in one."""
+    return f"{topic}/".startswith(f"{TOPIC}/")
 
 
 def is_table(path: Path) -> bool:
@@ -137,7 +142,9 @@ class Table(Recording):
             reason = f"there is no column but the time, '{time}'; choose another file"
         elif of := _names_signals(self.columns_by_field):
             reason = f"column '{of}' names the signal of a row's one number; write a column for each signal"
-        texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if not reason else []
+        every = _by_message(self.columns_by_field, len(kept))
+        one = len(every) == 1 and not reason
+        texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
         turns = ((name, _take_turns(column.tolist())) for name, column in texts if len(texts) < len(names))
         if of := next((f"{number} '{name}'" for name, number in turns if number), ""):
             say = "say so in the signals file, `table: {runs: COLUMN}`, or write a file for each"
@@ -145,7 +152,6 @@ class Table(Recording):
         kind = file.suffix[1:].lower()
         others = [name for name, column in self.columns_by_field.items() if column.dtype.kind in "OM"]
         words = reason or f"text or instants, which are no signals: {', '.join(others)}" * bool(others)
-        every = _by_message(self.columns_by_field, len(kept))
         self._fields = {topic: fields for topic, (fields, _) in every.items()}
         self._rows = {topic: rows for topic, (_, rows) in every.items()}
         self.topics = {}
@@ -396,10 +402,12 @@ def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[l
     for name, column in columns.items():
         if column.dtype.kind not in "OM":
             there = np.isfinite(column) if column.ndim == 1 else np.ones(number, np.bool_)
+            if there.all() and column.ndim == 1 and _goes_on(column):
+                there = ~there  # an index or a label is of no message
             if there.all() or len(names) > _MOST_KINDS:
                 return one
             names.setdefault(there.tobytes(), []).append(name)
-    empty = names.pop(bytes(number), [])
+    any_row = names.pop(bytes(number), [])
     known = {kind: np.frombuffer(kind, np.bool_) for kind in names}
     rows = {kind: np.count_nonzero(there) for kind, there in known.items()}
     groups: list[list[bytes]] = []
@@ -409,13 +417,19 @@ def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[l
         tied = [group for group in groups if not of.isdisjoint(group)]
         groups = [group for group in groups if group not in tied] + [[*chain(*tied), kind]]
     rows_of = [np.flatnonzero(np.any([known[kind] for kind in group], axis=0)) for group in groups]
-    if sum(1 + np.count_nonzero(np.diff(of) > 1) >= _ROWS_EACH for of in rows_of) < 2:
+    if sum(1 + np.count_nonzero(np.diff(of) > 1) >= min(_ROWS_EACH, max(3, len(of) / 5)) for of in rows_of) < 2:
         return one
     fields = [[name for kind in group for name in names[kind]] for group in groups]
     begun = [(commonprefix(group), group[0]) for group in fields]
-    fields[0] += empty
+    fields[int(np.argmax([len(of) for of in rows_of]))] += any_row
     topics = once((begin.rpartition("_")[0] or begin or first for begin, first in begun), "_")
     return {f"{TOPIC}/{topic}": of for topic, of in zip(topics, zip(fields, rows_of, strict=True), strict=True)}
+
+
+def _goes_on(column: Column) -> bool:
+    """Whether a column is an index, a label or constant: its step from row to row is nearly always that before."""
+    same = np.diff(column.astype(np.float64), 2) == 0
+    return int(np.count_nonzero(same)) >= 0.9 * len(same)
 
 
 def _names_signals(columns: Mapping[str, Column]) -> str:
