@@ -192,6 +192,27 @@ def test_a_memory_of_a_state_follows_the_fault():
     assert np.array_equal(biased.u[:10], healthy.u[:10])
 
 
+def test_a_failed_actuator_has_failed_in_what_is_remembered_of_it():
+    topic = {"topic": "/m", "type": "std_msgs/msg/Float64MultiArray"}
+    fields = {"x": "data[0]", "u": "data[1]", "was": "lag(data[1], 2)"}
+    x, *u = (Signal(name, field=field, scale=2.0, **topic) for name, field in fields.items())
+    signals = SignalMap((x,), tuple(u), clock="/m", max_gap=1.0)
+    model = UncertainLTI([[-1.0]], [[1.0, 0.5]], [[0.1]], [[0.1] * 2], signals=signals)
+
+    def plant(off):
+        t, x, u = 0.1 * np.arange(40.0), np.zeros(40), np.zeros((40, 2))
+        u[:, 0] = np.sin(t)
+        u[2:, 1] = u[:-2, 0]
+        for k in range(39):
+            done = (u[k] + off * np.array([k >= 10, k >= 12])) / 2.0
+            x[k + 1] = x[k] + 0.1 * 2.0 * (-x[k] / 2.0 + model.B[0] @ done)
+        return Transient(t, x, u, signals=signals, max_gap=1.0)
+
+    healthy, truth = plant(0.0), plant(0.2)
+    faulty = inject(healthy, "offset", "u", 0.2, 1.0, model)
+    assert faulty.x == pytest.approx(truth.x, abs=1e-12) and np.array_equal(faulty.u, healthy.u)
+
+
 # --- the smallest detectable fault ---
 
 
