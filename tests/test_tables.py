@@ -1194,29 +1194,32 @@ def test_columns_that_lack_numbers_now_and_then_or_one_after_the_other_are_of_on
     lost = [",".join([f"{0.1 * k:.1f}", *np.where(rng.random(3) < 0.3, "", "1.5")]) for k in range(300)]
     halves = [f"{0.1 * k:.1f},{'2.5,,1' if k < 150 else ',3.5,1'}" for k in range(300)]
     slow = [f"{0.1 * k:.1f},{k % 5},{k % 3},{k if k % 10 == 0 else ''}" for k in range(300)]
-    for number, rows in enumerate((lost, halves, slow)):
+    changed = [f"{0.1 * k:.1f}," + ",".join(str(k) if j == k * k % 3 else "" for j in range(3)) for k in range(300)]
+    for number, rows in enumerate((lost, halves, slow, changed)):
         path = write(tmp_path / f"{number}.csv", "time,a,b,c", *rows)
         assert list(open_recording(path).topics) == ["/table"]
 
 
 def _by_turns(rows, more=lambda k: ""):
-    return [f"{0.05 * k:.2f},{f'{k % 9},' if k % 2 else f',{math.sin(0.1 * k):.5f}'}{more(k)}" for k in range(rows)]
+    numbers = [f"{k % 9},," if k % 2 else f",{math.sin(0.1 * k):.5f},{k % 7}" for k in range(rows)]
+    return [f"{0.05 * k:.2f},{numbers[k]}{more(k)}" for k in range(rows)]
 
 
 def test_a_short_log_of_messages_by_turns_has_the_topics_of_a_long_one(tmp_path):
     """A model of a long log refused one of a second: it had the one topic `/table`."""
     for rows in (14, 400):
-        path = write(tmp_path / f"{rows}.csv", "time,CMD.u,ATT.roll", *_by_turns(rows))
+        path = write(tmp_path / f"{rows}.csv", "time,CMD.u,ATT.r,ATT.p", *_by_turns(rows))
         assert list(open_recording(path).topics) == ["/table/CMD", "/table/ATT"]
 
 
 @pytest.mark.parametrize("more", [lambda k: k, lambda k: 7, lambda k: int(k > 250)], ids=["index", "constant", "label"])
 def test_an_index_or_a_label_of_each_row_does_not_make_messages_by_turns_one(tmp_path, more):
-    path = write(tmp_path / "a.csv", "time,CMD.u,ATT.roll,more", *_by_turns(400, lambda k: f",{more(k)}"))
+    path = write(tmp_path / "a.csv", "time,CMD.u,ATT.r,ATT.p,more", *_by_turns(400, lambda k: f",{more(k)}"))
     table = open_recording(path)
     assert {topic: info.count for topic, info in table.topics.items()} == {"/table/CMD": 200, "/table/ATT": 200}
-    assert [fact.fields for fact in table.facts()] == [("CMD_u", "more"), ("ATT_roll",)]
+    assert [fact.fields for fact in table.facts()] == [("CMD_u", "more"), ("ATT_r", "ATT_p")]
     temperature = _by_turns(400, lambda k: f",{20 + math.sin(0.01 * k):.4f}")
-    assert list(open_recording(write(tmp_path / "b.csv", "time,CMD.u,ATT.roll,T", *temperature)).topics) == ["/table"]
+    one = write(tmp_path / "b.csv", "time,CMD.u,ATT.r,ATT.p,T", *temperature)
+    assert list(open_recording(one).topics) == ["/table"]
     named = _by_turns(400, lambda k: f",{('ATT', 'CMD')[k % 2]}")
-    assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.roll,type", *named)).warnings  # no units
+    assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.r,ATT.p,type", *named)).warnings  # no units

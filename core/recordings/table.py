@@ -396,7 +396,10 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
 
 
 def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
-    """Fields and rows of each topic: of a log whose lines are of several messages by turns, those of each message."""
+    """Fields and rows of each topic: of a log whose lines are of several messages by turns, those of each message.
+
+    Where no message has two numbers, signals were written as they changed, and hold until then: they are one table.
+    """
     one = {TOPIC: (list(columns), np.arange(number))}
     names: dict[bytes, list[str]] = {}  # by where they have a number
     for name, column in columns.items():
@@ -417,9 +420,10 @@ def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[l
         tied = [group for group in groups if not of.isdisjoint(group)]
         groups = [group for group in groups if group not in tied] + [[*chain(*tied), kind]]
     rows_of = [np.flatnonzero(np.any([known[kind] for kind in group], axis=0)) for group in groups]
-    if sum(1 + np.count_nonzero(np.diff(of) > 1) >= min(_ROWS_EACH, max(3, len(of) / 5)) for of in rows_of) < 2:
-        return one
     fields = [[name for kind in group for name in names[kind]] for group in groups]
+    turns = [1 + np.count_nonzero(np.diff(of) > 1) >= min(_ROWS_EACH, max(3, len(of) / 5)) for of in rows_of]
+    if sum(turns) < 2 or max(map(len, fields)) < 2:
+        return one
     begun = [(commonprefix(group), group[0]) for group in fields]
     fields[int(np.argmax([len(of) for of in rows_of]))] += any_row
     topics = once((begin.rpartition("_")[0] or begin or first for begin, first in begun), "_")
