@@ -235,7 +235,7 @@ def left(Z: Array, *of: Array) -> tuple[Array, ...]:
 
     `Z` (N, j): regressors; Returns (N, k): one array for each that is given.
     """
-    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z]))
+    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size_of(Z)]))
     return tuple(Y - Q @ (Q.T @ Y) for Y in of)
 
 
