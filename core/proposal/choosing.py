@@ -98,7 +98,6 @@ def functions(X: Array) -> NDArray[np.bool_]:
     return found
 
 
-_NOISE = "noise"
 _BURSTS = 5  # times the range of nearly all samples that of all is, from which on rare bursts hide the level of noise
 
 
@@ -124,7 +123,7 @@ def drop_noise(
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
             told = f"{max(0.0, known):.0%}"
-            candidate.reason = f"{_NOISE}: one sample predicts {told} of the variance at the next, controls included"
+            candidate.reason = f"noise: one sample predicts {told} of the variance at the next, controls included"
             candidate.ready = "state"
     return [c for c in pool if not c.reason], ""
 
@@ -278,7 +277,9 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
                 candidate.reason, candidate.ready = source.reason, "state"
     pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], every, like)
     used = drop_copies(used)
-    pool, doubt = drop_noise(drop_functions(steps_of(pool, every, used), pool), every, used)
+    before = drop_functions(steps_of(pool, every, used), pool)
+    pool, doubt = drop_noise(before, every, used)
+    noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TYPE]  # measured, in a table
     N = len(steps_of(pool, every, used).X)
     room = max(2, N // PER_UNKNOWN)
     used = _strongest(_driven(pool, every, used, 0), used, _Room(N, room // 2, "controls"))
@@ -293,8 +294,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     drop_idle_controls(steps_of(keep, every, used), used, _driven(keep, every, used, 0)[1:].max(axis=1, initial=0.0))
     used = [c for c in used if not c.reason]
     _delay(keep, every, used)
-    levels = [c for c in main.candidates if c.reason.startswith(_NOISE) and main.type == TYPE]  # a table's are measured
-    levels = [c for c in levels if np.ptp(c.finite) <= _BURSTS * np.ptp(np.percentile(c.finite, (1, 99)))]
+    levels = [c for c in noise if np.ptp(c.finite) <= _BURSTS * np.ptp(np.percentile(c.finite, (1, 99)))]
     for candidate in levels[: max(0, states_room.most - len(keep))]:
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
@@ -495,9 +495,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.reason = f"answers within a row: the controls of the same row tell {share:.0%} of it"
             candidate.ready = "state"
     for candidate in (c for c in controls if c.judged):
-        now, after = (np.concatenate([v[side] for v in candidate.values]) for side in (slice(-1), slice(1, None)))
-        known = np.isfinite(now) & np.isfinite(after)
-        now, after = now[known], after[known]
+        now, after = _in_turn(candidate)
         if (moves := np.mean(now != after)) <= RARE or held_for(now, after):
             candidate.judged = False
             candidate.why = f"{_BY_NAME}not judged, as it changes in {moves:.1%} of the rows only"
@@ -590,8 +588,13 @@ def _told(candidate: Candidate, controls: Sequence[Candidate]) -> float:
 
 def _known(candidate: Candidate) -> float:
     """Share of the variance of the next row that one row tells."""
-    now, after = (np.concatenate([v[side] for v in candidate.values]) for side in (slice(-1), slice(1, None)))
-    good = np.isfinite(now) & np.isfinite(after)
-    if good.sum() < 3 or np.ptp(now[good]) == 0 or np.ptp(after[good]) == 0:
+    now, after = _in_turn(candidate)
+    if len(now) < 3 or np.ptp(now) == 0 or np.ptp(after) == 0:
         return 0.0
-    return float(np.corrcoef(now[good], after[good])[0, 1]) ** 2
+    return float(np.corrcoef(now, after)[0, 1]) ** 2
+
+
+def _in_turn(candidate: Candidate) -> Array:
+    """Numbers of rows, and of the next ones (2, N), where both have one."""
+    pairs = np.hstack([np.stack([v[:-1], v[1:]]) for v in candidate.values])
+    return np.asarray(pairs[:, np.isfinite(pairs).all(axis=0)])

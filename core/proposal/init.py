@@ -508,9 +508,9 @@ def propose(
     ready = [c for s in sources for c in s.candidates if c.ready]
     further = ([c for c in ready if c.ready == kind] for kind in ("state", "control"))
     name_signals(*([*some, *more] for some, more in zip((chosen, used), further, strict=True)))
-    settled = [c for c in chosen if not c.why]  # what is mostly noise is never still
-    set_operating_point(settled or chosen, used, sources)
-    for candidate in [*ready, *(c for c in chosen if c.why)]:
+    levels = [c for c in chosen if c.why]  # mostly noise, which is never still
+    set_operating_point([c for c in chosen if c not in levels] or chosen, used, sources)
+    for candidate in [*ready, *levels]:
         set_own_scale(candidate)
     warnings += [doubt] * bool(doubt)
     if not commands:

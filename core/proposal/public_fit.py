@@ -165,7 +165,7 @@ def fit(
     for_controls_as_they_are = (weights, transient_weights, operating_point, structure)
     learns = alarm == "panel" and method == "working-set"
     if learns:
-        refuse_copies(t for t in transients if isinstance(t, Transient))
+        refuse_copies(transients)
     if learns and all(given is None for given in for_controls_as_they_are):
         at, why = choose_ends(transients, groups=groups, **options)
         if why:

@@ -166,9 +166,9 @@ class Table(Recording):
     def type_fields(self, topic: str) -> TypeFields:
         """Columns as fields."""
         self._require([topic])
-        fields = {name: _field_type(self.columns_by_field[name]) for name in self._fields[topic]}
-        whole = [base for base, names in self._quaternions.items() if fields.keys() >= set(names)]
-        fields |= {base: FieldType("message", _QUATERNION) for base in whole}
+        columns, quaternions = self._of(topic)
+        fields = {name: _field_type(column) for name, column in columns.items()}
+        fields |= {base: FieldType("message", _QUATERNION) for base in quaternions}
 
         def of(type_name: str) -> Mapping[str, FieldType]:
             if type_name == _QUATERNION:
@@ -182,7 +182,7 @@ class Table(Recording):
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Rows, one after the other."""
         wanted = list(dict.fromkeys(self._require(topics)))
-        fields = [{name: self.columns_by_field[name] for name in self._fields[topic]} for topic in wanted]
+        fields = [self._of(topic)[0] for topic in wanted]
         order = zip(*self._in_order(wanted), strict=True)
         rows = ((k, int(row), {name: c[row] for name, c in fields[k].items()}) for k, row in order)
         return ((wanted[k], int(self.times[row]), SimpleNamespace(**numbers)) for k, row, numbers in rows)
@@ -210,8 +210,7 @@ class Table(Recording):
     def _facts(self, topic: str) -> TopicFacts:
         steps = np.diff(self.times[self._rows[topic]])
         step = float(np.median(steps)) if len(steps) else 0.0
-        columns = {name: self.columns_by_field[name] for name in self._fields[topic]}
-        quaternions = {base: names for base, names in self._quaternions.items() if columns.keys() >= set(names)}
+        columns, quaternions = self._of(topic)
         numbers = [(name, c) for name, c in columns.items() if _field_type(c).kind == "number"]
         numbered = [base for base in quaternions if f"{base}_0" in columns]
         parts = {name for base, names in quaternions.items() if base not in numbered for name in names}
@@ -222,6 +221,11 @@ class Table(Recording):
             fields += (*(f"{base}.{axis}" for axis in axes), *(f"{name}({base})" for name in of_quaternion()))
         gap = float(steps.max()) * 1e-9 if len(steps) else None
         return TopicFacts(self.topics[topic], 1e9 / step if step > 0 else None, gap, fields, "none", None)
+
+    def _of(self, topic: str) -> tuple[dict[str, Column], dict[str, list[str]]]:
+        """Columns of a topic, and the quaternions whose four columns are among them."""
+        columns = {name: self.columns_by_field[name] for name in self._fields[topic]}
+        return columns, {base: names for base, names in self._quaternions.items() if columns.keys() >= set(names)}
 
     def _in_order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
         """Position of the topic of each message among some, and its row, as they come in the file."""
