@@ -1345,6 +1345,18 @@ def test_columns_that_one_table_lacks_are_left_out_and_tables_of_two_topics_refu
     refuses(BagError, words, propose, [tmp_path / "a.csv", tmp_path / "c.csv"])
 
 
+@pytest.mark.parametrize(("name", "command", "depends"), [("heading_deg", "rudder", False), ("Hdg", "hdg_ref", True)])
+def test_nothing_depends_on_where_a_vehicle_heads_for(tmp_path, name, command, depends):
+    """A compass passes north in another drive, also where it did not in these; a course to be held is held to it."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    speed = answers(rng, np.column_stack([u, u]))[:, 0]
+    columns = {name: 200 + 40 * np.sin(np.cumsum(0.01 * speed)), "turn": speed, command: u}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == [f"unwrap({name}, 360)", "turn"], proposal.text
+    assert ("structure:" in proposal.text) != depends, proposal.text
+
+
 def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     """Another drive is elsewhere, and the numbers of a mode are names: neither tells what comes next."""
     rng = np.random.default_rng(3)

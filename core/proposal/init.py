@@ -46,6 +46,7 @@ from uncertain_lti.proposal.candidates import (
 )
 from uncertain_lti.proposal.choosing import choose, is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
+    COMPASS,
     clock_of,
     columns_of,
     entry,
@@ -377,14 +378,16 @@ def _drop_computed(sources: Sequence[Source]) -> None:
 
 
 def _wrapped(source: Source) -> None:
-    """Angles that jump by a turn are unwrapped, those of a quaternion always."""
+    """Angles that jump by a turn are unwrapped, those of a quaternion and a compass always."""
     for candidate in source.free:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         finite = [values[np.isfinite(values)] for values in candidate.values]
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
         jumps = (t for t in (math.tau, 360.0) if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
-        turn = math.tau if angle else next(jumps, 0.0)
-        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course)", candidate.path.lower())
+        low, high = candidate.finite.min(), candidate.finite.max()
+        compass = COMPASS.search(candidate.path) and -180 <= low and high <= 360 and max(-low, high) > math.tau
+        turn = math.tau if angle else next(jumps, 360.0 if compass else 0.0)
+        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg)", candidate.path.lower())
         if angle or (turn and named):
             candidate.path = f"unwrap({candidate.path}{', 360' * (turn > 7)})"
             candidate.values = [_unwrapped(v, turn) for v in candidate.values]

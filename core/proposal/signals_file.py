@@ -38,6 +38,10 @@ _PARTS = re.compile(r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+|\d+")  # letters 
 _DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value", "quaternion", "accel", "wrench"}
 
 
+COMPASS = re.compile(r"(?i)(heading|hdg|azimuth|compass)(_?deg\w*)?(?!\w)")
+"""Name of the direction in which a vehicle is: nothing depends on it, and another drive may go elsewhere."""
+
+
 _UNITS = (
     *((re.compile(rf"{name}\("), function.unit) for name, function in FUNCTIONS.items() if function.unit),
     (re.compile(r"angular_velocity\.|twist\.angular\.|(^|\.)angular\.[xyz]$"), "rad/s"),
@@ -221,8 +225,8 @@ def signals_file(
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
         lines = for_members(lines, states[0].element, list(members))
-    elif around := [c for c in states if _turns(c)] if not any(map(_turns, controls)) else []:
-        lines += ["", "# Half a turn or more: nothing depends on how many turns there were.", "structure:"]
+    elif around := [] if any(map(_holds_course, controls)) else [c for c in states if _turns(c)]:
+        lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle heads for.", "structure:"]
         lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
 
@@ -241,10 +245,16 @@ _LISTED = 40
 
 
 def _turns(candidate: Candidate) -> bool:
-    """Whether an angle went round by half a turn or more."""
+    """Whether an angle went round by half a turn or more, or the next drive may head elsewhere."""
     spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
     turn = FieldPath(candidate.path).unwrap
-    return turn > 0 and max(spans, default=0.0) >= turn / 2
+    return turn > 0 and (max(spans, default=0.0) >= turn / 2 or COMPASS.search(candidate.path) is not None)
+
+
+def _holds_course(control: Candidate) -> bool:
+    """Whether an angle depends on a command for it, such as the course that an autopilot holds."""
+    held = re.search(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)", control.path)
+    return _turns(control) or held is not None
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
