@@ -137,7 +137,7 @@ def describe(
         part, past = _stretches(problem), lagged_states(signals, model.n)
         messages += _carried(few, discarded, problem, names, transients)
         alike = _collinear(problem, sums, names, past)
-        noisy, late, held = _noise_like(part, names), _delayed(part, signals, past), _held(part, signals)
+        noisy, late, held = _noise_like(part), _delayed(part, signals, past), _held(part, signals)
         messages += [*alike, *late, *held, *jittering(model, part, names), *_frozen(part, names, transients)]
         lacking = {} if late else _missing(part, signals)
         lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
@@ -145,7 +145,7 @@ def describe(
         messages += _weak(problem, sums, signals, past, lacking)
         later = [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)]
         messages += _fed_back(part, names, past, later)
-        messages += [m for i, m in noisy.items() if i not in lacking]
+        messages += _noisy({i: share for i, share in noisy.items() if i not in lacking}, names, part.dt)
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
     messages += _wide(sums, mean_width, names)
@@ -514,18 +514,23 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
     return where + (f"; and {len(indices) - 4} more" if len(indices) > 4 else "")
 
 
-def _noise_like(problem: Problem, names: Sequence[str]) -> dict[int, str]:
-    """States whose next sample cannot be predicted from those before."""
+def _noise_like(problem: Problem) -> dict[int, float]:
+    """States whose next sample cannot be predicted from those before, and the share of its variance that can."""
     n = problem.n
     share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
     moving = np.ptp(problem.z[:, :n], axis=0) > 0
-    slow = float(np.median(problem.dt)) * FASTEST >= 1.0
+    return {i: max(0.0, float(share[i])) for i in np.flatnonzero(moving & (share < NOISE)).tolist()}
+
+
+def _noisy(noise: dict[int, float], names: Sequence[str], dt: Array) -> list[str]:
+    """States that are mostly noise, in one message."""
+    slow = float(np.median(dt)) * FASTEST >= 1.0
     more = "how it moves needs faster rows" if slow else "leave it out where that says nothing, or record it at work"
-    return {
-        i: f"'{names[i]}' moves {_NOISE}: signals and controls at one instant predict {max(0.0, share[i]):.0%} of its "
-        f"variance at the next; its level is judged, {more}"
-        for i in np.flatnonzero(moving & (share < NOISE)).tolist()
-    }
+    listed, most = ", ".join(f"'{names[i]}'" for i in noise), max(noise.values(), default=0.0)
+    return [
+        f"{listed} {'moves' if len(noise) == 1 else 'move'} {_NOISE}: signals and controls at one instant predict "
+        f"{'at most ' * (len(noise) > 1)}{most:.0%} of the variance at the next; its level is judged, {more}"
+    ] * bool(noise)
 
 
 def _slow(model: UncertainLTI) -> list[str]:
