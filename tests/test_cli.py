@@ -291,9 +291,15 @@ def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, wor
     data = check_data(model, verdicts)
     assert f"ALARM: raised once, {words}" in check_text(data)
     assert ("2023-11-15T23:13:20 UTC, 25 h on  " in check_text(data).split("ALARM")[0]) == ("UTC" in words)
-    data["states"]["x1"]["jump"] = {**data["alarms"][0], "text": "x1 jumped"}
+    jump = {**data["alarms"][0], "change": -1.0, "largest_in_fit": 0.5, "text": "x1 jumped"}
+    data["states"]["x1"]["jump"] = jump
     at = words.removeprefix("first at ").rpartition(" for ")[0].rstrip(",")
     assert f"x1 jumped at {at}" in check_text(data).splitlines()
+    for i in range(7):  # of a plant's many states those that jumped farthest for what they are
+        new = {**jump, "largest_in_fit": 0.1 * (9 - i), "text": f"jump {i}"}
+        data["states"][f"other {i}"] = {**data["states"]["x1"], "jump": new}
+    jumps = [line.partition(" at ")[0] for line in check_text(data).splitlines() if "jump" in line]
+    assert jumps == ["jump 6", "jump 5", "x1 jumped", "jump 4", "jump 3", "  and 3 more jumps; --json has all"]
     (told,) = findings(model, "m.model.json", [verdicts])["happened"]
     assert ("first at 2023-11-15T23:13:20 UTC, 25 h on" in told["text"]) == (at.endswith("on"))
 

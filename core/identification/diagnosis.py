@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, runs
-from uncertain_lti.base.text import moment, plural, quoted
+from uncertain_lti.base.text import moment, plural, quoted, shortlist
 from uncertain_lti.identification import regimes
 from uncertain_lti.identification.discard import Carriers
 from uncertain_lti.identification.evidence import (
@@ -211,7 +211,7 @@ def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], pa
     """Signals that nearly move together, and the recording that would separate them."""
     free = np.flatnonzero(sums.phi_scale[: problem.p] > 0)
     free = free[~np.isin(free, list(past))]
-    messages = []
+    found: dict[str, str] = {}  # several combinations may be of the same signals
     for value, vector in zip(*[a.T for a in _directions(sums, free)], strict=True):
         part = [int(free[j]) for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
         if not 1e-12 * problem.p < value < COLLINEAR or len(part) < 2:
@@ -223,10 +223,13 @@ def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], pa
             cure = f"record steps of {quoted(controls)} that are sharper than {quoted(states)} can follow"
         else:
             cure = "excite them by other controls or from other initial states; the bounds hold as they are"
-        messages.append(
-            f"{quoted([names[j] for j in part])} nearly move together (all but {value**0.5:.2%} of their size), so "
-            f"their columns are poorly told apart and their elements may trade places: {cure}"
+        those = quoted([names[j] for j in part])
+        message = (
+            f"{those} nearly move together (all but {value**0.5:.2%} of their size), so their columns are poorly told "
+            f"apart and their elements may trade places: {cure}"
         )
+        found.setdefault(those, message)
+    messages = [*found.values()]
     if (groups := len(messages)) > MOST_GROUPS:
         messages[MOST_GROUPS:] = [
             f"{groups} combinations of signals nearly move together, of which the {MOST_GROUPS} nearest are named "
@@ -574,7 +577,7 @@ def _wide(sums: Moments, mean_width: Array, names: Sequence[str]) -> list[str]:
     """States whose envelope is as wide as what they do, and controls that never moved."""
     span, n = sums.high - sums.low, len(mean_width)
     wide = np.flatnonzero((span[:n] > 0) & (mean_width > WIDE * span[:n])).tolist()
-    listed = ", ".join(f"'{names[i]}' ({mean_width[i] / span[i]:.0%})" for i in wide)
+    listed = shortlist([f"'{names[i]}' ({mean_width[i] / span[i]:.0%})" for i in wide], 8)
     messages = [
         f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show there: "
         f"what moves it is not among the controls, one step is long for it, or the noise is as large; without an "

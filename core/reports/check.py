@@ -511,13 +511,16 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
             unknown = data["unknown_regime"] / data["verdicts"]
             blocks.append(f"unknown regime: {unknown:.2%} of the verdicts, which nothing vouches for")
     blocks += [f"  {text}" for text in data["unknown"]]
-    blocks += [f"{j['text']} at {instant_text(j)}" for s in data["states"].values() if (j := s["jump"]) is not None]
+    jumps = [j for s in data["states"].values() if (j := s["jump"]) is not None]
+    jumps.sort(key=lambda j: j["largest_in_fit"] / abs(j["change"]))
+    blocks += _first([f"{j['text']} at {instant_text(j)}" for j in jumps], "jump")
     frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
-    longest = {r["state"]: r for r in sorted(data["repeats"], key=lambda repeat: repeat["seconds"])}
+    every = {r["state"]: r for r in sorted(data["repeats"], key=lambda repeat: repeat["seconds"])}
+    longest = dict(sorted(every.items(), key=lambda item: -item[1]["seconds"]))
     blocks += _first(frozen, "frozen repeat")
     rest = "as of a machine at rest: the model does not move it"
     moves = {name: f"while {shortlist(r['moving'], 3)} moved" if r["moving"] else rest for name, r in longest.items()}
-    blocks += [f"warning: {r['text']}, {moves[name]}" for name, r in longest.items()]
+    blocks += _first([f"warning: {r['text']}, {moves[name]}" for name, r in longest.items()], "warning")
     told = [f"the alarm from {instant_text(like)} {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
     if alarms := data["alarms"]:

@@ -81,6 +81,7 @@ COARSE = 0.5
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
 _FAR = 10.0
+_NAMED = 6
 """A jump of so many times the range of a state is none that anybody need be told the size of."""
 _ABOVE = 1.0 + 1e-10
 """A threshold is this times the size that it is learnt from, which must not pass it by rounding."""
@@ -496,9 +497,9 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         )
     if still or blind:
         seen = [name for name in names if name not in (*still, *blind)]
-        why = [f"{', '.join(still)} never moved"] if still else []
-        why += [f"of {', '.join(blind)} not even a jump of the whole recorded range"] if blind else []
-        return "some", f"sees only {', '.join(seen)}: {'; '.join(why)}"
+        why = [f"{shortlist(still, _NAMED)} never moved"] if still else []
+        why += [f"of {shortlist(blind, _NAMED)} not even a jump of the whole recorded range"] if blind else []
+        return "some", f"sees only {shortlist(seen, _NAMED)}: {'; '.join(why)}"
     low, high = (np.format_float_positional(float(f"{100 * s:.2g}"), trim="-") for s in (share.min(), share.max()))
     ranges = f"{low} % of the recorded range" if low == high else f"{low} to {high} % of the recorded ranges"
     coarse = [name for name, s in zip(names, share.tolist(), strict=True) if s > COARSE]
@@ -525,7 +526,7 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
     of = list(zip(model.signals.states, panel.biases.tolist(), (panel.biases < _FAR * span).tolist(), strict=True))
     each = [f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "") for s, b, near in of if near]
     blind = [s.name for s, _, near in of if not near]
-    sees = [f"a jump of {', '.join(each)}"] if each else []
+    sees = [f"a jump of {shortlist(each, 2 * _NAMED)}"] if each else []
     sees += [f"of {shortlist(blind, 4)} not even a jump of ten times the recorded range"] if blind else []
     if math.isfinite(panel.limit):
         count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
