@@ -224,8 +224,8 @@ def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], pa
         else:
             cure = "excite them by other controls or from other initial states; the bounds hold as they are"
         those = quoted([names[j] for j in part])
-        told = f"{those} nearly move together (all but {value**0.5:.2%} of their size), so their columns are poorly told"
-        found.setdefault(those, f"{told} apart and their elements may trade places: {cure}")
+        why = f"(all but {value**0.5:.2%} of their size), so their columns are poorly told apart and their elements may"
+        found.setdefault(those, f"{those} nearly move together {why} trade places: {cure}")
     messages = [*found.values()]
     if (groups := len(messages)) > MOST_GROUPS:
         messages[MOST_GROUPS:] = [

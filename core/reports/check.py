@@ -549,9 +549,14 @@ def instant_text(instant: Mapping[str, Any], form: str = ".4f") -> str:
     return f"{day} UTC, {lasting(instant['t'] / 3600)} on"
 
 
+def raised_by(alarm: Mapping[str, Any]) -> list[str]:
+    """What raised it, farthest beyond its threshold first; none where containment alone did."""
+    by = [r for r in alarm["raised"] if r["rule"] != "containment"]
+    return [r["words"] for r in sorted(by, key=lambda r: -abs(r["value"]))]
+
+
 def _raised_by(alarm: Mapping[str, Any]) -> list[str]:
-    """The line on what raised it; none where containment alone did."""
-    by = [r["words"] for r in alarm["raised"] if r["rule"] != "containment"]
+    by = raised_by(alarm)
     return [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
 
 

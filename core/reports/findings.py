@@ -36,7 +36,7 @@ from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.check import UNVOUCHED, check_data, instant_text
+from uncertain_lti.reports.check import UNVOUCHED, check_data, instant_text, raised_by
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -160,9 +160,7 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         count, first = recording["episode_count"], instant_text(recording["episodes"][0]["first"], ".8g")
         text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first}; "
         text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}"
-    if alarms := recording["alarms"]:
-        text += f". The alarm was raised {times(len(alarms))}, first at {instant_text(alarms[0], '.8g')}"
-    elif bad:
+    if bad and not recording["alarms"]:
         text += ". The alarm was not raised"
     if judged and state == "unknown":
         text += f", but {recording['reason']}"
@@ -171,6 +169,9 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     elif held := [repeat for repeat in recording["repeats"] if repeat["moving"]]:
         longest = max(held, key=lambda repeat: repeat["seconds"])
         text += f". {longest['text']}, while {shortlist(longest['moving'], 3)} moved"
+    if alarms := recording["alarms"]:
+        by = "".join(f", by {words}" for words in raised_by(alarms[0])[:1])
+        text = f"The alarm was raised {times(len(alarms))}, first at {instant_text(alarms[0], '.8g')}{by}. {text}"
     return {"recording": recording["recording"], "state": state, "text": text}
 
 
