@@ -185,7 +185,7 @@ def _dynamics(model: UncertainLTI) -> list[Block]:
     """How fast a model is: eigenvalues, or what each regime rests on with its time constants."""
     if model.schedule is None:
         values = [v.real if v.imag == 0 else v for v in model.eigenvalues()]
-        return [f"eigenvalues of A [1/s]: {', '.join(f'{v:.4g}' for v in values)}"]
+        return [f"eigenvalues of A [1/s]: {shortlist([f'{v:.4g}' for v in values], MOST_SHOWN // 2)}"]
     title = f"scheduled on {model.schedule.words}, {plural(model.schedule.blocks, 'regime')}"
     return [title, blocks_table(model), *(f"note: {text}" for text in blocks_in_words(model))]
 
