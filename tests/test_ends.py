@@ -44,7 +44,12 @@ def test_the_end_at_which_a_command_acts_is_found(share: float, found: str, gain
     runs = [plant(run, share, gain) for run in range(4)]
     at, why = choose_ends(runs, **WAY)
     assert at == found and bool(why) == (at != "departure")
-    assert choose_ends(runs[:2], **WAY) == ("departure", ""), "two recordings say too little of it"
+    assert choose_ends(runs[:2], **WAY)[0] == found
+
+
+def test_two_recordings_choose_an_end_only_where_it_is_far_better() -> None:
+    runs = [plant(run, 1.0, noise=0.1) for run in range(4)]  # jumps of a half
+    assert choose_ends(runs, **WAY)[0] == "arrival" and choose_ends(runs[:2], **WAY) == ("departure", "")
 
 
 def test_a_controllers_answer_to_the_arrival_is_not_taken() -> None:

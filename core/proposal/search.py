@@ -108,17 +108,18 @@ def _what(left: Validation) -> dict[str, Any]:
 
 ENOUGH, COMPARED = 20, 20_000
 """Transitions per signal from which on ends of steps are compared, and transitions on which they are."""
-UNITS = 3
-"""Recordings, groups or blocks from which on they are: of two runs at one speed the arrival had smaller jumps, and ten
-times the false alarms at another speed."""
+UNITS, FAR_BETTER = 3, 0.2
+"""Recordings, groups or blocks from which on that decides, and share of the jumps that does so of two: of two runs at
+one speed the arrival had jumps of a third, and ten times the false alarms at another speed."""
 
 
 def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, str]:
     """At which end of a step the controls act, as far as nobody has said so, and why, in words, if not the departure.
 
-    The arrival is taken, or both ends, if the jumps seen on what was left out are smaller by PAYS (both only if clearly
-    smaller still). It is not tried where that may be a controller's answer: a command that follows from the state at
-    the arrival tells that state, and a fault that it follows hides. `options`: of `fit_monitored`.
+    The arrival is taken, or both ends, if the jumps seen on what was left out are smaller by PAYS, of two recordings by
+    FAR_BETTER (both only if clearly smaller still). It is not tried where that may be a controller's answer: a command
+    that follows from the state at the arrival tells that state, and a fault that it follows hides. `options`: of
+    `fit_monitored`.
     """
     if any(t.ends_given for t in transients):
         return "departure", ""
@@ -126,16 +127,16 @@ def choose_ends(transients: Sequence[Transient], **options: Any) -> tuple[At, st
     try:
         tried = {at: [t.controls_at(at) for t in few] for at in ("arrival", "both")}
         options |= {"schedule": {}, "describe_data": False}
-        figures: dict[At, float] = {}
+        figures, units = dict[At, float](), 0
         for at in _promising_ends(few, tried["arrival"]):
             panel = fit_monitored(tried.get(at, few), **options).panel
-            if panel is None or panel.units < UNITS or not panel.vouched:
+            if panel is None or not panel.vouched:
                 return "departure", ""
-            figures[at] = panel.figure
+            figures[at], units = panel.figure, panel.units
     except UncertainLTIError:  # a control is a state, or too little is left
         return "departure", ""
     base, least = figures.get("departure", 0.0), min(figures.values(), default=0.0)
-    if least >= PAYS * base:
+    if least >= (PAYS if units >= UNITS else FAR_BETTER) * base:
         return "departure", ""
     chosen = next(at for at, figure in figures.items() if CLEARLY * figure <= least)
     where = "the arrival" if chosen == "arrival" else "both ends"
