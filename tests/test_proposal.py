@@ -1357,6 +1357,39 @@ def test_nothing_depends_on_where_a_vehicle_heads_for(tmp_path, name, command, d
     assert ("structure:" in proposal.text) != depends, proposal.text
 
 
+def test_wheels_are_judged_by_what_their_encoders_count(tmp_path):
+    """A count that grows was a counter, and one that falls a place which another drive leaves: no slip was seen."""
+
+    def drive(number, slip=0.0):
+        rng, speed, way, rows = np.random.default_rng(number), np.zeros(2), np.array([900.0, 31000.0]), []
+        pwm = np.repeat(rng.integers(0, 255, (40, 2)) * [1, 0] + rng.integers(-255, 255, (40, 2)) * [0, 1], 50, axis=0)
+        for k, power in enumerate(pwm):
+            speed += 0.2 * (power * (8.0, 8.0 - 8.0 * slip * (k > 1000)) - speed)
+            way += 0.05 * speed
+            rows.append([power[0], power[1], np.floor(way[0]), (np.floor(way[1]) + 32768) % 65536 - 32768])
+        columns = dict(zip(("pwm_left", "pwm_right", "left_ticks", "encoder_right"), np.transpose(rows), strict=True))
+        return table_of(tmp_path / f"{number}.csv", columns, 0.05 * np.arange(len(rows)))
+
+    files = [drive(number) for number in range(3)]
+    proposal = propose(files)
+    assert [c.path for c in proposal.states] == ["left_ticks", "unwrap(encoder_right, 65536)"], proposal.text
+    assert "rate(left_ticks)" in proposal.text and "from: left_ticks, nominal: 0" in proposal.text
+    model = fitted(files, proposal)
+    checks = ((7, 0.0), (6, 0.3))
+    well, slips = (
+        EnvelopeMonitor(model).check(*read_transients([drive(n, slip)], model.signals)) for n, slip in checks
+    )
+    assert not well.alarm.any() and slips.alarm[1100:].mean() > 0.1, (well.alarm.mean(), slips.alarm[1100:].mean())
+
+
+def test_the_place_of_a_servo_depends_on_its_command(tmp_path):
+    rng = np.random.default_rng(3)
+    target = np.repeat(rng.integers(-3000, 3000, 60), 25)
+    count = np.rint(answers(rng, np.column_stack([target, target]))[:, 0])
+    proposal = propose([table_of(tmp_path / "a.csv", {"encoder": count, "target": target}, 0.05 * np.arange(1500))])
+    assert [c.path for c in proposal.states] == ["encoder"] and "structure:" not in proposal.text, proposal.text
+
+
 def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
     """Another drive is elsewhere, and the numbers of a mode are names: neither tells what comes next."""
     rng = np.random.default_rng(3)

@@ -18,7 +18,7 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from itertools import product
+from itertools import product, repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,14 +49,16 @@ from uncertain_lti.proposal.signals_file import (
     COMPASS,
     clock_of,
     columns_of,
+    endless,
     entry,
     name_signals,
+    of_wheel,
     set_operating_point,
     set_own_scale,
     signals_file,
     words_of,
 )
-from uncertain_lti.proposal.tune import choose_memories
+from uncertain_lti.proposal.tune import Remembered, choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
 from uncertain_lti.recordings.table import TYPE, Table
@@ -312,17 +314,18 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "a time that a computer took, by its name, and no signal of the machine"
     if source.type == TYPE and _PLACE.search("_".join(words_of(candidate.path))):
         return "a place on the map, and another run may be elsewhere"
-    names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() else _CLOCK
+    wheel = of_wheel(candidate)
+    names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() and not wheel else _CLOCK
     if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
         steps = np.concatenate([np.diff(v) for v in apart])
         clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
-    if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival))):
+    if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival, repeat(wheel)))):
         return "grows as a clock or a counter does"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
-def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
-    """Never falls, and is a whole number or follows the time of arrival; or counts rows or is a stamp, if it falls."""
+def _counts(values: Array, arrival: NDArray[np.int64], wheel: bool) -> bool:
+    """Never falls, and is a whole number, but that of a wheel, or follows the time; or counts rows, or is a stamp."""
     good = np.isfinite(values)
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
     if len(finite) < 3 or np.ptp(t) == 0:
@@ -334,7 +337,8 @@ def _counts(values: Array, arrival: NDArray[np.int64]) -> bool:
         return True
     if (np.diff(finite) < 0).any():
         return False
-    return follows or bool(len(np.unique(finite)) >= 0.5 * len(finite) and (finite == np.rint(finite)).all())
+    whole = len(np.unique(finite)) >= 0.5 * len(finite) and (finite == np.rint(finite)).all()
+    return follows or bool(whole and not wheel)
 
 
 _OF_BODY = re.compile(
@@ -383,13 +387,14 @@ def _wrapped(source: Source) -> None:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         finite = [values[np.isfinite(values)] for values in candidate.values]
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
-        jumps = (t for t in (math.tau, 360.0) if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
+        turns = (math.tau, 360.0) if not (wheel := of_wheel(candidate)) else (65536.0,)  # of 16 bits
+        jumps = (t for t in turns if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
         low, high = candidate.finite.min(), candidate.finite.max()
         compass = COMPASS.search(candidate.path) and -180 <= low and high <= 360 and max(-low, high) > math.tau
         turn = math.tau if angle else next(jumps, 360.0 if compass else 0.0)
         named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg)", candidate.path.lower())
-        if angle or (turn and named):
-            candidate.path = f"unwrap({candidate.path}{', 360' * (turn > 7)})"
+        if angle or (turn and (named or wheel)):
+            candidate.path = f"unwrap({candidate.path}{f', {turn:.0f}' * (turn > 7)})"
             candidate.values = [_unwrapped(v, turn) for v in candidate.values]
 
 
@@ -552,7 +557,7 @@ def _members(
 
 
 def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[str]:
-    """Lines of what narrows the envelope of the proposed states on left-out data."""
+    """Lines of what narrows the envelope of the proposed states on left-out data, and of how fast wheels turned."""
     group, clock = [*states, *controls], clock_of(states, sources)
     names, n, transients = [c.name for c in group], len(states), []
     for number, z in enumerate(columns_of(states, controls, sources)):
@@ -565,11 +570,16 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
             transients.append(Transient(t, z[:, :n], z[:, n:], state_names=names[:n], control_names=names[n:]))
     if not transients:
         return []
-    chosen, width = choose_memories(transients, "noise")
-    gain = f"with it, mean width x {width:.2g} on left-out data"
+    on = endless(states, controls)
+    if chosen := tuple(Remembered(c.name, Memory("rate")) for c in on if of_wheel(c)):
+        gain = "how fast it turned"
+    else:
+        chosen, width = choose_memories(transients, "noise")
+        gain = f"with it, mean width x {width:.2g} on left-out data"
     lines = ["  # known before the step, so without a row of its own and without a verdict"] if chosen else []
     for one in chosen:
         of = group[names.index(one.of)]
+        one = replace(one, memory=Memory("rate")) if of in on else one  # what it was alone says nothing
         memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
         steady = of.steady if memory.kind == "lag" else 0.0
         path, unit = memory.of(of.path), memory.unit(of.unit)

@@ -40,6 +40,7 @@ _DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value"
 
 COMPASS = re.compile(r"(?i)(heading|hdg|azimuth|compass)(_?deg\w*)?(?!\w)")
 """Name of the direction in which a vehicle is: nothing depends on it, and another drive may go elsewhere."""
+_WHEEL = re.compile(r"(^|_)(ticks?|enc(oders?)?)(_|$)")
 
 
 _UNITS = (
@@ -86,6 +87,12 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
 def words_of(text: str) -> list[str]:
     """Words of a name, in small letters: `gnss`, `pos`, `time` of `gnss_posTime`."""
     return [w.lower() for w in _PARTS.findall(text)]
+
+
+def of_wheel(candidate: Candidate) -> bool:
+    """Whether a number is what the encoder of a wheel or a motor counts, by its name."""
+    topic = "" if of_table(candidate.topic) else candidate.topic.rpartition("/")[2]
+    return _WHEEL.search("_".join(words_of(f"{topic} {FieldPath(candidate.path).angle}"))) is not None
 
 
 def clock_of(states: Sequence[Candidate], sources: Sequence[Source]) -> Source:
@@ -172,7 +179,7 @@ def signals_file(
         "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",
-        *([] if plant else [_ADDITIVE, "additive: noise", ""]),
+        *([] if plant else [_ADDITIVE, f"additive: {'both' if any(map(of_wheel, states)) else 'noise'}", ""]),
     ]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     by_arrival = any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0
@@ -225,7 +232,7 @@ def signals_file(
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
         lines = for_members(lines, states[0].element, list(members))
-    elif around := [] if any(map(_holds_course, controls)) else [c for c in states if _turns(c)]:
+    elif around := endless(states, controls):
         lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle heads for.", "structure:"]
         lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
@@ -244,17 +251,28 @@ def _recordings(bags: Sequence[Recording]) -> list[str]:
 _LISTED = 40
 
 
+def endless(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[Candidate]:
+    """States on which nothing depends, as they go on from turn to turn, or where the next drive goes."""
+    return [c for c in states if _turns(c) and not any(_holds(control, c) for control in controls)]
+
+
 def _turns(candidate: Candidate) -> bool:
-    """Whether an angle went round by half a turn or more, or the next drive may head elsewhere."""
+    """Whether a count or an angle goes on: it went round by half a turn, or another drive may be elsewhere."""
     spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
     turn = FieldPath(candidate.path).unwrap
-    return turn > 0 and (max(spans, default=0.0) >= turn / 2 or COMPASS.search(candidate.path) is not None)
+    goes_on = max(spans, default=0.0) >= turn / 2 or COMPASS.search(candidate.path) is not None
+    return of_wheel(candidate) or (turn > 0 and goes_on)
 
 
-def _holds_course(control: Candidate) -> bool:
-    """Whether an angle depends on a command for it, such as the course that an autopilot holds."""
-    held = re.search(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)", control.path)
-    return _turns(control) or held is not None
+_COURSE = re.compile(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)")
+_PLACES = {"pos", "position", "set", "setpoint", "target", "goal", "desired", "ref", "reference"}
+
+
+def _holds(control: Candidate, state: Candidate) -> bool:
+    """Whether a command may be for the angle itself, as the course of an autopilot or the place of a servo is."""
+    if of_wheel(state):
+        return not _PLACES.isdisjoint(words_of(control.path))
+    return _turns(control) or _COURSE.search(control.path) is not None
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
