@@ -16,9 +16,11 @@ disturbs no other topic.
 from __future__ import annotations
 
 import functools
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -204,7 +206,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
         elif type_name in _store().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
-            remedy = "convert it to MCAP where its package is installed (`ros2 bag convert`)"
+            remedy = "source the workspace that has its package, or convert it to MCAP there (`ros2 bag convert`)"
             raise TypesysError(f"the file holds no definition of {type_name}, nor does ROS 2; {remedy}")
         used: dict[str, int] = {}
         _complete(type_name, types, (), used)
@@ -229,8 +231,22 @@ def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
     name = distribution.upper() if f"ROS2_{distribution.upper()}" in Stores.__members__ else "JAZZY"
     store = _store(name)
     if type_name not in store.fielddefs:
-        return "", ""
+        return _installed_text(type_name), "the workspaces that are sourced here"
     return str(store.generate_msgdef(type_name, ros_version=2)[0]), f"ROS 2 {name.capitalize()}"
+
+
+def _installed_text(type_name: str) -> str:
+    """Definition of a type, and of those it uses, as packages of sourced workspaces have them; else nothing."""
+    roots, texts, wanted = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), dict[str, str](), [type_name]
+    for name in wanted:
+        package, _, kind = name.partition("/msg/")
+        paths = (Path(root, "share", package, "msg", f"{kind}.msg") for root in roots)
+        if name not in texts and name not in _store().fielddefs and (path := next(filter(Path.is_file, paths), None)):
+            texts[name] = _readable("ros2msg", path.read_bytes())
+            used = re.findall(r"^(?:(\w+)/(?:msg/)?)?([A-Z]\w*)[\s[<]", texts[name], re.MULTILINE)
+            wanted += [f"{where or package}/msg/{what}" for where, what in used]
+    parts = [texts.pop(type_name, ""), *(f"MSG: {name.replace('/msg/', '/')}\n{text}" for name, text in texts.items())]
+    return f"{'=' * 80}\n".join(parts)
 
 
 def ros2_text(type_name: str, text: bytes) -> bytes:
