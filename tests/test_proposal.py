@@ -427,11 +427,17 @@ def test_the_place_of_a_body_that_turns_goes_and_the_load_of_its_computer(turn, 
     for k in range(2000):
         u = float(rng.normal()) if k % 40 == 0 else u
         rows.append([f"{0.02 * k:.2f}", x, y, math.remainder(heading, math.tau), v + 1e-3 * rng.normal(), 30 + u, u])
-        x, y, heading = x + 0.02 * v * math.cos(heading), y + 0.02 * v * math.sin(heading), heading + 0.02 * turn
+        rows[-1].append(20_000 * (k % 50))
+        x, y, heading = (
+            x + 0.02 * v * math.cos(heading),
+            y + 0.02 * v * math.sin(heading),
+            heading + 0.02 * turn * (1 + 2 * math.sin(k / 90)),
+        )
         v += 0.02 * (5 + 2 * u - v)
-    names = ["time", "vicon x", "vicon y", "vicon yaw", "speed", "CPU0", "throttle"]
+    names = ["time", "vicon x", "vicon y", "vicon yaw", "speed", "CPU0", "throttle", "state_usec"]
     proposal = propose([csv(tmp_path / "car.csv", names, rows)])
     assert "/table CPU0: of a computer, by its name" in proposal.text
+    assert "/table state_usec: grows as a clock" in proposal.text, proposal.text
     assert proposal.text.count("a place of a body that turns") == 2 * left, proposal.text
 
 

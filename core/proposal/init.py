@@ -82,9 +82,9 @@ _RUN = re.compile(
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
-_CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
+_CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
 _COMPUTER = re.compile(r"(^|_)(elapsed|latency|cpu\d*)(_|$)|^dt$")  # what it took for a cycle, and how busy it is
-_COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id"}  # likewise, of whole numbers
+_COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
