@@ -30,6 +30,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.recordings.message_types import define
 from uncertain_lti.sampling.reading import check_paths
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -119,6 +120,12 @@ def test_a_sourced_workspace_has_the_definitions_that_an_old_database_lacks(conv
     every = zip(bag.messages(["/engine/state"]), Bag(converted["mcap"]).messages(["/engine/state"]), strict=True)
     for (_, time, mine), (_, expected, theirs) in every:
         assert time == expected and mine.rest.position.tobytes() == theirs.position.tobytes()
+    define.cache_clear()
+    assert define("car_msgs/msg/Wheels", "ros2msg", b"").note.endswith("that of a sourced workspace is used")
+    assert "nor does ROS 2" in define("car_msgs/msg/Motors", "ros2msg", b"").reason
+    (share / "Motors.msg").write_text("Wheels front\nLost rear\n")
+    define.cache_clear()
+    assert "car_msgs/msg/Lost is used and not defined" in define("car_msgs/msg/Motors", "ros2msg", b"").reason
 
 
 def test_an_annotated_copy_is_that_of_the_mcap(converted, tmp_path):

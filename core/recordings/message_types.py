@@ -15,6 +15,7 @@ disturbs no other topic.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 import re
@@ -191,13 +192,16 @@ def _plain(data: bytes) -> bytes:
 def define(name: str, encoding: str, text: bytes) -> Definition:
     """Definition from a schema; its reason says what failed.
 
-    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise for
-    types that a text uses and does not define.
+    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it, and that of a
+    sourced workspace for others; likewise Jazzy's for types that a text uses and does not define.
     """
     type_name = full_name(name)
     types: dict[str, Any] = {}
     store = get_typestore(Stores.EMPTY)
     reason = note = ""
+    if not text.strip() and (found := _installed_text(type_name)):
+        encoding, text = "ros2msg", found.encode()
+        note = f"the file holds no definition of {type_name}; that of a sourced workspace is used"
     try:
         if len(text) > _LARGEST_SCHEMA:
             raise TypesysError(f"its definition is {len(text)} bytes long")
@@ -237,16 +241,20 @@ def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
 
 def _installed_text(type_name: str) -> str:
     """Definition of a type, and of those it uses, as packages of sourced workspaces have them; else nothing."""
-    roots, texts, wanted = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep), dict[str, str](), [type_name]
-    for name in wanted:
-        package, _, kind = name.partition("/msg/")
-        paths = (Path(root, "share", package, "msg", f"{kind}.msg") for root in roots)
-        if name not in texts and name not in _store().fielddefs and (path := next(filter(Path.is_file, paths), None)):
-            texts[name] = _readable("ros2msg", path.read_bytes())
-            used = re.findall(r"^(?:(\w+)/(?:msg/)?)?([A-Z]\w*)[\s[<]", texts[name], re.MULTILINE)
-            wanted += [f"{where or package}/msg/{what}" for where, what in used]
+    roots = list(filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))
+    texts, wanted = dict[str, str](), [type_name]
+    for name in wanted if roots else ():
+        named = re.fullmatch(r"(\w{1,99})/msg/(\w{1,99})", name)
+        if not named or name in texts or name in _store().fielddefs:
+            continue
+        paths = (Path(root, "share", named[1], "msg", f"{named[2]}.msg") for root in roots)
+        with contextlib.suppress(OSError, TypesysError):
+            if path := next(filter(Path.is_file, paths), None):
+                texts[name] = _readable("ros2msg", path.read_bytes())
+                used = re.findall(r"^(?:(\w+)/(?:msg/)?)?([A-Z]\w*)[\s[<]", texts[name], re.MULTILINE)
+                wanted += [f"{where or named[1]}/msg/{what}" for where, what in used]
     parts = [texts.pop(type_name, ""), *(f"MSG: {name.replace('/msg/', '/')}\n{text}" for name, text in texts.items())]
-    return f"{'=' * 80}\n".join(parts)
+    return f"{'=' * 80}\n".join(parts).strip()
 
 
 def ros2_text(type_name: str, text: bytes) -> bytes:
