@@ -9,6 +9,7 @@
 
 """rosbag2 databases and ROS 1 bags: what they give is what the same data in MCAP gives, and damage is a sentence."""
 
+import os
 import random
 import re
 import shutil
@@ -29,6 +30,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.cli.main import main
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.recordings.message_types import define
 from uncertain_lti.sampling.reading import check_paths
 from uncertain_lti.signals.signal_map import SignalMap
 
@@ -99,6 +101,31 @@ def test_the_same_bits_as_in_mcap(converted, kind):
     bag, signals = Bag(converted[kind]), SignalMap.load(converted["signals"])
     columns = bag.columns(signals.topics, check_paths(bag, signals))
     assert columns.alone <= 4 < len(columns.topic)  # the rest was read in blocks, by its plan
+
+
+def test_a_sourced_workspace_has_the_definitions_that_an_old_database_lacks(converted, tmp_path, monkeypatch):
+    """A command of a package that is no part of ROS 2, such as ackermann_msgs, was lost, and with it the controls."""
+    path, share = tmp_path / "run.db3", tmp_path / "install" / "share" / "car_msgs" / "msg"
+    shutil.copy(converted["old db3"], path)
+    with closing(sqlite3.connect(path)) as database:
+        database.execute("UPDATE topics SET type = 'car_msgs/msg/Wheels' WHERE name = '/engine/state'")
+        database.commit()
+    assert "source the workspace that has its package" in Bag(path).topics["/engine/state"].reason
+    share.mkdir(parents=True)
+    (share / "Wheels.msg").write_text("# of a car\nstd_msgs/Header header\nstring[] name\nRest rest  # as JointState\n")
+    (share / "Rest.msg").write_text("float64[] position\nfloat64[] velocity\nfloat64[] effort\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", os.pathsep.join([str(tmp_path), str(tmp_path / "install")]))
+    bag = Bag(path)
+    assert any("and the workspaces that are sourced here are used" in note for note in bag.warnings), bag.warnings
+    every = zip(bag.messages(["/engine/state"]), Bag(converted["mcap"]).messages(["/engine/state"]), strict=True)
+    for (_, time, mine), (_, expected, theirs) in every:
+        assert time == expected and mine.rest.position.tobytes() == theirs.position.tobytes()
+    define.cache_clear()
+    assert define("car_msgs/msg/Wheels", "ros2msg", b"").note.endswith("that of a sourced workspace is used")
+    assert "nor does ROS 2" in define("car_msgs/msg/Motors", "ros2msg", b"").reason
+    (share / "Motors.msg").write_text("Wheels front\nLost rear\n")
+    define.cache_clear()
+    assert "car_msgs/msg/Lost is used and not defined" in define("car_msgs/msg/Motors", "ros2msg", b"").reason
 
 
 def test_an_annotated_copy_is_that_of_the_mcap(converted, tmp_path):

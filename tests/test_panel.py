@@ -389,6 +389,10 @@ def test_a_monitor_that_sees_large_jumps_alone_is_not_praised(learnt, shares, ki
     found = worth(full, replace(panel, biases=span * shares, unlike=()))
     assert found[0] == kind and found[1].startswith(words)
     assert "large" in words or "large" not in found[1]
+    if kind == "good":  # where most of the recordings would alarm at thresholds of the others
+        panel = replace(panel, biases=span * shares, unlike=())
+        panel.__dict__["alarming"] = panel.units // 2 + 1
+        assert worth(full, panel)[0] == "some" and "expect an alarm in most" in worth(full, panel)[1]
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.002, None])

@@ -221,7 +221,7 @@ def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_
     ("topic", "role"),
     [
         ("/controller/forward_kinematics", ""), ("/arm_controller/state", "state"), ("/motor_controls", "control"),
-        ("/thruster/cmd/left", "control"), ("/controller/cmd_out", "control"),
+        ("/thruster/cmd/left", "control"), ("/controller/cmd_out", "control"), ("/u_speed", "control"),
     ],
 )  # fmt: skip
 def test_a_controller_publishes_all_kinds(topic, role):
@@ -236,6 +236,7 @@ def test_a_magnetometer_and_a_frame_are_measured_though_their_type_says_little()
 
 COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "yaw_sp_move_rate", "level_sp", "ref_x")]
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
+COLUMNS += [("action[0..5]", "control"), ("action_3", "control"), ("reaction", "state"), ("tau[0..6]", "control")]
 COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
 
 
@@ -417,6 +418,27 @@ def test_the_place_of_a_body_goes_where_its_velocities_are_its_own(names, own, t
         v += 0.02 * (5 + 2 * u - v)
     proposal = propose([csv(tmp_path / "car.csv", ["time", *names, "throttle_cmd"], rows)])
     assert ("a place in a fixed frame, where the velocities are the body's" in proposal.text) == own, proposal.text
+
+
+@pytest.mark.parametrize(("turn", "left"), [(0.4, True), (0.01, False)])
+def test_the_place_of_a_body_that_turns_goes_and_the_load_of_its_computer(turn, left, tmp_path):
+    """Of a car on a track a drive elsewhere was outside all that was fitted."""
+    rng, rows, x, y, heading, v, u = np.random.default_rng(8), [], 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(2000):
+        u = float(rng.normal()) if k % 40 == 0 else u
+        rows.append([f"{0.02 * k:.2f}", x, y, math.remainder(heading, math.tau), v + 1e-3 * rng.normal(), 30 + u, u])
+        rows[-1].append(20_000 * (k % 50))
+        x, y, heading = (
+            x + 0.02 * v * math.cos(heading),
+            y + 0.02 * v * math.sin(heading),
+            heading + 0.02 * turn * (1 + 2 * math.sin(k / 90)),
+        )
+        v += 0.02 * (5 + 2 * u - v)
+    names = ["time", "vicon x", "vicon y", "vicon yaw", "speed", "CPU0", "throttle", "state_usec"]
+    proposal = propose([csv(tmp_path / "car.csv", names, rows)])
+    assert "/table CPU0: of a computer, by its name" in proposal.text
+    assert "/table state_usec: grows as a clock" in proposal.text, proposal.text
+    assert proposal.text.count("a place of a body that turns") == 2 * left, proposal.text
 
 
 def test_what_does_not_move_or_is_no_number_stands_in_comments(tmp_path):
@@ -1231,7 +1253,7 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     assert why["S_PU1"] == "switched between 0, 1" and why["F_PU1"] == "0 whenever S_PU1 is off"
     assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
-                  "Level1_again: moves with Level1", "elapsed: a time that a computer took"):  # fmt: skip
+                  "Level1_again: moves with Level1", "elapsed: of a computer"):  # fmt: skip
         assert re.search(words, proposal.text), words
     assert not any(c.steady for c in [*proposal.states, *proposal.controls]), "fit decides what to count from"
     model = fitted([path], proposal)

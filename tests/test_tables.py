@@ -130,6 +130,36 @@ def test_parquet_and_feather(shipped, names, tmp_path):
         refuses(BagError, f"run{suffix}: is damaged or no {suffix} file", open_recording, tmp_path / f"run{suffix}")
 
 
+def test_lists_of_a_parquet_are_matrices_where_all_rows_have_as_many(tmp_path):
+    """The joints of an arm, as LeRobot writes them; a list that differs in length, or holds text, is told."""
+    pa = pytest.importorskip("pyarrow", reason="pyarrow, of the extra tables, is not installed")
+    from pyarrow import parquet
+
+    joints = np.arange(60.0).reshape(20, 3)
+    columns = {"timestamp": pa.array(np.arange(20) / 30, pa.float32())}
+    for name, kind in (("state", pa.list_(pa.float32(), 3)), ("action", pa.list_(pa.int64())), ("words", None)):
+        columns[name] = pa.array(joints.astype(int if name == "action" else float).tolist(), kind)
+    columns["words"] = pa.array([["a", "b"]] * 20)
+    columns["uneven"] = pa.array([[1.0]] * 19 + [[1.0, 2.0]])
+    columns["gap"] = pa.array([[1.0]] * 19 + [None])
+    parquet.write_table(pa.table(columns), tmp_path / "episode.parquet")
+    table = Table(tmp_path / "episode.parquet")
+    fields = table.columns_by_field
+    assert set(fields) == {"state", "action"} and all((fields[name] == joints).all() for name in fields)
+    left = " ".join(table.warnings)
+    assert all(f"'{name}'" in left for name in ("words", "uneven", "gap")), left
+
+
+def test_a_time_that_each_row_has_goes_before_that_of_a_slower_sensor(tmp_path):
+    """Rows at 100 Hz with the time of a sensor at 10 Hz beside their own had gaps of minutes, as that sensor paused."""
+    rows = [f"{0.1 * (k // 10) + 900 * (k > 50):.1f},{k % 7},{1.7e9 + 0.01 * k:.2f}" for k in range(100)]
+    bag = read_csv(tmp_path, "elapsed time sensors,current,vicon time", rows)
+    assert set(np.diff(bag.times).tolist()) == {10**7} and "column 'vicon time': it is taken for the" in bag.warnings[0]
+    rows = [f"{0.1 * k:.1f},{k % 7},{1.7e9 + 0.01 * k:.2f}" for k in range(100)]
+    bag = read_csv(tmp_path, "elapsed time sensors,current,vicon time", rows)
+    assert set(np.diff(bag.times).tolist()) == {10**8} and not bag.warnings
+
+
 def test_decimal_commas_in_quotes_are_read_unless_they_may_part_thousands(tmp_path):
     path = tmp_path / "a.csv"
     for time, numbers in (("{:.1f}", True), ("{:.0f}", False)):  # what parts decimals in one column does in each
@@ -1060,11 +1090,9 @@ def test_row_numbers_without_a_name_are_no_time(tmp_path):
     assert "taken for the time" in open_recording(tmp_path / "b.csv").warnings[0]
 
 
-def test_another_time_is_told_where_most_rows_share_one(tmp_path):
+def test_another_time_is_taken_where_most_rows_share_one(tmp_path):
     bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
-    assert bag.warnings[0].endswith(
-        "write times with more decimals, or take column 't [ms]', `table: {time: 't [ms]'}`"
-    )
+    assert set(np.diff(bag.times).tolist()) == {10**8} and "and 'Timestamp' does not" in bag.warnings[0]
     bag = read_csv(tmp_path, "time,x", (f"{k - k // 4},{k}" for k in range(100)))
     assert "only the first of such rows counts: write times" in bag.warnings[0]
     assert not read_csv(tmp_path, "time_s,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9))).warnings

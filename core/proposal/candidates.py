@@ -338,7 +338,7 @@ _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|pedal|joy|ackerm
 _COMMANDS += "|drive(?!n|_?(train|axle|shaft|wheel|end))"  # parts of a machine are none
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 _COLUMN = re.compile(
-    r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
+    r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
 )
 _DESIRED = re.compile(r"(^|_)(Des[A-Z]|[A-Z]Des$)")  # as the log of an autopilot spells what its controllers follow
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
@@ -399,7 +399,7 @@ def role_by_name(topic: str, type_name: str) -> str:
             return "state"
         if _REFERENCE.search(text):
             return "reference"
-        bare_twist = text == last and kind == "twist" and text.endswith("vel")  # what drives a base
+        bare_twist = text == last and (text.startswith("u_") or (kind == "twist" and text.endswith("vel")))  # of a base
         if bare_twist or (_ABOVE if text == name != last else _COMMAND).search(text):
             return "control"
         if _STATE.search(text):
@@ -419,7 +419,7 @@ def bare(name: str) -> str:
 
 def role_of_column(name: str, beside: Collection[str] = ()) -> str:
     """What a column of a table seems to be by its name, and those `beside` it, as `bare` gives them."""
-    low = bare(name)
+    low = bare(name.partition("[")[0])
     if (outlet := re.sub(r"(^|_)in(?=_|$)", r"\1out", low)) != low and outlet in beside:
         return "state"
     if _BODY[0].issubset(beside) and not _BODY[1].isdisjoint(beside):

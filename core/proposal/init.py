@@ -68,8 +68,8 @@ from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
 from uncertain_lti.signals.values import TableLayout
 
-LONGEST_ARRAY = 24
-"""Entries of an array that are looked at one by one; a longer one is a picture, a scan or a map."""
+LONGEST_ARRAY = 35
+"""Entries of an array that are looked at one by one, such as motors of a humanoid; a longer one is a matrix, a scan."""
 
 
 DUST = 1e-9
@@ -85,9 +85,9 @@ _RUN = re.compile(
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
-_CLOCK |= {"odometer", "mileage", "miles"}  # or of what counts the way
-_TAKEN = {"elapsed", "latency"}  # what a computer took for a cycle
-_COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id"}  # likewise, of whole numbers
+_CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
+_COMPUTER = re.compile(r"(^|_)(elapsed|latency|cpu\d*)(_|$)|^dt$")  # what it took for a cycle, and how busy it is
+_COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
@@ -310,9 +310,10 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    if source.type == TYPE and (not _TAKEN.isdisjoint(words_of(candidate.path)) or candidate.path.lower() == "dt"):
-        return "a time that a computer took, by its name, and no signal of the machine"
-    if source.type == TYPE and _PLACE.search("_".join(words_of(candidate.path))):
+    name = "_".join(words_of(candidate.path))
+    if _COMPUTER.search(name):
+        return "of a computer, by its name, and no signal of the machine"
+    if source.type == TYPE and _PLACE.search(name):
         return "a place on the map, and another run may be elsewhere"
     wheel = of_wheel(candidate)
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() and not wheel else _CLOCK
@@ -345,16 +346,27 @@ _OF_BODY = re.compile(
     r"(?P<place>(pos(ition)?_?)?(?P<a>[xy])(_?pos(ition)?)?(_m)?)|(v|vel|velocity|speed)_?(?P<b>[xy])|(?P<c>[xy])_?(vel|dot)"
 )
 """Columns of the place of a body in a plane, and of its velocity."""
+_HEADED = re.compile(r"(unwrap\()?(?P<of>.*?)_?((?P<place>[xy])|yaw|heading|theta|psi)(, 360)?\)?")
+"""Columns of such a place and of where the body heads, `of` one name."""
 
 
 def _leave_out_places(source: Source) -> None:
-    """Of a body whose velocities are in its own frame: its place goes where it heads, which no linear model has."""
+    """Leave out the place of a body that turns, or has velocities of its own: it goes where the body heads."""
     found = [(c, m) for c in source.free if (m := _OF_BODY.fullmatch(bare(c.path)))]
     places = {m["a"]: c for c, m in found if m["place"]}
     velocities = {m["b"] or m["c"]: c for c, m in found if not m["place"]}
+    reason, left = "a place in a fixed frame, where the velocities are the body's", list[Candidate]()
+    headed = {c: m for c in source.free if (m := _HEADED.fullmatch(c.path.lower()))}
     if len(places) == len(velocities) == 2 and not all(_rate_of(places[axis], velocities[axis]) for axis in "xy"):
-        for candidate in places.values():
-            candidate.reason, candidate.ready = "a place in a fixed frame, where the velocities are the body's", "state"
+        left = list(places.values())
+    elif len(velocities) < 2 and len(source.free) > len(headed):  # more than a pose is measured
+        turning = {m["of"] for c, m in headed.items() if not m["place"] and np.ptp(c.finite) > 1.0}  # rad
+        reason, left = (
+            "a place of a body that turns",
+            [c for c, m in headed.items() if m["place"] and m["of"] in turning],
+        )
+    for candidate in left:
+        candidate.reason, candidate.ready = reason, "state"
 
 
 def _rate_of(place: Candidate, velocity: Candidate) -> bool:

@@ -224,7 +224,7 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
             lists = f"its index lists {len(reader.chunks)}"
             found.warnings.append(found.damaged(f"holds {count(chunks, 'chunk')}, and {lists}"))
         stated = sum(sum(info.connection_counts.values()) for info in reader.chunk_infos)
-    schemas, borrowed = dict[tuple[str, str], int](), ""
+    schemas, borrowed = dict[tuple[str, str], int](), set[str]()
     for number, connection in enumerate(reader.connections, start=1):
         kind, text = connection.msgtype, connection.msgdef.data
         if (schema := schemas.get((kind, text), 0)) == 0:
@@ -234,7 +234,8 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
                 data = ros2_text(kind, data)
             elif not text:
                 text, store = distribution_text(kind, distribution)
-                data, borrowed = text.encode(), borrowed or store
+                data = text.encode()
+                borrowed |= {store} if text else set()
             found.schemas[schema] = Schema(schema, data, encoding, kind)
         found.numbers[connection.id] = number
         metadata = {"offered_qos_profiles": qos[connection.id]} if qos.get(connection.id) else {}
@@ -244,7 +245,7 @@ def _declare(found: Foreign, reader: Any, chunks: int) -> int:
         found.channels[number] = Channel(number, topic, stored, metadata, schema)
     if borrowed:
         lacks = "the file does not hold the definitions of all its types"
-        found.warnings.append(f"{found.path}: {lacks}; those of {borrowed} are used")
+        found.warnings.append(f"{found.path}: {lacks}; those of {' and '.join(sorted(borrowed))} are used")
     return int(stated)
 
 

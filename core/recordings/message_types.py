@@ -15,10 +15,13 @@ disturbs no other topic.
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -189,13 +192,16 @@ def _plain(data: bytes) -> bytes:
 def define(name: str, encoding: str, text: bytes) -> Definition:
     """Definition from a schema; its reason says what failed.
 
-    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it; likewise for
-    types that a text uses and does not define.
+    Where the file holds no text, the definition of ROS 2 Jazzy is taken for a type that is part of it, and that of a
+    sourced workspace for others; likewise Jazzy's for types that a text uses and does not define.
     """
     type_name = full_name(name)
     types: dict[str, Any] = {}
     store = get_typestore(Stores.EMPTY)
     reason = note = ""
+    if not text.strip() and (found := _installed_text(type_name)):
+        encoding, text = "ros2msg", found.encode()
+        note = f"the file holds no definition of {type_name}; that of a sourced workspace is used"
     try:
         if len(text) > _LARGEST_SCHEMA:
             raise TypesysError(f"its definition is {len(text)} bytes long")
@@ -204,7 +210,7 @@ def define(name: str, encoding: str, text: bytes) -> Definition:
         elif type_name in _store().fielddefs:
             note = f"the file holds no definition of {type_name}; that of ROS 2 Jazzy is used"
         else:
-            remedy = "convert it to MCAP where its package is installed (`ros2 bag convert`)"
+            remedy = "source the workspace that has its package, or convert it to MCAP there (`ros2 bag convert`)"
             raise TypesysError(f"the file holds no definition of {type_name}, nor does ROS 2; {remedy}")
         used: dict[str, int] = {}
         _complete(type_name, types, (), used)
@@ -229,8 +235,26 @@ def distribution_text(type_name: str, distribution: str) -> tuple[str, str]:
     name = distribution.upper() if f"ROS2_{distribution.upper()}" in Stores.__members__ else "JAZZY"
     store = _store(name)
     if type_name not in store.fielddefs:
-        return "", ""
+        return _installed_text(type_name), "the workspaces that are sourced here"
     return str(store.generate_msgdef(type_name, ros_version=2)[0]), f"ROS 2 {name.capitalize()}"
+
+
+def _installed_text(type_name: str) -> str:
+    """Definition of a type, and of those it uses, as packages of sourced workspaces have them; else nothing."""
+    roots = list(filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)))
+    texts, wanted = dict[str, str](), [type_name]
+    for name in wanted if roots else ():
+        named = re.fullmatch(r"(\w{1,99})/msg/(\w{1,99})", name)
+        if not named or name in texts or name in _store().fielddefs:
+            continue
+        paths = (Path(root, "share", named[1], "msg", f"{named[2]}.msg") for root in roots)
+        with contextlib.suppress(OSError, TypesysError):
+            if path := next(filter(Path.is_file, paths), None):
+                texts[name] = _readable("ros2msg", path.read_bytes())
+                used = re.findall(r"^(?:(\w+)/(?:msg/)?)?([A-Z]\w*)[\s[<]", texts[name], re.MULTILINE)
+                wanted += [f"{where or named[1]}/msg/{what}" for where, what in used]
+    parts = [texts.pop(type_name, ""), *(f"MSG: {name.replace('/msg/', '/')}\n{text}" for name, text in texts.items())]
+    return f"{'=' * 80}\n".join(parts).strip()
 
 
 def ros2_text(type_name: str, text: bytes) -> bytes:

@@ -34,10 +34,8 @@ from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Reco
 from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
 from uncertain_lti.recordings.table_times import (
     NO_TIME,
-    called_time,
     field_name,
     find_column,
-    goes_forward,
     instants,
     may_be,
     spread,
@@ -124,15 +122,14 @@ class Table(Recording):
             flow = number > 1 and not unit and (np.diff(self.times) >= 0).all() and _flows(of_rows.values(), number)
             each = f"are the {number} rows of a time one for each of {number} units? then "
             each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
-            other = next((name for name in names if called_time(name) and goes_forward(raw.columns[name])), "")
             if flow:
                 usual = float(np.median(np.diff(np.unique(self.times)))) * 1e-9
                 self.times, taken = spread(self.times), f"they are taken to come evenly in the {usual:g} s after it: "
             else:
                 taken = f"only the first of such rows counts: {f'{each}write a file for each; else ' * (number > 1)}"
-            named = f"column '{other}', `table: {{time: '{other}'}}`" if other else "another, `--table time=COLUMN`"
             same = f"{equal} of {len(kept)} rows have the time of a row before in column '{time}'"
-            self._warnings.append(f"{path}: {same}, and {taken}write times with more decimals, or take {named}")
+            remedy = "write times with more decimals, or take another, `--table time=COLUMN`"
+            self._warnings.append(f"{path}: {same}, and {taken}{remedy}")
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
         fields = zip(once(map(field_name, names), "_"), names, strict=True)
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}

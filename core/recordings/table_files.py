@@ -420,11 +420,28 @@ def _read_arrow(path: Path) -> RawTable:
         elif pa.types.is_string(kind) or pa.types.is_large_string(kind) or pa.types.is_time(kind):
             texts = column.cast(pa.string()).to_pylist()  # times of day as in a CSV file
             found[name] = np.array([text or "" for text in texts], dtype=object)
+        elif (rows_of := _matrix(column)) is not None:
+            found[name] = rows_of
         else:
             notes.setdefault(f"of type {kind}", []).append(name)
     read = _of_one_length(path, found, notes)
     read.exact = lambda name: [str(value) for value in columns[name].to_pylist()]  # integers with gaps
     return read
+
+
+def _matrix(column: Any) -> Column | None:
+    """Lists of as many numbers in each row, such as the joints of an arm, as (rows, numbers); else nothing."""
+    import pyarrow as pa
+    import pyarrow.compute as pc  # type: ignore[import-not-found, import-untyped, unused-ignore]
+
+    kind = column.type
+    if not (pa.types.is_list(kind) or pa.types.is_large_list(kind) or pa.types.is_fixed_size_list(kind)):
+        return None
+    inner, lengths = kind.value_type, pc.unique(pc.list_value_length(column)).to_pylist()
+    if not (pa.types.is_floating(inner) or pa.types.is_integer(inner)) or len(lengths) != 1 or not lengths[0]:
+        return None
+    flat = pc.list_flatten(column).cast(pa.float64(), safe=False)
+    return np.asarray(flat, dtype=np.float64).reshape(-1, lengths[0])
 
 
 def _nanoseconds(path: Path, name: str, values: Column) -> Column:

@@ -33,6 +33,7 @@ _NAMES = (
     r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
     r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
+_OF_WHAT, _GROWS = re.compile(r"\w+_time"), "it is taken for the time, as it grows from row to row"
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?", "d": r"days?",
@@ -144,7 +145,11 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     if likely := [name for name in called if may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
         taken = called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0]
-        return _clock_beside(table, taken) or taken, ""
+        taken = _clock_beside(table, taken) or taken
+        held = np.mean(table.columns[taken][1:] == table.columns[taken][:-1]) > 0.5  # of a sensor slower than the rows
+        finer = (n for n in plain if (called_time(n) or _OF_WHAT.fullmatch(_bare(n))) and _grows(table.columns[n]))
+        column = next(finer, "") if held else ""
+        return (column, f"{_GROWS}, and '{taken}' does not") if column else (taken, "")
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and may_be(table.columns[name])]
     if len(dated) == 1 or (len(dated) == 2 and dated[0] == names[0]):
         return _clock_beside(table, dated[0]) or dated[0], ""
@@ -153,9 +158,9 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
     if first == ["column 1"] and names[1:2] != ["column 2"] and set(np.diff(table.columns["column 1"]).tolist()) == {1}:
         first = []  # the row numbers of a data frame, which alone have no name
-    for name in [*(n for n in names if re.fullmatch(r"\w+_time", _bare(n))), *first]:
+    for name in [*(n for n in names if _OF_WHAT.fullmatch(_bare(n))), *first]:
         if _grows(table.columns[name]):
-            return name, "it is taken for the time, as it grows from row to row"
+            return name, _GROWS
     none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
     texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
     if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):

@@ -516,6 +516,8 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"worth having while the machine runs as in the one recording, which says nothing of another day: check it "
             f"on one that was not fitted; {sees}"
         )
+    if 2 * panel.alarming > panel.units:
+        return "some", f"worth having, but expect an alarm in most healthy recordings: {sees}"
     return "good", f"worth having: {sees}"
 
 
