@@ -10,6 +10,7 @@
 """What befalls a monitor on a robot, with real publishers in other processes: it survives, tells, and never lies."""
 
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -409,9 +410,11 @@ def test_a_control_that_is_sent_once_and_a_latched_alarm_outlive_a_reload(bench:
     plant.send(5)
     assert on.flagged(48, since=44) == [0, 0, 0, 0]
     assert violation.messages[-1].data and world.status()["latched"]
-    assert trigger(world, "reset")[0] and not world.status()["alarm"]
+    assert trigger(world, "reset") == (True, "the alarm is reset") and not world.status()["alarm"]
     on.process.says("the alarm is over after")
-    assert ", by ~/reset" in on.process.output
+    assert re.search(r"\[WARN\].*: alarm", on.process.output)
+    assert re.search(r"\[INFO\].*the alarm is over after .*, by ~/reset", on.process.output)
+    assert trigger(world, "reset") == (True, "there was no alarm; its window is empty now")
 
 
 # --- snapshots ----------------------------------------------------------------------------------------------
