@@ -357,7 +357,8 @@ def test_a_busy_processor_is_no_reader_that_stands_still(sends: Sends) -> None:
     """Sending takes 2 ms as others have the processor, and 20 µs of it."""
     sends.sending = dict.fromkeys(sends.node.outputs.publishers, (2e-5, 2e-3))
     verdicts = sends.run(2000)
-    assert sends.sent["lower"] == verdicts > 500 and sends.sender.held_back == 0 and not sends.sender.problems
+    assert sends.sent["violation"] >= sends.sent["lower"] == verdicts > 500
+    assert sends.sender.held_back == 0 and not sends.sender.problems
 
 
 _LISTENS = """
@@ -641,6 +642,8 @@ def test_the_type_of_a_topic_may_change_while_the_node_runs(world: World, tmp_pa
     mode.publish(UInt8(data=3))
     for name in ("Int32", "UInt8"):
         assert world.set(enable="/machine/mode data == 3", enable_type=f"std_msgs/msg/{name}") == (True, "")
+        heard = world.node.get_subscriptions_info_by_topic
+        until(lambda name=name: [i.topic_type for i in heard("/machine/mode")] == [f"std_msgs/msg/{name}"], "its type")
     until(lambda: world.status()["armed"], "the mode")
     fields = zip(model.signals.controls, ("twist.linear.x", "twist.linear.y"), strict=True)
     controls = tuple(replace(signal, type="geometry_msgs/msg/TwistStamped", field=field) for signal, field in fields)
