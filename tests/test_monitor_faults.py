@@ -640,10 +640,13 @@ def test_the_type_of_a_topic_may_change_while_the_node_runs(world: World, tmp_pa
     world.monitor(saved(model, tmp_path))
     mode = world.publisher(UInt8, "/machine/mode", QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL))
     mode.publish(UInt8(data=3))
+
+    def types_heard() -> list[str]:
+        return [info.topic_type for info in world.node.get_subscriptions_info_by_topic("/machine/mode")]
+
     for name in ("Int32", "UInt8"):
         assert world.set(enable="/machine/mode data == 3", enable_type=f"std_msgs/msg/{name}") == (True, "")
-        heard = world.node.get_subscriptions_info_by_topic
-        until(lambda name=name: [i.topic_type for i in heard("/machine/mode")] == [f"std_msgs/msg/{name}"], "its type")
+        until(lambda name=name: types_heard() == [f"std_msgs/msg/{name}"], "its type")
     until(lambda: world.status()["armed"], "the mode")
     fields = zip(model.signals.controls, ("twist.linear.x", "twist.linear.y"), strict=True)
     controls = tuple(replace(signal, type="geometry_msgs/msg/TwistStamped", field=field) for signal, field in fields)

@@ -1220,21 +1220,8 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         flow, valve = on[k] * (30 + rng.normal()), 50 + 5 * (level - 1) + rng.normal()
         analyser = rng.normal() if k % 5 == 0 else analyser
         pressure = 2 * flow + 3 * rng.normal()
-        rows.append(
-            [
-                60 * k,
-                level,
-                rng.normal(),
-                pressure,
-                1 + on[k] if k else "",
-                flow,
-                0,
-                valve,
-                analyser,
-                level,
-                int(k == 700),
-            ]
-        )
+        switch = 1 + on[k] if k else ""
+        rows.append([60 * k, level, rng.normal(), pressure, switch, flow, 0, valve, analyser, level, int(k == 700)])
         rows[-1] += [622 + int(rng.integers(2)), rng.random()]
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
@@ -1327,10 +1314,8 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
         speed += 0.9 * (target - speed) * (1 - 0.5 * brake) + 0.01 * rng.normal()
         load += 0.1 * (target - load) + 0.05 * brake + 0.01 * rng.normal()
     names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Angle_of_Attack", "Brake_IN", "Released", "Idle", "Label"]
-    names, rows = (
-        [*names, "class"],
-        [[*row, "leak" if k % 500 == 9 else "normal" if k > 5 else ""] for k, row in enumerate(rows)],
-    )
+    classes = {k: "leak" if k % 500 == 9 else "normal" if k > 5 else "" for k in range(1500)}
+    names, rows = [*names, "class"], [[*row, classes[k]] for k, row in enumerate(rows)]
     path = csv(tmp_path / "drive.csv", names, rows)
     proposal = propose([path])
     assert [c.path for c in proposal.states] == ["Axis_ActSpeed", "Angle_of_Attack"], proposal.text
