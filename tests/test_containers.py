@@ -128,7 +128,8 @@ def test_a_sourced_workspace_has_the_definitions_that_an_old_database_lacks(conv
     assert "car_msgs/msg/Lost is used and not defined" in define("car_msgs/msg/Motors", "ros2msg", b"").reason
 
 
-def test_an_annotated_copy_is_that_of_the_mcap(converted, tmp_path):
+def test_an_annotated_copy_is_that_of_the_mcap(converted, tmp_path, capsys):
+    """Without a message that is none, which is counted."""
     model = str(tmp_path / "m.model.json")
     command = ["fit", str(converted["mcap"]), "--signals", str(converted["signals"]), "--output", model, "-q"]
     assert main([*command, "--additive", "noise", "--alarm", "containment"]) == 0
@@ -145,6 +146,12 @@ def test_an_annotated_copy_is_that_of_the_mcap(converted, tmp_path):
             assert (mine.log_time_ns, mine.data) == (theirs.log_time_ns, theirs.data)
         for mine, theirs in zip(copy.messages(["/engine/state"]), expected.messages(["/engine/state"]), strict=True):
             assert mine[1] == theirs[1] and mine[2].position.tobytes() == theirs[2].position.tobytes()
+    empty = shutil.copy(converted["db3"], tmp_path / "empty.db3")
+    with closing(sqlite3.connect(empty)) as database:
+        database.execute("UPDATE messages SET data = x'' WHERE id = (SELECT MAX(id) FROM messages)")
+        database.commit()
+    assert main(["check", model, str(empty), "--write", str(tmp_path / "empty.mcap")]) == 0
+    assert "1 message that cannot be converted to CDR not copied" in capsys.readouterr().err
 
 
 def test_parts_of_a_split_database_are_one_recording(converted, tmp_path):

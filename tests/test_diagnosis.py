@@ -11,6 +11,7 @@
 
 import re
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ import yaml
 from tanks import Tanks
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, read_transients
-from uncertain_lti.identification import fit
+from uncertain_lti.identification import evidence, fit
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import next_text
@@ -299,6 +300,16 @@ def resonance(turn, damping, noise, measured=(0, 1), seed=0, count=1500, dt=0.05
     x = x / x.std(axis=0)
     x = (x + noise * rng.standard_normal(x.shape))[:, list(measured)]
     return Transient(np.arange(count + 1) * dt, x, u * (1 - hidden), name="run")
+
+
+def test_one_jump_does_not_hide_how_noise_is_correlated():
+    """The mean of two neighbours of white noise, whose correlation is a half and then none."""
+    rng = np.random.default_rng(0)
+    z, white = rng.normal(size=(2000, 2)), 1e-3 * rng.normal(size=2001)
+    moved = white[1:] + white[:-1]
+    moved[700] += 0.1
+    problem = SimpleNamespace(z=z, N=2000, n=1, dt=np.ones(2000), x_next=z[:, :1] + moved[:, None])
+    np.testing.assert_allclose(evidence._correlation(problem, np.arange(1, 2000)), [[0.5, 0.0]], atol=0.05)
 
 
 @pytest.mark.parametrize("turn", [0.3, 1.6])

@@ -47,11 +47,12 @@ def test_what_is_outside_is_named_by_signal_or_by_pair() -> None:
     """With as many digits as tell a value from the ends; pairs only where no signal leaves its own range."""
     held = np.zeros((1, 4, 4), dtype=bool)
     held[0, :, :2] = True
-    signals = SignalMap((Signal("x0", "", "x0", 3.28e6),), (Signal("u0", "", "u0"),))
+    signals = SignalMap((Signal("x0", "", "x0", 3.28e6),), (Signal("u0", "", "u0", 2.0, 10.0),))
     sides = np.array([0.0]), np.array([1.0])
     domain = Domain(*sides, *sides, Occupancy(4, held))
     model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], signals=signals, domain=domain)
     assert outside_in_words(model, np.array([[1.5], [0.2]])) == "x0 at 3280002 (fitted: 3280000 to 3280001)"
+    assert outside_in_words(model, np.array([[0.5], [1.5]])) == "u0 at 17 (fitted: 2 to 12)"
     assert outside_in_words(model, np.array([[0.5], [0.9]])) == "combinations of x0 with u0 that were not fitted"
     assert not outside_in_words(model, np.array([[0.5], [0.2]]))
 

@@ -319,3 +319,15 @@ def test_boxes_hold_what_their_transitions_have(each: int, limited: bool) -> Non
         assert np.array_equal(low[:, b], moved[:, inside].min(axis=1))
         assert np.array_equal(high[:, b], moved[:, inside].max(axis=1))
         assert np.array_equal(room[:, b], np.vstack(left)[:, inside].min(axis=1))
+
+
+def test_what_a_tile_is_filled_up_with_counts_nowhere_and_on_a_bound_is_not_outside() -> None:
+    """Three transitions at the first of two blocks, the other one with wider bounds; noise of half-width 0.5."""
+    blocks = arithmetic.Blocks((Axis("s", knots=(0.0, 1.0)),))
+    z, dt, after = np.zeros((2, 3)), np.ones(3), np.array([[0.2, 0.5, 2.0]])
+    tables = np.zeros((2, 1, 2)), np.zeros((2, 1, 2)), np.array([[0.5], [5.0]])
+    outside, width, *_ = arithmetic.verdicts(tables, z, dt, after, z[:1], blocks, np.zeros((1, 3)), np.ones((1, 1)))
+    assert (outside.tolist(), width.tolist()) == ([1], [1.0])
+    given = z, dt, after, z[:1], None, None, 0, (False,), np.zeros((2, 1)), np.array([[0.0], [0.0], [0.5]])
+    at, distance = arithmetic.near_bounds(1, *given, None, None, [0])
+    assert (at.tolist(), distance.tolist()) == ([2], [2.0])

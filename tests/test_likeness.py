@@ -22,7 +22,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.model.signature import Signature, closeness
-from uncertain_lti.monitor.likeness import LEAST, MATCH, Explainer, Pattern, learn_signatures, likeness
+from uncertain_lti.monitor.likeness import MATCH, Explainer, Pattern, learn_signatures, likeness, over_recording
 from uncertain_lti.monitor.session import OK
 from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.model_text import model_text, signature_text
@@ -141,6 +141,9 @@ def test_a_pattern_starts_over_after_a_hundred_quiet_verdicts(model: UncertainLT
         explainer.push(row, -side, side, quiet)
         verdicts.append(explainer.pattern.verdicts)
     assert verdicts == [1, 2, 1]
+    found = EnvelopeMonitor(model).check(run(200, FAULTS[0]))
+    begins = [begin for begin, *_ in over_recording(model, found)]
+    assert len(begins) > 1 and found.alarm[begins].all() and not found.alarm[np.subtract(begins, 1)].any()
 
 
 def test_one_sample_is_not_all_of_a_pattern() -> None:
@@ -198,7 +201,7 @@ def test_live_says_what_check_says(taught: UncertainLTI) -> None:
 def test_too_few_verdicts_name_nothing(taught: UncertainLTI) -> None:
     explainer = Explainer(taught)
     assert explainer.likeness() is None
-    for _ in range(LEAST - 1):
+    for _ in range(4):  # five are enough
         explainer.push(np.array([[3.0, 0.0, np.inf]]), -np.ones(3), np.ones(3), 0)
     like = explainer.likeness()
     assert like is not None and not like.label and not like.words
@@ -213,13 +216,21 @@ def test_the_session_says_so(taught: UncertainLTI) -> None:
     rig.session.explainer = Explainer(rig.model)
     rig.send(20)
     rig.lines.clear()
-    for _ in range(30):
-        rig.send(1)
-        rig.x[1] += 3.0 * rig.model.centre_and_half(rig.x, rig.u, DT)[1][1]
+
+    def jumps(count: int) -> None:
+        for _ in range(count):
+            rig.send(1)
+            rig.x[1] += 3.0 * rig.model.centre_and_half(rig.x, rig.u, DT)[1][1]
+
+    jumps(30)
     said = [line for line in rig.lines if "looks like" in line]
     assert len(said) == 1 and "the alarm looks like b broken (match " in said[0]
     monitor, *_ = rig.session.report(rig.now, 10.0)
     assert monitor.level != OK and "looks like b broken" in monitor.message
+    before = rig.session.explainer.pattern.verdicts
+    rig.send(60)  # not yet a hundred quiet verdicts
+    jumps(10)
+    assert rig.session.explainer.pattern.verdicts > before > 20
 
 
 def test_other_bounds_have_no_signatures(taught: UncertainLTI) -> None:
@@ -254,7 +265,7 @@ def test_the_command(tmp_path: Path, cli: Command) -> None:
 def test_a_sensor_is_named_by_what_its_bias_leaves_in_its_own_equation_too(own: float, named: str) -> None:
     """Two states that move against each other are no sign of a third whose equation is as before."""
     model = UncertainLTI([[own, 0, 0], [5, -1, 0], [-5, 0, -1]], np.zeros((3, 0)), np.zeros((3, 3)), np.zeros((3, 0)))
-    pattern = Pattern((1,), 3)
+    pattern, half = Pattern((1,), 3), np.array([4.0, 8.0, 16.0])
     for k in range(20):
-        pattern.add((-1) ** k * np.array([[own, 5.0, -5.0]]) / 4, np.ones(3))
+        pattern.add((-1) ** k * np.array([[own, 5.0, -5.0]]) / half, half)
     assert likeness(model, pattern).words == named

@@ -589,6 +589,7 @@ def test_without_autostart_the_node_obeys_transitions(world: World, tmp_path: Pa
     diagnostics = world.diagnostics()
     assert world.state() == "unconfigured"
     diagnostics.reaches(STALE, saying="unconfigured: no verdicts")
+    assert world.set(margin=1.0)[0] and "write TOPIC FIELD OPERATOR NUMBER" in world.set(enable="data == 3")[1]
     assert not world.change("activate")
     process.says("no transition activate from unconfigured; there are configure")
     assert world.change("configure") and world.state() == "inactive"

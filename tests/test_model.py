@@ -240,8 +240,9 @@ def test_a_model_is_not_changed_behind_its_back() -> None:
     model = UncertainLTI(A, ONE, ONE, ONE)
     A[0, 0] = 7.0
     assert model.A[0, 0] == 0.0
-    with pytest.raises(ValueError, match="read-only"):
-        model.A[0, 0] = 7.0
+    for array in (model.A, Signature("a", [1], [[[1.0]]]).moments):
+        with pytest.raises(ValueError, match="read-only"):
+            array[0] = 7.0
     assert model.replace(v=[2.0]).v.tolist() == [2.0] and model.v.tolist() == [0.0]
 
 
@@ -535,9 +536,9 @@ RESIDUALS: list[tuple[str, Any, str]] = [
         ("signatures.0.moments", [[[1.0]]], "states"),
         ("signatures.0.recordings", 0, "whole numbers"),
         ("signatures.0.more", 1, "unknown field"),
-        ("signatures", armed()["signatures"] * 2, "different labels"),
+        ("signatures", armed()["signatures"] * 2, "different labels, at most 256"),
         ("domain.measure.cells", True, "domain.measure.cells"),
-        ("domain.measure.cells", 10**9, "domain.measure.cells"),
+        ("domain.measure.cells", 65, "domain.measure.cells"),
         ("domain.measure.cells", 5, "domain.measure.occupied"),
         ("domain.measure.occupied", "?", "domain.measure.occupied"),
         ("domain.measure.more", 1, "domain.measure"),

@@ -73,7 +73,7 @@ def refusal(result: subprocess.CompletedProcess, node: str = "envelope_monitor")
         (["-p", "violations:=-2"], ["parameter violations is -2", "from 0"]),
         (["-p", "violations:=2.5"], ["parameter violations is 2.5", "a whole number"]),
         (["-p", "margin:=-2.0"], ["parameter margin is -2.0", "from 0"]),
-        (["-p", "latch:=1"], ["parameter latch is 1", "true or false"]),
+        (["-p", "latch:=1"], ["parameter latch is 1", "true or false", "for example -p latch:=false"]),
         (["-p", "model:=123"], ["parameter model is 123", "model:='123'"]),
         (["-p", "enable:=true"], ["parameter enable is true", "enable:='true'"]),
         (["-p", "masked:=[a, b]"], ["parameter masked is ['a', 'b']", "write no brackets: -p \"masked:='a,b'\""]),

@@ -1242,7 +1242,8 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         flow, valve = on[k] * (30 + rng.normal()), 50 + 5 * (level - 1) + rng.normal()
         analyser = rng.normal() if k % 5 == 0 else analyser
         pressure = 2 * flow + 3 * rng.normal()
-        rows.append([60 * k, level, rng.normal(), pressure, on[k], flow, 0, valve, analyser, level, int(k == 700)])
+        switch = 1 + on[k] if k else ""
+        rows.append([60 * k, level, rng.normal(), pressure, switch, flow, 0, valve, analyser, level, int(k == 700)])
         rows[-1] += [622 + int(rng.integers(2)), rng.random()]
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
@@ -1250,7 +1251,7 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     proposal = propose([path])
     assert [c.name for c in proposal.states] == ["Level1", "Temp", "Flicker"], proposal.text
     why = {c.name: c.why for c in proposal.controls}
-    assert why["S_PU1"] == "switched between 0, 1" and why["F_PU1"] == "0 whenever S_PU1 is off"
+    assert why["S_PU1"] == "switched between 1, 2" and why["F_PU1"] == "0 whenever S_PU1 is off"
     assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
                   "Level1_again: moves with Level1", "elapsed: of a computer"):  # fmt: skip
@@ -1329,13 +1330,14 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     for k in range(1500):
         target = 3.0 * math.sin(k / 40) + math.sin(k / 13)
         brake = int(rng.integers(0, 2)) if k % 30 == 0 else brake
-        label = 1 + k % 2 if k in range(1400, 1420) else 0
+        label = "" if k in range(100, 140) else 1 + k % 2 if k in range(1400, 1420) else 0
         t = 0.05 * k - (0.9 if k in range(700, 720) else 0.0)  # a clock that is set back for a second
         rows.append([f"{t:.2f}", speed, target, load, brake, 1 - brake, rng.integers(0, 2) if k % 9 == 0 else 0, label])
         speed += 0.9 * (target - speed) * (1 - 0.5 * brake) + 0.01 * rng.normal()
         load += 0.1 * (target - load) + 0.05 * brake + 0.01 * rng.normal()
     names = ["time", "Axis_ActSpeed", "Axis_SetSpeed", "Angle_of_Attack", "Brake_IN", "Released", "Idle", "Label"]
-    names, rows = [*names, "class"], [[*row, "leak" if k % 500 == 9 else "normal"] for k, row in enumerate(rows)]
+    classes = {k: "leak" if k % 500 == 9 else "normal" if k > 5 else "" for k in range(1500)}
+    names, rows = [*names, "class"], [[*row, classes[k]] for k, row in enumerate(rows)]
     path = csv(tmp_path / "drive.csv", names, rows)
     proposal = propose([path])
     assert [c.path for c in proposal.states] == ["Axis_ActSpeed", "Angle_of_Attack"], proposal.text

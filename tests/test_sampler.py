@@ -13,7 +13,7 @@ import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -626,6 +626,10 @@ def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: boo
                 sampler.push(*message)
         assert len(sampler.kept("/u")) <= 2
     assert sampler.counters["resets"] == 2
+    sampler = Sampler(two_topics())
+    for message in (at("/c", 100, 100), at("/c", 101, 101), at("/c", 102, 1), at("/u", 103, 1), at("/c", 104, 2)):
+        sampler.push(*message)
+    assert not any(name.startswith("late") for name in sampler.counters)  # for a sample of before, which had none
 
 
 @settings(max_examples=40)
@@ -655,9 +659,9 @@ def test_latest_changes_nothing_and_is_what_would_be_fixed_now(case: tuple[Signa
     assert watched.counters == quiet.counters
 
 
-def flooded() -> Sampler:
+def flooded(clock: str = "header") -> Sampler:
     """A sample is open, a control is held at it, and more controls have come than are kept."""
-    sampler = Sampler(two_topics(max_gap=1e6))
+    sampler = Sampler(two_topics(max_gap=1e6, time={"/c": clock, "/u": "header"}))
     sampler.push("/u", 1, 1, [-7.0])
     sampler.push("/c", 2, 2, [0.0])
     for stamp in range(3, 3 * BUFFERED_MESSAGES):
@@ -667,8 +671,9 @@ def flooded() -> Sampler:
     return sampler
 
 
-def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open() -> None:
-    sampler = flooded()
+@pytest.mark.parametrize("clock", ["header", "log"])
+def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open(clock: str) -> None:
+    sampler = flooded(clock)
     (step,) = sampler.push("/c", 10**6, 10**6, [0.0])
     assert step.u.tolist() == [-7.0] and step.status is Status.OK
     (step,) = sampler.push("/c", 2 * 10**6, 2 * 10**6, [0.0])
@@ -684,6 +689,26 @@ def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older(
     assert math.isnan(steps[1].u[0]) and steps[1].status is Status.MISSING
     assert steps[2].u.tolist() == [end - 5.0]
     assert sampler.counters["missing u"] == 1
+
+
+@pytest.mark.parametrize(
+    ("controls", "clock", "found"),
+    [
+        ([(3, 3), (4, 9), (5, 4), (6, 5), (7, 10)], [(20, 9), (60, 21)], math.nan),
+        ([*((k, k) for k in range(3, 9)), (19, None)], [(20, 20), (60, 21), (61, 22)], 19.0),
+    ],
+)  # fmt: skip
+def test_what_has_been_forgotten_matters_until_a_sample_finds_something_newer(
+    monkeypatch: pytest.MonkeyPatch, controls: Any, clock: Any, found: float
+) -> None:
+    """(4, 9) is newer than what is kept; the age of 19, which has no stamp, goes by arrivals, which jitter."""
+    monkeypatch.setattr(sampler_module, "BUFFERED_MESSAGES", 4)
+    sampler = Sampler(two_topics(max_gap=1e6))
+    sampler.push("/c", 2, 2, [0.0])
+    for arrival, stamp in controls:
+        sampler.push("/u", arrival, stamp, [float(arrival)])
+    *_, (step,) = [sampler.push("/c", arrival, stamp, [0.0]) for arrival, stamp in clock]
+    np.testing.assert_array_equal(step.u, [found])
 
 
 @settings(max_examples=40)

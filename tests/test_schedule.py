@@ -73,6 +73,7 @@ def test_a_missing_value_has_no_weights() -> None:
         (lambda: Axis("speed", knots=(0.0, float("inf"))), "not finite"),
         (lambda: Schedule(()), "one or two"),
         (lambda: Schedule((SPEED, SPEED)), "is there twice"),
+        (lambda: Schedule((Axis("a", modes=range(41)), Axis("b", modes=range(25)))), "1025 blocks; at most 1024"),
         (lambda: Schedule((SPEED,)).positions(["torque"]), "'speed'"),
         (lambda: Schedule.from_list([{"signal": "a", "knots": [0, 1], "odd": 1}]), "odd"),
         (lambda: Schedule.from_list([{"signal": "a", "knots": [0, True]}]), "knots"),

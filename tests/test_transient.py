@@ -26,7 +26,7 @@ from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError, TransientError
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Sampler
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, controls_as
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 NAN, INF = math.nan, math.inf
@@ -152,6 +152,8 @@ def test_a_control_acts_as_it_was_recorded_at_the_departure_or_at_the_arrival_of
     assert (arrival.control_names, arrival.ends) == (("u1", "u2"), ("arrival", "arrival"))
     assert both.transitions().u.tolist() == [[0, 5, 6], [1, 6, 7], [2, 7, 8]]
     assert both.control_names == ("u1", "u2", "u2 at arrival") and both.ends == ("departure", "departure", "arrival")
+    taken = [Signal("u1", "", "a"), Signal("u2", "", "b"), Signal("u2 at arrival", "", "b", at="arrival")]
+    assert controls_as(Transient(t, x, u), taken).ends == both.ends
     again = Transient(t, x, u).controls_at("both")
     assert Transient(t[:0], x[:0], u[:0]).controls_at("arrival").u.shape == (0, u.shape[1])
     assert again.transitions().u.tolist() == [[0, 1, 5, 6], [1, 2, 6, 7], [2, 3, 7, 8]]

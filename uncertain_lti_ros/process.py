@@ -88,13 +88,6 @@ class Declared:
         limits = "" if self.low is None else f" from {self.low:.12g} to {self.high:.12g}"
         return f"{_TYPES[type(self.default)]}{limits}"
 
-    @property
-    def example(self) -> str:
-        """What a shell takes for the default."""
-        if isinstance(self.default, bool):
-            return str(self.default).lower()
-        return repr(self.default) if self.default != "" else "TEXT"
-
 
 def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
     """Declare the parameters of a node."""
@@ -112,7 +105,7 @@ def declare(node: Node, parameters: Iterable[Declared]) -> dict[str, Any]:
             given = node._parameter_overrides[parameter.name].value
             given = [] if given is None else given
             shown = repr(given) if isinstance(given, str) else _shown(given)
-            remedy = f"for example -p {parameter.name}:={parameter.example}"
+            remedy = f"for example -p {parameter.name}:={_shown(parameter.default)}"
             if isinstance(parameter.default, str):
                 listed = isinstance(given, list)
                 why = "write no brackets" if listed else "if it looks like something else, quote it twice"
@@ -168,7 +161,7 @@ def _help(name: str, summary: str, parameters: Sequence[Declared]) -> str:
         lines.append(f" {star}{parameter.name} = {_shown(parameter.default)}   {parameter.wanted}")
         lines += textwrap.wrap(parameter.text, _WIDTH, initial_indent=" " * 6, subsequent_indent=" " * 6)
     first = parameters[0]
-    value = "machine.model.json" if first.name == "model" else first.example
+    value = "machine.model.json" if first.name == "model" else _shown(first.default)
     lines += [
         "",
         f"Example: {name} --ros-args -p {first.name}:={value} -r __node:=my_{name}",

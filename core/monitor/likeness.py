@@ -133,7 +133,7 @@ class Pattern:
 
     def signature(self, label: str) -> Signature:
         """The pattern as a signature of one recording."""
-        return Signature(label, self.steps, scaled(self._sum), 1, self.verdicts)
+        return Signature(label, self.steps, scaled(self._sum), verdicts=self.verdicts)
 
     def parts(self, model: UncertainLTI) -> tuple[Part, ...]:
         """What single part of the machine explains the one-step pattern within the fitted domain.

@@ -398,7 +398,6 @@ class EventLog:
                 self._latest, self._unnamed = line, self._unnamed + 1
         elif self._named:
             self._log(OK, f"the alarm is over after {now - self._alarm_since:.3g} s{why}")
-            self._named = False
 
     def _left_out(self, number: int) -> str:
         """How many alarms no line names."""
