@@ -553,6 +553,10 @@ def test_a_file_that_is_missing_names_those_beside_it(tmp_path: Path) -> None:
     assert "there is no such file or folder; check the path" in error_of(tmp_path / "nix.mcap")
     write(TWO, []).save(tmp_path / "there.mcap")
     assert "there are there.mcap" in error_of(tmp_path / "nix.mcap")
+    (tmp_path / "live.mcap.part").touch()
+    assert f"or was killed: read {tmp_path / 'live.mcap.part'}" in error_of(tmp_path / "live.mcap")
+    for quoted in (tmp_path / "*.mcap", Path("~/nix.mcap")):
+        assert "a shell replaces ~ and * outside quotes alone" in error_of(quoted)
     assert "neither a file nor a folder" in error_of(Path("/dev/zero"))
     os.symlink(tmp_path / "nowhere", tmp_path / "link.mcap")
     assert "there is no such file" in error_of(tmp_path / "link.mcap")

@@ -73,6 +73,10 @@ def missing(path: Path) -> BagError:
     inside = path.parent.iterdir() if path.parent.is_dir() else ()
     there = sorted((p for p in inside if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
     hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
+    if str(path).startswith("~") or "*" in path.name:
+        hint = "; a shell replaces ~ and * outside quotes alone"
+    if (unfinished := Path(f"{path}.part")).exists():
+        hint = f"; its recording goes on, or was killed: read {unfinished}"
     return BagError(f"{path}: there is no such file or folder{hint}")
 
 
