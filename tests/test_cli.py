@@ -160,6 +160,7 @@ REFUSED = [
     ("plot m.model.json run.mcap --signals s.yaml", "the model has its signals"),
     ("plot m.model.json run.mcap --output run.mcap", "end the name in"),
     ("plot no.model.json run.mcap --output r.html", "no such"),
+    ("report leibov2006 run.mcap --output r.pdf", "r.pdf: a report is a page; end the name in .html"),
     ("plot no.mcap --output r.html", "no such"),
     ("plot m.model.json run.mcap --output no/r.html", "make it first"),
     ("layout m.model.json", "--foxglove"),

@@ -200,6 +200,8 @@ def report(options: argparse.Namespace) -> Result:
     output = options.output or (None if options.json else "report.html")
     if output is not None:
         page_target(output, options.model, judged.bags)
+        if not output.lower().endswith((".html", ".htm")):
+            raise BagError(f"{output}: a report is a page; end the name in .html")
     checked = [verdicts for _, verdicts, _ in judged]
     if not checked:
         return Result(BAD_INPUT)
