@@ -17,6 +17,9 @@ from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
 from uncertain_lti.sampling.transient import Transient
 
+OPENING = (Status.FIRST, Status.RESET, Status.GAP)
+"""Of a sample without a predecessor."""
+
 
 def steps_of(transient: Transient) -> list[Step]:
     """As the sampler gives them."""
@@ -24,7 +27,7 @@ def steps_of(transient: Transient) -> list[Step]:
     z = np.hstack([transient.x, transient.u, transient.s])
     for k, status in enumerate(transient.statuses()):
         none = [float("nan")] * z.shape[1]
-        before = z[k - 1].tolist() if k and not status.opens_segment else none
+        before = z[k - 1].tolist() if k and status not in OPENING else none
         dt = (transient.t_ns[k] - transient.t_ns[k - 1]) * 1e-9 if k else float("nan")
         found.append(Step(status, int(transient.t_ns[k]), 0, float(dt), before, transient.x[k].tolist()))
     return found

@@ -553,6 +553,10 @@ def test_a_file_that_is_missing_names_those_beside_it(tmp_path: Path) -> None:
     assert "there is no such file or folder; check the path" in error_of(tmp_path / "nix.mcap")
     write(TWO, []).save(tmp_path / "there.mcap")
     assert "there are there.mcap" in error_of(tmp_path / "nix.mcap")
+    (tmp_path / "live.mcap.part").touch()
+    assert f"or was killed: read {tmp_path / 'live.mcap.part'}" in error_of(tmp_path / "live.mcap")
+    for quoted in (tmp_path / "*.mcap", Path("~/nix.mcap")):
+        assert "a shell replaces ~ and * only where they are not in quotes" in error_of(quoted)
     assert "neither a file nor a folder" in error_of(Path("/dev/zero"))
     os.symlink(tmp_path / "nowhere", tmp_path / "link.mcap")
     assert "there is no such file" in error_of(tmp_path / "link.mcap")
@@ -627,10 +631,11 @@ def test_a_folder_without_metadata_is_one_split_bag_or_an_error(tmp_path: Path) 
     runs = {f"r_{i}.mcap": part(100 * i, 100 * i + 9.9) for i in (0, 1)}
     assert "r_0.mcap, r_1.mcap" in error_of(write_folder(tmp_path / "runs", runs))
     mixed = {"a_0.mcap": part(0, 1), "b_0.mcap": part(0, 1)}
-    assert "name them one by one: a_0.mcap, b_0.mcap" in error_of(write_folder(tmp_path / "mixed", mixed))
+    folder = write_folder(tmp_path / "my bags", mixed)
+    assert f"name them, '{folder}'/*.mcap: a_0.mcap, b_0.mcap" in error_of(folder)
     (tmp_path / "bare").mkdir()
     assert "there is no .mcap, .db3 or .bag file in it" in error_of(tmp_path / "bare")
-    assert "name the folders in it: mixed, runs, split" in error_of(tmp_path)
+    assert "name the folders in it: my bags, runs, split" in error_of(tmp_path)
 
 
 def test_metadata_yaml_decides(tmp_path: Path) -> None:

@@ -160,6 +160,7 @@ REFUSED = [
     ("plot m.model.json run.mcap --signals s.yaml", "the model has its signals"),
     ("plot m.model.json run.mcap --output run.mcap", "end the name in"),
     ("plot no.model.json run.mcap --output r.html", "no such"),
+    ("report leibov2006 run.mcap --output r.pdf", "r.pdf: a report is a page; end the name in .html"),
     ("plot no.mcap --output r.html", "no such"),
     ("plot m.model.json run.mcap --output no/r.html", "make it first"),
     ("layout m.model.json", "--foxglove"),
@@ -355,6 +356,25 @@ def test_of_several_recordings_one_that_lacks_a_topic_keeps_none_from_being_chec
         shutil.copy(other, tmp_path / "third.mcap")
         said = cli(command, model, other, tmp_path / "third.mcap", "--output", page, status=2).err
         assert "2 of 2 recordings not checked" in said and not page.exists()
+
+
+def test_of_several_recordings_one_that_cannot_be_opened_keeps_none_from_being_checked(folder, tmp_path, cli):
+    run, model, empty = str(folder / "run.mcap"), str(folder / "m.model.json"), tmp_path / "empty.mcap"
+    empty.touch()
+    for other, why in ((empty, "the file is empty"), (tmp_path / "none.mcap", "there is no such file")):
+        said = cli("check", model, other, run, status=2)
+        assert said.out.count(" verdicts, ") == 1
+        assert why in said.err and "1 of 2 recordings not checked" in said.err
+        assert [r["recording"] for r in cli.json("check", model, run, other, status=2)["not_checked"]] == [str(other)]
+    assert "2 of 2 recordings not checked" in cli("check", model, empty, tmp_path / "none.mcap", status=2).err
+    assert "named twice" in refused(cli, "check", model, run, run)
+    page, image = tmp_path / "page.html", tmp_path / "image.png"
+    for command in ("report", "plot"):
+        cli(command, model, empty, run, "--output", page, status=2)
+        assert page.exists()
+        page.unlink()
+    assert "an image shows one recording" in cli("plot", model, empty, run, "--output", image, status=2).err
+    assert not image.exists()
 
 
 def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, cli):

@@ -242,7 +242,7 @@ def test_a_ros_1_bag_whose_recorder_was_killed(converted, tmp_path):
     data[at : at + 8] = bytes(8)
     path = tmp_path / "active.bag"
     path.write_bytes(data[:begin])
-    refuses(BagError, r"not indexed.*mend it with `rosbag reindex active\.bag`", Bag, path)
+    refuses(BagError, rf"not indexed.*mend it with `rosbag reindex {re.escape(str(path))}`", Bag, path)
 
 
 def database_of(path, *statements):

@@ -209,6 +209,20 @@ def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
     assert (mended < plain).all()
 
 
+def test_a_delay_that_explains_next_to_nothing_of_many_states_is_not_named():
+    """Of twelve states one follows the control late: sure of enough samples, and 0 % of what is unexplained."""
+    rng, count, told = np.random.default_rng(3), 3000, {}
+    u = steps(rng, count)[:, :1]
+    noise = 0.1 * rng.normal(size=(count, 12))
+    for effect in (0.08, 0.4):
+        x = np.zeros((count, 12))
+        for k in range(3, count - 1):
+            x[k + 1] = 0.9 * x[k] + noise[k]
+            x[k + 1, 0] += effect * u[k - 3, 0]
+        told[effect] = [m for m in messages(Transient(np.arange(count) * 0.05, x, u)) if WORDS["delay"] in m]
+    assert told[0.08] == [] and len(told[0.4]) == 1
+
+
 def test_real_recordings_say_what_is_known_of_them(recordings, signals_folder):
     def of(bags, signals):
         return fit(read_transients([recordings / b for b in bags], signals_folder / signals)).fit_summary["messages"]

@@ -20,6 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refuses
+from steps import OPENING
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling import sampler as sampler_module
@@ -142,7 +143,7 @@ class Reference:
         """Values of each message with angles unwrapped from where the stream starts anew."""
         where = self.signals.on(topic)
         clock = topic == self.signals.clock
-        starts = {s.index for s in self.samples if s.status.opens_segment} if clock else {*self.jumps[topic]}
+        starts = {s.index for s in self.samples if s.status in OPENING} if clock else {*self.jumps[topic]}
         taken = [s.index for s in self.samples] if clock else self.by_topic[topic]
         values = {i: list(self.sent[i].values) for i in taken}
         for column, position in enumerate(where):
@@ -288,7 +289,7 @@ class Reference:
                 kind = control.field.partition("(")[0]
                 back = int(control.field.rpartition(",")[2].strip(" )")) if kind == "lag" else control.delay
                 source = k - (1 if kind in ("diff", "rate") else back)
-                joined = source >= 0 and not any(s.status.opens_segment for s in closed[source + 1 : k + 1])
+                joined = source >= 0 and not any(s.status in OPENING for s in closed[source + 1 : k + 1])
                 past = before[source][j] if joined else NAN
                 if kind in ("diff", "rate"):
                     past = before[k][j] - past

@@ -593,8 +593,9 @@ def test_damage_anywhere_is_read_or_a_sentence(tables, kind, tmp_path):
 
 
 def test_a_folder_of_tables_is_not_one_recording(tables):
-    words = "a folder of tables, each of which is a recording; name them one by one: run.csv"
-    refuses(BagError, words, group_recordings, [tables[".csv"].parent])
+    folder = tables[".csv"].parent
+    words = re.escape(f"a folder of tables, each of which is a recording; name them, {folder}/*.csv: run.csv")
+    refuses(BagError, words, group_recordings, [folder])
 
 
 def test_a_run_named_without_a_column_for_it(tables):

@@ -20,7 +20,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import refuses
-from steps import holds
+from steps import OPENING, holds
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, fit
 from uncertain_lti.base.errors import FitError, TransientError
@@ -72,7 +72,7 @@ def test_cut_and_judged_usable_as_the_sampler_does(run: tuple[Any, ...]) -> None
     assert np.array_equal(steps.x_next, np.reshape([kept[k].x_next for k in ok], steps.x_next.shape))
     dropped = Counter({s.value: sampler.counters[s.value] for s in Status if s.dropped})
     assert +transient.counters == +dropped
-    opens = [k for k, s in enumerate(kept) if s.status.opens_segment]
+    opens = [k for k, s in enumerate(kept) if s.status in OPENING]
     assert transient.segment.tolist() == [sum(o <= k for o in opens) - 1 for k in range(len(kept))]
     assert transient.segments == len(opens)
 

@@ -14,11 +14,14 @@ from __future__ import annotations
 import argparse
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, ModelError, SignalError
+from uncertain_lti.base.files import kind_of
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.cli.command import (
     ALARM,
@@ -84,43 +87,51 @@ def check_recording(
 class Judged:
     """Recordings judged one by one; of several, one that cannot be read is `refused` and keeps none of the others."""
 
-    def __init__(self, options: argparse.Namespace, model: UncertainLTI, bags: Sequence[Recording]) -> None:
-        self.options, self.bags = options, bags
+    def __init__(self, options: argparse.Namespace, model: UncertainLTI, paths: Sequence[str]) -> None:
+        from uncertain_lti.recordings.formats import group_recordings
+
+        self.options, self.count, self.alarm = options, len(paths), False
+        self.refused: list[dict[str, str]] = []
+        group = partial(group_recordings, layout=model.signals.table)
+        try:
+            self.bags = group(paths)
+        except BagError:
+            opened = []
+            for path in paths:
+                with self._refusing(path):
+                    group([path])
+                    opened.append(path)
+            self.bags = group(opened)
+        self.count = len(self.bags) + len(self.refused)
         self.deployed = deployed_monitor(options, model)
         self.model = self.deployed.monitor.model  # with the rules that are judged by
-        self.refused: list[dict[str, str]] = []
-        self.alarm = False
+
+    @contextmanager
+    def _refusing(self, path: str) -> Iterator[None]:
+        try:
+            yield
+        except (BagError, SignalError) as error:
+            if self.count == 1:
+                raise
+            complain(self.options.command, str(error))
+            self.refused.append({"recording": path, "error": str(error)})
 
     def __iter__(self) -> Iterator[tuple[Recording, Verdicts, Decisions]]:
-        options = self.options
+        progress = self.options.progress
         for bag in self.bags:
-            try:
-                verdicts, decisions = check_recording(self.deployed, bag, options.progress.iterate("reading"))
-            except (BagError, SignalError) as error:
-                if len(self.bags) == 1:
-                    raise
-                complain(options.command, str(error))
-                self.refused.append({"recording": str(bag.path), "error": str(error)})
-                continue
-            options.progress.note(*verdicts.transient.notes)
-            self.alarm = self.alarm or bool(verdicts.alarm.any())
-            yield bag, verdicts, decisions
+            with self._refusing(str(bag.path)):
+                verdicts, decisions = check_recording(self.deployed, bag, progress.iterate("reading"))
+                progress.note(*verdicts.transient.notes)
+                self.alarm = self.alarm or bool(verdicts.alarm.any())
+                yield bag, verdicts, decisions
         if self.refused:
-            all_of_them = plural(len(self.bags), "recording")
-            complain(options.command, f"{len(self.refused)} of {all_of_them} not checked, as said above")
+            all_of_them = plural(self.count, "recording")
+            complain(self.options.command, f"{len(self.refused)} of {all_of_them} not checked, as said above")
 
     def status(self, recordings: Sequence[Mapping[str, Any]] = ()) -> int:
         """Exit status of what was judged so far, and of what is known of each recording."""
         nothing = UNKNOWN if any(r["outcome"] == "unknown" for r in recordings) else DONE
         return ALARM if self.alarm else BAD_INPUT if self.refused else nothing
-
-
-def _judged(options: argparse.Namespace) -> Judged:
-    """Recordings judged by the model that is named first."""
-    from uncertain_lti.recordings.formats import group_recordings
-
-    model = load_model(options.model)
-    return Judged(options, model, group_recordings(options.bags, layout=model.signals.table))
 
 
 # --- check -----------------------------------------------------------------------------------------------------------
@@ -139,7 +150,7 @@ def check(options: argparse.Namespace) -> Result:
     from uncertain_lti.monitor.deployed import drift_in_words
     from uncertain_lti.reports.check import check_data, check_text, outcome
 
-    judged = _judged(options)
+    judged = Judged(options, load_model(options.model), options.bags)
     model, bags, deployed = judged.model, judged.bags, judged.deployed
     copies: dict[Recording, Path] = {}
     if options.write is not None:
@@ -185,10 +196,12 @@ def report(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.findings import findings, findings_text
     from uncertain_lti.reports.pages import html_report, page_target, write_page
 
-    judged = _judged(options)
+    judged = Judged(options, load_model(options.model), options.bags)
     output = options.output or (None if options.json else "report.html")
     if output is not None:
         page_target(output, options.model, judged.bags)
+        if not output.lower().endswith((".html", ".htm")):
+            raise BagError(f"{output}: a report is a page; end the name in .html")
     checked = [verdicts for _, verdicts, _ in judged]
     if not checked:
         return Result(BAD_INPUT)
@@ -223,29 +236,30 @@ def plot(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.figures import alarm_figure, matrices_figure, save
     from uncertain_lti.reports.pages import HOLDS, interactive_page, page_target, plotted_check, write_page
 
-    named = _names_model(options.bags[0])
-    model = load_model(options.bags[0]) if named else None
+    first = options.bags[0]
+    named = first == "leibov2006" or first.endswith(".json") or kind_of(first) == "a model file"
+    model = load_model(first) if named else None
     paths = options.bags[1:] if named else options.bags
     if model is not None and options.signals:
         raise ModelError(f"--signals {options.signals}: the model has its signals; leave the option out")
-    bags = group_recordings(paths, layout=None if model is None else model.signals.table) if paths else []
-    output = Path(options.output or ("plot.html" if bags else "plot.png"))
+    judged = None if model is None or not paths else Judged(options, model, paths)
+    bags = group_recordings(paths) if judged is None else judged.bags
+    output = Path(options.output or ("plot.html" if paths else "plot.png"))
     page = output.suffix == ".html"
     if output.suffix not in HOLDS:
         raise BagError(f"{output}: a plot is a page or an image; end the name in .html, .png, .svg or .pdf")
-    if page and not bags:
+    if page and not paths:
         raise ModelError(f"{output}: a model alone is drawn as an image; end the name in .png, .svg or .pdf")
     if not page and model is None:
         raise BagError(f"{output}: recordings without a model are drawn as a page; end the name in .html")
-    if not page and len(bags) > 1:
+    if not page and judged is not None and judged.count > 1:
         raise BagError(f"{output}: an image shows one recording; name one, or end the name in .html")
-    page_target(output, options.bags[0] if named else "", bags)
-    judged = Judged(options, model, bags) if model is not None and bags else None
+    page_target(output, first if named else "", bags)
     if page:
         if judged is None:
             about, plotted = "Recorded", _recorded(options, bags)
         else:
-            about = os.path.basename(options.bags[0])
+            about = os.path.basename(first)
             plotted = [plotted_check(judged.model, verdicts, len(bags)) for _, verdicts, _ in judged]
         if not plotted:
             nothing = "no recording could be checked, so nothing is drawn"
@@ -262,16 +276,6 @@ def plot(options: argparse.Namespace) -> Result:
     recordings = [str(bag.path) for bag in bags]
     data = {"plot": str(output), "recordings": recordings, "alarm": status == ALARM, "exit_status": status}
     return Result(status, data)
-
-
-def _names_model(path: str) -> bool:
-    """Whether the first word names a model: the published one, or a file that begins as JSON does."""
-    if not os.path.exists(path):
-        return path == "leibov2006" or path.endswith(".json")
-    if not os.path.isfile(path):
-        return False
-    with open(path, "rb") as stream:
-        return stream.read(100).lstrip()[:1] == b"{"
 
 
 def _recorded(options: argparse.Namespace, bags: Sequence[Recording]) -> list[Plotted]:

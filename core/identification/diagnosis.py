@@ -445,6 +445,7 @@ def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int])
         f"earlier (the unexplained part of a step falls by {share:.0%}): try "
         f"`delay: {signals[problem.n + j].delay + best}` for it in the signals file"
         for j, (best, share) in late_controls(problem, past).items()
+        if share >= 0.005  # of many states, of which few follow it, less may be sure
     ]
 
 

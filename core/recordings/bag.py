@@ -27,7 +27,7 @@ from uncertain_lti.recordings.bag_files import listed_parts, not_one_recording, 
 from uncertain_lti.recordings.mcap_records import Block, Contents, count, messages
 from uncertain_lti.recordings.message_types import RawMessage, RecordedChannel, define, lines_of, undefined
 from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts, TopicInfo, topic_facts
-from uncertain_lti.recordings.unreadable import changed, os_error
+from uncertain_lti.recordings.unreadable import changed, name_each, os_error
 from uncertain_lti.signals.field_path import FieldPath, TypeFields, full_name
 
 _MOST_LINES = 100_000  # of definitions that are read in one file
@@ -179,7 +179,7 @@ class Bag(Recording):
         contents = [survey(path, indexed) for path in paths if path not in empty]
         if not listed and (why := not_one_recording(contents)):
             unlike = f"without a metadata.yaml its files do not look like one recording ({why})"
-            raise BagError(f"{self.path}: {unlike}; name them one by one: {', '.join(path.name for path in paths)}")
+            raise BagError(f"{self.path}: {unlike}; {name_each(self.path, paths)}")
         return contents
 
     def _topics(self) -> dict[str, TopicInfo]:

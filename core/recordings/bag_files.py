@@ -19,6 +19,7 @@ from __future__ import annotations
 import itertools
 import os
 import re
+import shlex
 import struct
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -48,7 +49,16 @@ from uncertain_lti.recordings.mcap_records import (
 )
 from uncertain_lti.recordings.mcap_scan import outline, scan
 from uncertain_lti.recordings.message_types import Definition, define, distribution_text, ros2_text
-from uncertain_lti.recordings.unreadable import SUFFIXES, aside, changed, file_names, no_recording, one_line, os_error
+from uncertain_lti.recordings.unreadable import (
+    SUFFIXES,
+    aside,
+    changed,
+    file_names,
+    name_each,
+    no_recording,
+    one_line,
+    os_error,
+)
 from uncertain_lti.signals.field_path import full_name
 from uncertain_lti.signals.values import compose, construct
 
@@ -79,7 +89,7 @@ class Foreign(Contents):
 
     def damaged(self, how: str) -> str:
         """The sentence for a file that is not whole, with the remedy."""
-        return f"{self.path}: {how}; {_REMEDIES[self.magic].format(self.path.name)}"
+        return f"{self.path}: {how}; {_REMEDIES[self.magic].format(shlex.quote(str(self.path)))}"
 
     def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
         """Messages of one block as MCAP has them."""
@@ -119,7 +129,7 @@ def scan_foreign(path: Path) -> Foreign | None:
     found: Foreign = aside(_scan, path, "ROS 1 bag" if head.startswith(_BAG) else "database of ROS 2")
     log = path.with_name(f"{path.name}-wal")
     if found.magic == _DATABASE and log.exists() and log.stat().st_size:
-        remedy = f"put them in with `sqlite3 {path.name} 'PRAGMA wal_checkpoint'`"
+        remedy = f"put them in with `sqlite3 {shlex.quote(str(path))} 'PRAGMA wal_checkpoint'`"
         unwritten = f"messages that were not yet written to it are in {log.name} and are not read"
         found.warnings.append(f"{path}: {unwritten}; {remedy}")
     return found
@@ -341,7 +351,7 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
         raise no_recording(folder, inside)
     if len({pair[0] if (pair := stem_and_index(p)) else p.name for p in found}) > 1:
         several = "without a metadata.yaml its files cannot be one recording"
-        raise BagError(f"{folder}: {several}; name them one by one: {file_names(found)}")
+        raise BagError(f"{folder}: {several}; {name_each(folder, found)}")
     unusable = f"{folder}: its metadata.yaml cannot be used; the files were taken by their names"
     return found, False, [unusable] * (folder / "metadata.yaml").exists()
 

@@ -18,7 +18,7 @@ import resource
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +73,10 @@ def missing(path: Path) -> BagError:
     inside = path.parent.iterdir() if path.parent.is_dir() else ()
     there = sorted((p for p in inside if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
     hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
+    if str(path).startswith("~") or "*" in path.name:
+        hint = "; a shell replaces ~ and * only where they are not in quotes"
+    if (unfinished := Path(f"{path}.part")).exists():
+        hint = f"; its recording goes on, or was killed: read {unfinished}"
     return BagError(f"{path}: there is no such file or folder{hint}")
 
 
@@ -106,12 +110,16 @@ def no_recording(folder: Path, inside: list[Path]) -> BagError:
     if folders:
         return BagError(f"{folder}: holds no recording itself; name the folders in it: {file_names(folders)}")
     if tables := [p for p in inside if p.suffix in TABLES]:
-        each = f"each of which is a recording; name them one by one: {file_names(tables)}"
-        return BagError(f"{folder}: a folder of tables, {each}")
+        return BagError(f"{folder}: a folder of tables, each of which is a recording; {name_each(folder, tables)}")
     return BagError(f"{folder}: there is no {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]} file in it; check the path")
 
 
-def file_names(paths: list[Path]) -> str:
+def name_each(folder: Path, inside: Sequence[Path]) -> str:
+    """The remedy for a folder whose files are recordings of their own."""
+    return f"name them, {shlex.quote(str(folder))}/*{inside[0].suffix}: {file_names(inside)}"
+
+
+def file_names(paths: Sequence[Path]) -> str:
     """Names of files in one sentence."""
     return shortlist([path.name for path in paths], 12)
 

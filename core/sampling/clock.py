@@ -48,11 +48,6 @@ class Status(StrEnum):
         """The message made no sample."""
         return self in (Status.EQUAL, Status.SHORT, Status.LATE, Status.UNSTAMPED)
 
-    @property
-    def opens_segment(self) -> bool:
-        """The sample has no predecessor."""
-        return self in (Status.FIRST, Status.RESET, Status.GAP)
-
 
 _LONGEST, _LONGEST_REMEMBERED = 2.5, 1.5
 """Median steps up to which a longer one is no gap; of signals that recall others one over a lost sample is: what they
