@@ -1406,12 +1406,19 @@ def test_wheels_are_judged_by_what_their_encoders_count(tmp_path):
     assert not well.alarm.any() and slips.alarm[1100:].mean() > 0.1, (well.alarm.mean(), slips.alarm[1100:].mean())
 
 
-def test_the_place_of_a_servo_depends_on_its_command(tmp_path):
-    rng = np.random.default_rng(3)
-    target = np.repeat(rng.integers(-3000, 3000, 60), 25)
-    count = np.rint(answers(rng, np.column_stack([target, target]))[:, 0])
-    proposal = propose([table_of(tmp_path / "a.csv", {"encoder": count, "target": target}, 0.05 * np.arange(1500))])
+@pytest.mark.parametrize("pulled", [True, False], ids=["servo", "pendulum"])
+def test_a_count_that_something_pulls_back_matters(tmp_path, pulled):
+    """To the place that is its command, or down; a wheel stands as well elsewhere."""
+    rng, (x, v), count = np.random.default_rng(3), (0.0, 0.0), []
+    target = np.repeat(rng.integers(-300, 300, 60), 25)
+    for command in target:
+        count.append(np.rint(x))
+        v += 0.05 * (2.0 * command - (2.0 if pulled else 4.0) * x - 3.0 * v)
+        x += 0.05 * v
+    name = "goal" if pulled else "pwm"
+    proposal = propose([table_of(tmp_path / "a.csv", {"encoder": count, name: target}, 0.05 * np.arange(1500))])
     assert [c.path for c in proposal.states] == ["encoder"] and "structure:" not in proposal.text, proposal.text
+    assert "additive: noise" in proposal.text
 
 
 def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):

@@ -582,7 +582,7 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
             transients.append(Transient(t, z[:, :n], z[:, n:], state_names=names[:n], control_names=names[n:]))
     if not transients:
         return []
-    on = endless(states, controls)
+    on = endless(states, controls, sources)
     if chosen := tuple(Remembered(c.name, Memory("rate")) for c in on if of_wheel(c)):
         gain = "how fast it turned"
     else:

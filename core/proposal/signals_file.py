@@ -23,7 +23,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.proposal.candidates import OF_QUATERNION, Candidate, Source, held
+from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, held, steps_of
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.sampling.clock import coarse_ns, longest_pause
@@ -172,14 +172,14 @@ def signals_file(
     """Write the text of the file."""
     every = {s.topic: s for s in sources}
     topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
-    clock = clock_of(states, sources)
+    clock, around = clock_of(states, sources), endless(states, controls, sources)
     lines = [
         "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
         *_recordings(bags),
         "# States are what the machine remembers from one sample to the next; controls are what is done to it, as",
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",
-        *([] if plant else [_ADDITIVE, f"additive: {'both' if any(map(of_wheel, states)) else 'noise'}", ""]),
+        *([] if plant else [_ADDITIVE, f"additive: {'both' if any(map(of_wheel, around)) else 'noise'}", ""]),
     ]
     offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
     by_arrival = any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0
@@ -232,7 +232,7 @@ def signals_file(
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
         lines = for_members(lines, states[0].element, list(members))
-    elif around := endless(states, controls):
+    elif around:
         lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle heads for.", "structure:"]
         lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
@@ -251,28 +251,31 @@ def _recordings(bags: Sequence[Recording]) -> list[str]:
 _LISTED = 40
 
 
-def endless(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[Candidate]:
+def endless(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[Candidate]:
     """States on which nothing depends, as they go on from turn to turn, or where the next drive goes."""
-    return [c for c in states if _turns(c) and not any(_holds(control, c) for control in controls)]
+    every, course = {s.topic: s for s in sources}, any(map(_holds_course, controls))
+    wheels = [c for c in states if of_wheel(c) and not _is_pulled(c, controls, every)]
+    return [c for c in states if c in wheels or (_turns(c) and not of_wheel(c) and not course)]
+
+
+def _is_pulled(wheel: Candidate, controls: Sequence[Candidate], every: dict[str, Source]) -> bool:
+    """Whether a count changes by what it is, given how fast it changed: that of a pendulum, or of a servo."""
+    steps = steps_of([wheel], every, [wheel, *controls], [1] + [c.delay for c in controls])
+    rate, of = steps.X - steps.U[:, :1], np.hstack([steps.X, steps.U[:, 1:]])
+    return bool(Steps(rate, of, steps.dX).effects()[1, 0] > SHOWS)
 
 
 def _turns(candidate: Candidate) -> bool:
-    """Whether a count or an angle goes on: it went round by half a turn, or another drive may be elsewhere."""
+    """Whether an angle goes on: it went round by half a turn, or another drive may head elsewhere."""
     spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
     turn = FieldPath(candidate.path).unwrap
-    goes_on = max(spans, default=0.0) >= turn / 2 or COMPASS.search(candidate.path) is not None
-    return of_wheel(candidate) or (turn > 0 and goes_on)
+    return turn > 0 and (max(spans, default=0.0) >= turn / 2 or COMPASS.search(candidate.path) is not None)
 
 
-_COURSE = re.compile(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)")
-_PLACES = {"pos", "position", "set", "setpoint", "target", "goal", "desired", "ref", "reference"}
-
-
-def _holds(control: Candidate, state: Candidate) -> bool:
-    """Whether a command may be for the angle itself, as the course of an autopilot or the place of a servo is."""
-    if of_wheel(state):
-        return not _PLACES.isdisjoint(words_of(control.path))
-    return _turns(control) or _COURSE.search(control.path) is not None
+def _holds_course(control: Candidate) -> bool:
+    """Whether an angle depends on a command for it, such as the course that an autopilot holds."""
+    course = re.search(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)", control.path)
+    return _turns(control) or course is not None
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
