@@ -40,6 +40,7 @@ _DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value"
 
 COMPASS = re.compile(r"(?i)(heading|hdg|azimuth|compass)(_?deg\w*)?(?!\w)")
 """Name of the direction in which a vehicle is: nothing depends on it, and another drive may go elsewhere."""
+_COURSE = re.compile(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)")  # of a command: what holds it
 _WHEEL = re.compile(r"(^|_)(ticks?|enc(oders?)?)(_|$)")
 
 
@@ -253,9 +254,16 @@ _LISTED = 40
 
 def endless(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[Candidate]:
     """States on which nothing depends, as they go on from turn to turn, or where the next drive goes."""
-    every, course = {s.topic: s for s in sources}, any(map(_holds_course, controls))
-    wheels = [c for c in states if of_wheel(c) and not _is_pulled(c, controls, every)]
-    return [c for c in states if c in wheels or (_turns(c) and not of_wheel(c) and not course)]
+    every, holds = {s.topic: s for s in sources}, any(map(_goes_round, controls))
+    steered = holds or any(_COURSE.search(c.path) for c in controls)
+
+    def is_free(state: Candidate) -> bool:
+        if of_wheel(state):
+            return not _is_pulled(state, controls, every)
+        heads = COMPASS.search(state.path) and FieldPath(state.path).unwrap
+        return bool((heads and not steered) or (_goes_round(state) and not holds))
+
+    return [c for c in states if is_free(c)]
 
 
 def _is_pulled(wheel: Candidate, controls: Sequence[Candidate], every: dict[str, Source]) -> bool:
@@ -265,17 +273,11 @@ def _is_pulled(wheel: Candidate, controls: Sequence[Candidate], every: dict[str,
     return bool(Steps(rate, of, steps.dX).effects()[1, 0] > SHOWS)
 
 
-def _turns(candidate: Candidate) -> bool:
-    """Whether an angle goes on: it went round by half a turn, or another drive may head elsewhere."""
+def _goes_round(candidate: Candidate) -> bool:
+    """Whether an angle went round by half a turn or more."""
     spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
     turn = FieldPath(candidate.path).unwrap
-    return turn > 0 and (max(spans, default=0.0) >= turn / 2 or COMPASS.search(candidate.path) is not None)
-
-
-def _holds_course(control: Candidate) -> bool:
-    """Whether an angle depends on a command for it, such as the course that an autopilot holds."""
-    course = re.search(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)", control.path)
-    return _turns(control) or course is not None
+    return turn > 0 and max(spans, default=0.0) >= turn / 2
 
 
 def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
