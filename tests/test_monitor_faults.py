@@ -354,10 +354,10 @@ def test_a_stopped_reader_of_one_output_costs_the_readers_of_others_nothing(send
 
 
 def test_a_busy_processor_is_no_reader_that_stands_still(sends: Sends) -> None:
-    """Sending takes 2 ms as others have the processor, and 20 µs of it."""
-    sends.sending = dict.fromkeys(sends.node.outputs.publishers, (2e-5, 2e-3))
+    """Sending takes 2 ms as others have the processor, and 20 µs of it, or of flags, whose way is cold, 0.28 ms."""
+    sends.sending = dict.fromkeys(sends.node.outputs.publishers, (2e-5, 2e-3)) | {"flags": (2.8e-4, 2e-3)}
     verdicts = sends.run(2000)
-    assert sends.sent["violation"] >= sends.sent["lower"] == verdicts > 500
+    assert sends.sent["violation"] >= sends.sent["lower"] == verdicts > 500 and sends.sent["flags"] >= verdicts
     assert sends.sender.held_back == 0 and not sends.sender.problems
 
 

@@ -28,7 +28,7 @@ from uncertain_lti.monitor.stream import Stream
 from uncertain_lti.monitor.verdict import Verdict
 
 _AT_ONCE, _PAUSE = 200, 0.01  # messages that had waited are taken so many at once, with so many s in between
-_SLOW = 0.0002  # s of processor time for one message; 3 to 40 µs, to 200 beside others, unless its way is made anew
+_SLOW_FLAGS, _SLOW = 3e-4, 2e-4  # s of processor time for a message; 5 to 40 µs, beside others 0.26 ms, at a stand 0.36
 _PATIENCE = 60  # messages of one topic that are sent so slowly, less those that are not
 _REST_OF_FLAGS, _REST = 1.5, 6.0  # times its processor time pass after a slow message; of others, for each slow topic
 _FORGET = 1.0  # s without a message of a topic, and how slow it was is found out again
@@ -45,17 +45,18 @@ class Publisher(Protocol):
 class _Way:
     """The way to the readers of one topic, and how slow it is.
 
-    `tried`: steady time of the last message, s; `until`: no further message before this steady time.
+    `most`: s that a message may take; `tried`: steady time of the last one, s; `until`: none before this steady time.
     """
 
     name: str
     send: Any
+    most: cython.double
     slow: cython.Py_ssize_t
     tried: cython.double
     until: cython.double
 
     def __init__(self, name: str, publisher: Publisher) -> None:
-        self.name, self.send = name, publisher.send
+        self.name, self.send, self.most = name, publisher.send, _SLOW_FLAGS if name == FLAGS.name else _SLOW
         self.slow, self.tried, self.until = 0, -math.inf, -math.inf
 
 
@@ -176,9 +177,9 @@ class Sender:
                 continue
             way.send(messages[i])
             ended: cython.double = clock()
-            if ended - began > _SLOW and not doubted:
+            if ended - began > way.most and not doubted:
                 self._doubted = ended + _FORGET
-            elif ended - began > _SLOW:
+            elif ended - began > way.most:
                 self._was_slow(way, ended - began)
             elif way.slow > 0:
                 way.slow -= 1
