@@ -20,7 +20,9 @@ from scipy.special import stdtrit
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI, fit
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification import fitting
+from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, StatisticRule
+from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Residuals
 from uncertain_lti.reports.check import check_data
 from uncertain_lti.reports.findings import findings
@@ -102,6 +104,18 @@ def test_the_form_of_the_residuals_is_that_whose_threshold_encloses_less(runs):
         assert model.residuals.relative == relative and len(model.residuals.forms) == 1
         assert (model.residuals.law is None) == relative
         assert [rule.kind for rule in model.alarm] == ["energy", "energy", slow, "chi2"]
+
+
+def test_a_law_does_without_what_nothing_depends_on_and_is_none_where_more_is_said(runs):
+    """A base that counts how far its wheels turned saw no slow slip, as nothing may depend on the counts."""
+    (t, x, u), n, m = (runs[0].t, runs[0].x, runs[0].u), 3, runs[0].u.shape[1]
+    counted = Transient(t, np.hstack([DT * np.cumsum(x[:, :1], axis=0), x]), u)
+    column = np.array([[0.0, np.nan, np.nan]] * n)
+    free = Structure(n, m, {"A": column, "dA": column})
+    bounded = Structure(n, m, {"A": column, "dA": column}, upper={"A": np.full((n, n), 1e6)})
+    law = fitting.fit(counted, "lp", additive="noise", structure=free).residuals.other.law
+    assert (law.A[:, 0] == 0.0).all() and (law.A[:, 1:] != 0.0).all()
+    assert fitting.fit(counted, "lp", additive="noise", structure=bounded).residuals.other is None
 
 
 def test_a_jump_that_only_both_of_two_alike_tell_counts(runs):
@@ -418,6 +432,16 @@ def test_a_combination_that_the_others_lack_is_far_though_each_signal_is_in_its_
     reach = Reach(UncertainLTI(zero, zero, zero, zero, v=[1.0]), [seen])
     for u, level in ((0.5, 0), (-0.5, 2)):
         assert reach.level(Transient([0.0, DT], [[0.5]] * 2, [[u]] * 2).transitions()).tolist() == [level]
+
+
+def test_what_has_no_range_to_leave_is_never_far():
+    """Where a count has got to says nothing: of wheels that were driven on, every model was unproven."""
+    zero, t = np.zeros((1, 1)), DT * np.arange(200)
+    none = UncertainLTI(zero, zero, zero, zero, v=[1.0], domain=Domain([0], [1], [0], [1], anywhere=[True, False]))
+    count, u = np.cumsum(np.ones((200, 1)), axis=0), np.random.default_rng(0).uniform(size=(200, 1))
+    reach = Reach(none, [Transient(t, count, u)])
+    assert not reach.level(Transient(t, count + 1e4, u).transitions()).any()
+    assert (reach.level(Transient(t, count, u + 9.0).transitions()) == 2).all()
 
 
 def test_recordings_that_do_not_repeat_one_another_are_named(runs):

@@ -1381,6 +1381,19 @@ def test_nothing_depends_on_where_a_vehicle_heads_for(tmp_path, name, command, d
     assert ("structure:" in proposal.text) != depends, proposal.text
 
 
+@pytest.mark.parametrize(("command", "apart", "depends"), [("direction_cmd", 30, True), ("course_cmd", 140, False)])
+def test_a_heading_depends_on_a_command_it_follows_but_on_none_that_jumps(tmp_path, command, apart, depends):
+    """A vehicle goes the shorter way to its course, and no linear model knows how often it went round."""
+    rng, way = np.random.default_rng(3), [180.0]
+    course = np.repeat(180 + rng.uniform(-apart, apart, 60), 25)
+    for target in course[1:]:
+        way.append(way[-1] + 0.1 * ((target - way[-1] + 180) % 360 - 180) + 0.1 * rng.normal())
+    columns = {"heading": np.array(way) % 360, command: course}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(1500))])
+    assert [c.path for c in proposal.states] == ["unwrap(heading, 360)"], proposal.text
+    assert ("structure:" in proposal.text) != depends, proposal.text
+
+
 def test_wheels_are_judged_by_what_their_encoders_count(tmp_path):
     """A count that grows was a counter, and one that falls a place which another drive leaves: no slip was seen."""
 
@@ -1419,6 +1432,41 @@ def test_a_count_that_something_pulls_back_matters(tmp_path, pulled):
     proposal = propose([table_of(tmp_path / "a.csv", {"encoder": count, name: target}, 0.05 * np.arange(1500))])
     assert [c.path for c in proposal.states] == ["encoder"] and "structure:" not in proposal.text, proposal.text
     assert "additive: noise" in proposal.text
+
+
+@pytest.mark.parametrize("target", ["speed_setpoint", "pwm"])
+@pytest.mark.parametrize(("bits", "gain"), [(40, 20.0), (12, 4000.0), (8, 200.0), (32, 3e4)])
+def test_a_count_of_any_bits_goes_on_and_nothing_depends_on_it(tmp_path, bits, gain, target):
+    """A set point of the speed holds no place, and an encoder of a turn has as many bits as its maker gave it."""
+    rng, speed, way, counts = np.random.default_rng(3), 0.0, 2.0**32 - 1000.0 if bits == 32 else 0.0, []
+    command = np.repeat(rng.uniform(-1.0, 1.0, 60), 25)
+    for u in command:
+        speed += 0.2 * (u * gain * 5 - speed) + 0.01 * gain * rng.normal()
+        way += 0.05 * speed
+        counts.append(np.floor(way) % 2**bits if bits != 40 else np.floor(way))
+    proposal = propose([table_of(tmp_path / "a.csv", {"enc": counts, target: command}, 0.05 * np.arange(1500))])
+    path = f"unwrap(enc, {2**bits})" if bits != 40 else "enc"
+    assert [c.path for c in proposal.states] == [path], proposal.text
+    assert f"rate({path})" in proposal.text and "from: enc, nominal: 0" in proposal.text, proposal.text
+
+
+def test_a_count_that_is_set_to_0_is_not_unwrapped(tmp_path):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.uniform(0.1, 1.0, 60), 25)
+    count = np.floor(np.cumsum(answers(rng, np.column_stack([u, u]))[:, 0] + 1.0))
+    count[900:] -= count[900]
+    proposal = propose([table_of(tmp_path / "a.csv", {"ticks": count, "pwm": u}, 0.05 * np.arange(1500))])
+    assert [c.path for c in proposal.states] == ["ticks"], proposal.text
+
+
+@pytest.mark.parametrize("name", ["encoder_velocity", "enc_rpm", "ticks_per_sec", "delta_ticks"])
+def test_what_an_encoder_says_of_the_speed_is_no_count(tmp_path, name):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    speed = np.rint(100 * answers(rng, np.column_stack([u, u]))[:, 0])
+    proposal = propose([table_of(tmp_path / "a.csv", {name: speed, "pwm": u}, 0.05 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == [name] and "structure:" not in proposal.text, proposal.text
+    assert "additive: noise" in proposal.text and "how fast it turned" not in proposal.text, proposal.text
 
 
 def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):

@@ -320,7 +320,7 @@ def fit_fleet(
     afterwards = (
         memory,
         said,
-        partial(fleet.residuals, model, judged, structure is None),
+        partial(fleet.residuals, model, judged, structure is None or structure.free),
         *(partial(repeats_in, model, t) for t in transients),
     )
     kept, words, residuals, *seen = on_cores(lambda of: of(), [(of,) for of in afterwards], sums.count > WORTH_THREADS)

@@ -18,6 +18,7 @@ from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import LARGEST, Array, core_count
 from uncertain_lti.base.errors import FitError, UncertainLTIError
@@ -116,18 +117,20 @@ class Fleet:
         first, *others = self.map(passes.judge, self._same(model))
         return sum(others, first)
 
-    def residuals(self, model: Envelope, judged: Judged, own_law: bool = True) -> Residuals:
+    def residuals(self, model: Envelope, judged: Judged, own_law: ArrayLike = True) -> Residuals:
         """Mean and covariance of the utilisation, `judged`: of all transitions by the same model.
 
-        With them, but of a schedule and without an `own_law`, as of a structure, which a law does not know, residuals
-        of `law_of`: their spread is the same everywhere, where that of one utilisation changes as the half-widths do.
+        With them, but of a schedule, residuals of `law_of` on the signals of which `own_law` (p,) is true, if any:
+        their spread is the same everywhere, where that of one utilisation changes as the half-widths do.
         """
         mean = judged.total / self.N
         found = Residuals(mean, _covariance(judged.products / self.N - np.outer(mean, mean)))
-        if not own_law or self.columns.regimes is not None:
+        if not np.any(own_law) or self.columns.regimes is not None:
             return found
         pairs = self.map(passes.in_a_row, self._same(min(1.0, _TAKEN / self.N)))
-        return found.beside(law_of(np.sum([total for total, _ in pairs], axis=0), sum(n for _, n in pairs), self.n))
+        kept = np.tile(np.append(np.broadcast_to(own_law, self.p), np.ones(1 + self.n, dtype=bool)), 2)
+        products = np.sum([total for total, _ in pairs], axis=0) * np.outer(kept, kept)
+        return found.beside(law_of(products, sum(n for _, n in pairs), self.n))
 
     def check_solvable(self, where: Callable[[int], str], names: Sequence[str]) -> None:
         """Refuse data to which no envelope can be fitted; `where`: what a transition is called."""

@@ -115,6 +115,16 @@ class Structure:
         np.fill_diagonal(rows, np.diagonal(rows) | np.asarray(rows.any(axis=0))[: self.n])
         return np.asarray(rows.T @ rows)
 
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """Of which of [x; u] some row may have anything, (n + m,), where no more is said; none otherwise."""
+        used, said = np.asarray(self.rows.any(axis=0)), 0
+        for name, low in self.lower.items():
+            unbounded = (low == (0.0 if name in HALF_WIDTHS else -math.inf)) & (self.upper[name] == math.inf)
+            said += int(np.count_nonzero(~unbounded))
+        no_more = self.blocks is None and said == 2 * self.n * np.count_nonzero(~used)
+        return used if no_more else np.zeros_like(used)
+
     def _known(self, name: str) -> None:
         if name not in self._shapes:
             raise FitError(f"structure: there is no '{name}'; there are {', '.join(self._shapes)}")

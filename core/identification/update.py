@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
@@ -79,7 +80,7 @@ class _Updated(Fleet):
         both = Occupancy.of(np.logical_or.reduce(new)).occupied | seen.within(self._model.domain, low, high)
         return Occupancy(seen.cells, both)
 
-    def residuals(self, model: Envelope, judged: Judged, own_law: bool = True) -> Residuals:
+    def residuals(self, model: Envelope, judged: Judged, own_law: ArrayLike = True) -> Residuals:
         """Those of the earlier recordings by the model of then, those of the new ones by this one."""
         before, count = self._model.residuals, self._model.fit_summary["transitions"]
         if before is None:

@@ -46,16 +46,17 @@ from uncertain_lti.proposal.candidates import (
 )
 from uncertain_lti.proposal.choosing import choose, is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
-    COMPASS,
     clock_of,
     columns_of,
     endless,
     entry,
     name_signals,
+    of_compass,
     of_wheel,
     set_operating_point,
     set_own_scale,
     signals_file,
+    turn_of_count,
     words_of,
 )
 from uncertain_lti.proposal.tune import Remembered, choose_memories
@@ -399,13 +400,12 @@ def _wrapped(source: Source) -> None:
         angle = re.match(rf"({WRAPPING})\(", candidate.path) is not None
         finite = [values[np.isfinite(values)] for values in candidate.values]
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
-        turns = (math.tau, 360.0) if not (wheel := of_wheel(candidate)) else (65536.0,)  # of 16 bits
-        jumps = (t for t in turns if any(span <= 1.1 * t and step > 0.8 * t for span, step in steps))
-        low, high = candidate.finite.min(), candidate.finite.max()
-        compass = COMPASS.search(candidate.path) and -180 <= low and high <= 360 and max(-low, high) > math.tau
-        turn = math.tau if angle else next(jumps, 360.0 if compass else 0.0)
-        named = re.search(r"(angle|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg)", candidate.path.lower())
-        if angle or (turn and (named or wheel)):
+        low, high, turning = candidate.finite.min(), candidate.finite.max(), of_compass(candidate)
+        compass = bool(turning and -180 <= low and high <= 360 and max(-low, high) > math.tau)
+        named = turning or re.search("angle|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg", candidate.path.lower())
+        turned = (t for t in (math.tau, 360.0) if any(s <= 1.1 * t and step > 0.8 * t for s, step in steps))
+        turn = math.tau if angle else next(turned if named else iter(()), 360.0 * compass or turn_of_count(candidate))
+        if turn:
             candidate.path = f"unwrap({candidate.path}{f', {turn:.0f}' * (turn > 7)})"
             candidate.values = [_unwrapped(v, turn) for v in candidate.values]
 

@@ -38,10 +38,10 @@ _PARTS = re.compile(r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+|\d+")  # letters 
 _DULL = {"pose", "twist", "vector", "data", "point", "transform", "msg", "value", "quaternion", "accel", "wrench"}
 
 
-COMPASS = re.compile(r"(?i)(heading|hdg|azimuth|compass)(_?deg\w*)?(?!\w)")
+_COMPASS = re.compile(r"(?i)(heading|hdg|azimuth|compass)(_?deg\w*)?(?!\w)")
 """Name of the direction in which a vehicle is: nothing depends on it, and another drive may go elsewhere."""
 _COURSE = re.compile(r"(?i)(heading|hdg|azimuth|compass|course|yaw)(?!_?rate)")  # of a command: what holds it
-_WHEEL = re.compile(r"(^|_)(ticks?|enc(oders?)?)(_|$)")
+_WHEEL = re.compile(r"(^|_)(ticks?|enc(oders?)?)(_|$)(?!.*(vel|speed|rpm|rate|per|volt|temp|current))")
 
 
 _UNITS = (
@@ -96,6 +96,35 @@ def of_wheel(candidate: Candidate) -> bool:
     return _WHEEL.search("_".join(words_of(f"{topic} {FieldPath(candidate.path).angle}"))) is not None
 
 
+_BITS = [*np.exp2(range(8, 17)).tolist(), 2.0**32]
+
+
+def turn_of_count(candidate: Candidate) -> float:
+    """After how much the count of a wheel begins anew, by the bits that it fills, if it did; else 0.
+
+    It goes on there as it does between, which a count that is set to 0 does not.
+    """
+    counts = [v[np.isfinite(v)] for v in candidate.values if np.isfinite(v).sum() > 1]
+    for turn in _BITS if counts and of_wheel(candidate) else ():
+        jumps = [np.abs(np.diff(v)) > 0.8 * turn for v in counts]
+        if any(map(np.any, jumps)) and max(map(np.ptp, counts)) < turn:
+            steps = [np.abs(np.diff(np.unwrap(v, period=turn))) for v in counts]
+            jumped, others = (np.concatenate([s[j == of] for s, j in zip(steps, jumps, strict=True)]) for of in (1, 0))
+            return turn if jumped.max() <= 1.5 * others.max(initial=1.0) else 0.0
+    return 0.0
+
+
+def of_compass(candidate: Candidate) -> bool:
+    """Whether a number is the direction in which a vehicle is, by its name."""
+    return _COMPASS.search(_called(candidate)) is not None
+
+
+def _called(candidate: Candidate) -> str:
+    """The field, or the last word of the topic, where its message holds this number alone."""
+    angle = FieldPath(candidate.path).angle
+    return candidate.topic.rpartition("/")[2] if angle == "data" else angle
+
+
 def clock_of(states: Sequence[Candidate], sources: Sequence[Source]) -> Source:
     """The slowest of the topics of the states."""
     topics = {c.topic for c in states}
@@ -122,7 +151,8 @@ def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidat
         finite = pooled[np.isfinite(pooled[:, j]), j]
         span = float(np.ptp(finite)) if len(finite) else 0.0
         candidate.steady = steady[j] if abs(steady[j]) > 1e-3 * span else 0.0
-        candidate.scale = _listed(scale[j] if scale[j] > 0.1 * span else span)
+        of_range = scale[j] <= 0.1 * span or of_wheel(candidate)  # a count begins anywhere, and moves by little of it
+        candidate.scale = _listed(span if of_range else scale[j])
 
 
 def set_own_scale(candidate: Candidate) -> None:
@@ -255,22 +285,31 @@ _LISTED = 40
 def endless(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[Candidate]:
     """States on which nothing depends, as they go on from turn to turn, or where the next drive goes."""
     every, holds = {s.topic: s for s in sources}, any(map(_goes_round, controls))
-    steered = holds or any(_COURSE.search(c.path) for c in controls)
+    steered = holds or any(_COURSE.search(_called(c)) for c in controls)
 
     def is_free(state: Candidate) -> bool:
         if of_wheel(state):
             return not _is_pulled(state, controls, every)
-        heads = COMPASS.search(state.path) and FieldPath(state.path).unwrap
-        return bool((heads and not steered) or (_goes_round(state) and not holds))
+        heads = of_compass(state) and FieldPath(state.path).unwrap
+        goes_on = heads and not steered and not _is_pulled(state, controls, every)
+        return bool(goes_on or (_goes_round(state) and not holds))
 
     return [c for c in states if is_free(c)]
 
 
-def _is_pulled(wheel: Candidate, controls: Sequence[Candidate], every: dict[str, Source]) -> bool:
-    """Whether a count changes by what it is, given how fast it changed: that of a pendulum, or of a servo."""
-    steps = steps_of([wheel], every, [wheel, *controls], [1] + [c.delay for c in controls])
+TELLS = 0.02
+"""Share of what else is not known of a change that a count, or a heading, tells, from which on it matters."""
+
+
+def _is_pulled(state: Candidate, controls: Sequence[Candidate], every: dict[str, Source]) -> bool:
+    """Whether a count changes by what it is, given how fast it changed: that of a pendulum, or of a servo.
+
+    Or a heading by what it is and what is commanded.
+    """
+    steps = steps_of([state], every, [state, *controls], [1] + [c.delay for c in controls])
     rate, of = steps.X - steps.U[:, :1], np.hstack([steps.X, steps.U[:, 1:]])
-    return bool(Steps(rate, of, steps.dX).effects()[1, 0] > SHOWS)
+    shown = Steps(rate, of, steps.dX).effects()[1:, 0] > max(SHOWS, TELLS * len(rate))
+    return bool(shown[0] and (of_wheel(state) or shown[1:].any()))
 
 
 def _goes_round(candidate: Candidate) -> bool:

@@ -39,7 +39,7 @@ class Reach:
 
     def __init__(self, model: UncertainLTI, transients: Sequence[Transient]) -> None:
         self._model = model
-        every = [model.normalised_columns(t.transitions()) for t in transients]
+        every = [self._columns(t.transitions()) for t in transients]
         self._low = np.min([z.min(axis=1, initial=np.inf) for z in every], axis=0)
         self._high = np.max([z.max(axis=1, initial=-np.inf) for z in every], axis=0)
         stride = max(1, sum(z.shape[1] for z in every) // _MOST)
@@ -48,6 +48,13 @@ class Reach:
         scaled = some / self._scale
         self._inverse = np.linalg.pinv(scaled @ scaled.T, rcond=_SAME, hermitian=True)
         self._largest = float(self._leverage(some).max())
+
+    def _columns(self, steps: Transitions) -> Array:
+        """Those of a model, with 0 for what has no range to leave."""
+        z, anywhere = self._model.normalised_columns(steps), self._model.domain.anywhere
+        if anywhere is not None:
+            z[np.flatnonzero(anywhere)] = 0.0
+        return z
 
     def _lever(self, z: Array) -> Array:
         return np.vstack([z[: self._model.n + self._model.m], np.ones(z.shape[1])])
@@ -58,7 +65,7 @@ class Reach:
 
     def level(self, steps: Transitions) -> NDArray[np.intp]:
         """(K,): 0 where a transition begins within what was fitted, 1 beyond it, 2 far beyond."""
-        z = self._model.normalised_columns(steps)
+        z = self._columns(steps)
         found = np.zeros(z.shape[1], dtype=np.intp)
         leverage = self._leverage(self._lever(z))
         for level, (share, times) in enumerate(REACHES, start=1):
