@@ -97,13 +97,21 @@ def test_what_was_not_kept_is_never_left_outside():
     equal(model.update([*quiet, *loud]), fit([*quiet, *loud], "qp", **PAPER))
 
 
-@pytest.mark.parametrize("seed", [0])
+@pytest.mark.parametrize("seed", [0, 4])
 def test_what_is_kept_is_nearest_to_the_bounds_where_every_width_is_the_largest(seed):
     """Of more transitions than a pass brings, whose widths noise alone makes and rounding alone tells apart."""
     runs = runs_of(seed, (8000,) * 4, n=8, varies=0.0)
     model = fit(runs[:3], "lp", **PAPER)
     assert model.dA.max() < 1e-9
     equal(model.update(runs[3]), fit(runs, "lp", **PAPER))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_as_many_transitions_are_kept_as_there_is_room_for(seed):
+    """Also where a few large ones are near the bounds of every state."""
+    quiet, loud = runs_of(seed, (2500,) * 3, n=12, noise=0.003), runs_of(seed, (100,) * 4, n=12)
+    runs = [*(t.replace(x=t.x / 3, u=t.u / 3) for t in quiet), *loud]
+    equal(fit(runs[:-1], "qp", **PAPER).update(runs[-1]), fit(runs, "qp", **PAPER))
 
 
 def thresholds(model):
