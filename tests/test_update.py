@@ -26,7 +26,7 @@ from uncertain_lti.validation.panel import Evidence
 PAPER = {"additive": "noise", "alarm": "containment"}
 
 
-def runs_of(seed, lengths, n=3, m=2, noise=0.01, dt=0.02):
+def runs_of(seed, lengths, n=3, m=2, noise=0.01, dt=0.02, varies=0.05):
     """Recordings of one random stable plant whose elements vary a little, with noise."""
     rng = np.random.default_rng(seed)
     elements = np.hstack([rng.normal(size=(n, n)) / np.sqrt(n) - 2 * np.eye(n), rng.normal(size=(n, m))])
@@ -35,7 +35,7 @@ def runs_of(seed, lengths, n=3, m=2, noise=0.01, dt=0.02):
         x, u = np.zeros((count + 1, n)), np.zeros((count + 1, m))
         for k in range(count):
             u[k + 1] = 0.95 * u[k] + 0.3 * rng.normal(size=m)
-            drawn = elements * (1 + 0.05 * rng.uniform(-1, 1, elements.shape))
+            drawn = elements * (1 + varies * rng.uniform(-1, 1, elements.shape))
             step = dt * drawn @ np.concatenate([x[k], u[k]])
             x[k + 1] = x[k] + step + noise * rng.uniform(-1, 1, n)
         runs.append(Transient(np.arange(count + 1) * dt, x, u, name=f"run {number}"))
@@ -95,6 +95,23 @@ def test_what_was_not_kept_is_never_left_outside():
     model = fit(quiet, "qp", **PAPER)
     refuses(FitError, "does not prove the optimum of all recordings; give run 0 again, together", model.update, loud)
     equal(model.update([*quiet, *loud]), fit([*quiet, *loud], "qp", **PAPER))
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_what_is_kept_is_nearest_to_the_bounds_where_every_width_is_the_largest(seed):
+    """Of more transitions than a pass brings, whose widths noise alone makes and rounding alone tells apart."""
+    runs = runs_of(seed, (8000,) * 4, n=8, varies=0.0)
+    model = fit(runs[:3], "lp", **PAPER)
+    assert model.dA.max() < 1e-9
+    equal(model.update(runs[3]), fit(runs, "lp", **PAPER))
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_as_many_transitions_are_kept_as_there_is_room_for(seed):
+    """Also where a few large ones are near the bounds of every state."""
+    quiet, loud = runs_of(seed, (2500,) * 3, n=12, noise=0.003), runs_of(seed, (100,) * 4, n=12)
+    runs = [*(t.replace(x=t.x / 3, u=t.u / 3) for t in quiet), *loud]
+    equal(fit(runs[:-1], "qp", **PAPER).update(runs[-1]), fit(runs, "qp", **PAPER))
 
 
 def thresholds(model):

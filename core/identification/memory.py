@@ -106,7 +106,7 @@ class Boxes:
         changes = [falls + less, less - rises]
         if len(self.room) > 2 * len(widths):
             wider = 0.5 * (widths - np.asarray(before.fit_summary["max_width"]))
-            changes.append(wider[:, None] - more + 1e-12 * widths[:, None])
+            changes.append(wider[:, None] - more + 1e-11 * widths[:, None])
         return replace(self, room=self.room + np.vstack(changes))
 
     def widest(self, columns: Columns, model: Any) -> Array:
@@ -178,7 +178,7 @@ class Memory:
             "recordings": [list(recording) for recording in self.recordings],
             "weights": as_text(of.weights),
             "kept": {name: as_text(values) for name, values in kept.items()},
-            "rest": None if self.rest is None else _texts(self.rest),
+            "rest": self.rest and {name: as_text(of) for name, of in vars(self.rest).items() if of is not None},
             "boxes": None if self.boxes is None else self.boxes.to_dict(len(self.recordings)),
         }
 
@@ -275,13 +275,14 @@ def _nearest(
 ) -> Index:
     """The transitions of least room for their size, in each row alike, and those of the largest widths; so many.
 
-    `held`: of each row those to choose from, in order.
+    `held`: of each row those to choose from where there are many, in order.
 
     The size of a transition is (Δt φ)ᵀ P⁻¹ (Δt φ) + (Δt ψ)ᵀ Q⁻¹ (Δt ψ), its root, P and Q the means of the squares
     over all: by so much its room may change as the elements do.
     """
-    n, count = model.n, -(-4 * most // model.n)
-    some = np.unique(np.concatenate([of_row[: 2 * count] for of_row in held]))
+    n, some = model.n, np.arange(problem.N)
+    if problem.N > 8 * most:
+        some = np.unique(np.concatenate([of_row[: 8 * most // n] for of_row in held]))
     of = problem.subset(some)
     phi, psi = of.phi().T * of.dt, of.psi().T * of.dt
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
@@ -290,9 +291,12 @@ def _nearest(
     *_, room = boxes_of(
         model.tables, of.z_columns, of.dt, of.next_columns, None, widest, np.arange(len(some)), len(some)
     )
-    near = np.vstack([np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300)), room[2 * n :]])
-    near[n:] /= np.sqrt(np.maximum(wide, 1e-300))
-    nearest = np.sort(np.argpartition(near, min(count, near.shape[1]) - 1, axis=1)[:, :count], axis=1)
+    near = np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300))
+    if widest is not None:
+        differ = room[2 * n :].max(axis=1) > 1e-9 * widest  # where noise alone makes the widths, none is wider
+        near = np.vstack([near, room[2 * n :][differ] / np.sqrt(np.maximum(wide, 1e-300))])
+    count = min(12 * most // n, near.shape[1])  # the same transition is near in many rows
+    nearest = np.sort(np.argpartition(near, count - 1, axis=1)[:, :count], axis=1)
     order = np.take_along_axis(nearest, np.argsort(np.take_along_axis(near, nearest, 1), axis=1, kind="stable"), 1)
     index, first = np.unique(order.T, return_index=True)
     return np.sort(some[index[np.argsort(first)[:most]]])
@@ -328,11 +332,6 @@ def as_text(values: Any, form: str = "<f8") -> list[Any]:
     """Numbers as the file of a model has them, to the bit: shape, then base64."""
     array = np.atleast_1d(np.asarray(values)).astype(form)
     return [*array.shape, b64encode(np.ascontiguousarray(array).tobytes()).decode()]
-
-
-def _texts(part: Moments) -> dict[str, Any]:
-    each = {field.name: getattr(part, field.name) for field in fields(part)}
-    return {name: as_text(values) for name, values in each.items() if values is not None}
 
 
 def of_text(text: Sequence[Any], form: str = "<f8") -> Array:

@@ -27,6 +27,9 @@ from uncertain_lti.kernel.arithmetic import Blocks, near_bounds, occupy, pair_co
 
 T = TypeVar("T", "Moments", "Judged")
 
+_ROUNDING = 1e-11
+"""Slack, in scaled units, by which equal widths differ."""
+
 
 def _merged(a: T, b: T, least: Collection[str], greatest: Collection[str]) -> T:
     """Sums of two parts, but for fields of which the least or the greatest is taken; None where a part has none."""
@@ -317,13 +320,16 @@ def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, r
         s,
     )
     half = np.einsum("qk,qk->k", candidate.d[:, row], psi)
-    slack = half - residual
-    if candidate.limit is not None:
-        slack = np.minimum(slack, candidate.limit[row] / (2.0 * samples.root_weight * dt) - half)
     unit = candidate.size_unit
     size = unit @ psi if unit.ndim == 1 else np.einsum("qk,qk->k", unit[:, row], psi)
     size[size == 0.0] = 1.0  # at rest without an additive term nothing but rest is contained
-    return _Near(row, samples, slack / (size * candidate.scale[row]))
+    size *= candidate.scale[row]
+    slack = (half - residual) / size
+    if candidate.limit is not None:
+        room = (candidate.limit[row] / (2.0 * samples.root_weight * dt) - half) / size
+        wanted = room < candidate.room[row] - _ROUNDING  # where noise alone makes widths, all are the widest
+        slack = np.where(wanted, np.minimum(slack, room), slack)
+    return _Near(row, samples, slack)
 
 
 def _least(found: Sequence[_Near], rows: int, most: int, reach: Array) -> tuple[list[list[Index]], Array]:
@@ -338,7 +344,7 @@ def _least(found: Sequence[_Near], rows: int, most: int, reach: Array) -> tuple[
         own = np.flatnonzero(of == i)
         if len(own) > most:
             order = np.argpartition(slack[own], most)
-            reach[i] = slack[own[order[most]]]
+            reach[i] = min(reach[i], slack[own[order[most]]])
             own = np.sort(own[order[:most]])
         parts = np.split(own, np.searchsorted(own, starts[1:]))
         each.append([part - start for part, start in zip(parts, starts, strict=True)])

@@ -467,17 +467,15 @@ class WorkingSet:
         """Hold the solution against all samples, and solve again, until it contains them all."""
         looked_for = 2 * SUBSAMPLE // 5 + self.fleet.N // 2500
         share, most = looked_for / self.fleet.N, 3 * looked_for // 2
-        scanned = False
+        further = 1.0
         for _ in range(MAX_ROUNDS):
             for row in rows:  # the samples held after a pass are those of least slack: keep the first reach
                 if self._reach_scales[row.i] != row.scale:
                     evenly = row.samples.index % self._stride == 0
                     self._reach[:, row.i], self._reach_scales[row.i] = row.reach(share, evenly), row.scale
-            wanted = self._reach
-            if scanned:  # few are left near the bounds, and what is held further off need not be looked for again
-                wanted = _FURTHER * wanted
+            wanted = further * self._reach
             found = self.fleet.scan(self._candidate(wanted[0], wanted[1], most, rows))
-            scanned = True
+            further = _FURTHER  # few are left near the bounds, and what is held need not be looked for again
             self.passes += 1
             before = [(row.theta.copy(), row.d.copy(), row.limit, row.scale) for row in rows]
             todo = []
@@ -500,10 +498,8 @@ class WorkingSet:
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
     def _candidate(self, reach: Array, room: Array, most: int, rows: list[Row]) -> Candidate:
-        limits = [row.limit for row in rows]
-        limit = None
-        if all(value is not None for value in limits):
-            limit = np.array([float(value or 0.0) * row.limit_unit for value, row in zip(limits, rows, strict=True)])
+        limits = [row.limit * row.limit_unit for row in rows if row.limit is not None]
+        limit = np.array(limits) if len(limits) == len(rows) else None
         which = np.array([row.i for row in rows], dtype=np.intp)
         return Candidate(
             np.column_stack([row.theta for row in rows]),
