@@ -104,8 +104,10 @@ def turn_of_count(candidate: Candidate) -> float:
 
     It goes on there as it does between, which a count that is set to 0 does not.
     """
+    if not of_wheel(candidate):
+        return 0.0
     counts = [v[np.isfinite(v)] for v in candidate.values if np.isfinite(v).sum() > 1]
-    for turn in _BITS if counts and of_wheel(candidate) else ():
+    for turn in _BITS if counts else ():
         jumps = [np.abs(np.diff(v)) > 0.8 * turn for v in counts]
         if any(map(np.any, jumps)) and max(map(np.ptp, counts)) < turn:
             steps = [np.abs(np.diff(np.unwrap(v, period=turn))) for v in counts]

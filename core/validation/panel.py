@@ -81,8 +81,9 @@ COARSE = 0.5
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
 _FAR = 10.0
-_NAMED = 6
 """A jump of so many times the range of a state is none that anybody need be told the size of."""
+_NAMED = 6
+"""States that a sentence names at most."""
 _ABOVE = 1.0 + 1e-10
 """A threshold is this times the size that it is learnt from, which must not pass it by rounding."""
 _NOTHING = 1e-9
