@@ -1091,6 +1091,19 @@ def test_row_numbers_without_a_name_are_no_time(tmp_path):
     assert "taken for the time" in open_recording(tmp_path / "b.csv").warnings[0]
 
 
+def test_numbers_of_rows_are_no_seconds(tmp_path):
+    """Beside `elapsed` in s at 10 Hz they made a plant of a row per second."""
+    rows = [f"{k},{k / 10:.1f},{k % 7}" for k in range(60)]
+    assert set(np.diff(read_csv(tmp_path, "step,elapsed,x", rows).times).tolist()) == {10**8}
+    refuses(BagError, "no column is called time", read_csv, tmp_path, "step,x,y", rows)
+    assert "taken for the time" in read_csv(tmp_path, "k,x", (f"{2 * k},{k % 7}" for k in range(60))).warnings[0]
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_table_of_one_row_says_nothing_but_its_sentence(tmp_path):
+    refuses(BagError, "there is no time zone", read_csv, tmp_path, "time,x", ["2026-11-22T06:28:01+99:99,1"])
+
+
 def test_another_time_is_taken_where_most_rows_share_one(tmp_path):
     bag = read_csv(tmp_path, "Timestamp,x,t [ms]", (f"00:00:{k // 10:02},{k % 7},{100 * k}" for k in range(100)))
     assert set(np.diff(bag.times).tolist()) == {10**8} and "and 'Timestamp' does not" in bag.warnings[0]

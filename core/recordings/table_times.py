@@ -31,7 +31,7 @@ NO_TIME = -(2**63)
 _NAMES = (
     r"(__|%)?time(_?stamp)?", r"ts?", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
     r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
-    r"temps|tempo", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
+    r"temps|tempo", r"elapsed|up_?time", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
 _OF_WHAT, _GROWS = re.compile(r"\w+_time"), "it is taken for the time, as it grows from row to row"
 _UNIT = {
@@ -146,7 +146,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
         taken = called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0]
         taken = _clock_beside(table, taken) or taken
-        held = np.mean(table.columns[taken][1:] == table.columns[taken][:-1]) > 0.5  # of a sensor slower than the rows
+        times = table.columns[taken]
+        held = 2 * np.count_nonzero(times[1:] == times[:-1]) > len(times)  # of a sensor slower than the rows
         finer = (n for n in plain if (called_time(n) or _OF_WHAT.fullmatch(_bare(n))) and _grows(table.columns[n]))
         column = next(finer, "") if held else ""
         return (column, f"{_GROWS}, and '{taken}' does not") if column else (taken, "")
@@ -156,11 +157,10 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     if parts := _of_parts(table):
         return parts, "it is put together of these columns, a day more where it goes back"
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
-    if first == ["column 1"] and names[1:2] != ["column 2"] and set(np.diff(table.columns["column 1"]).tolist()) == {1}:
-        first = []  # the row numbers of a data frame, which alone have no name
     for name in [*(n for n in names if _OF_WHAT.fullmatch(_bare(n))), *first]:
-        if _grows(table.columns[name]):
-            return name, _GROWS
+        says = name in table.units or names[1:2] == ["column 2"]  # a unit, or that none has a name
+        if _grows(table.columns[name]) and (says or (np.diff(table.columns[name]) != 1).any()):
+            return name, _GROWS  # and are no numbers of rows, as `step` or the first column of a data frame
     none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
     texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
     if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
