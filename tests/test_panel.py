@@ -569,7 +569,9 @@ def test_states_that_are_blind_are_named(learnt):
     assert worth(full, replace(panel, biases=1.01 * span))[0] == "none"
     assert "is over ten times the recorded range" in worth(full, replace(panel, biases=1e6 * span))[1]
     assert worth(full, replace(panel, biases=0.041 * span))[1].endswith("jumps of 4.1 % of the recorded range")
-    assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0))[0]
+    assert "at most 1500 per hour with 90% confidence" in promises(full, replace(panel, limit=1523.0, asked=9.0))[0]
+    assert "too little to say how rare they are" in promises(full, replace(panel, limit=1523.0))[0]
+    assert "at most 15 per hour with 90% confidence" in promises(full, replace(panel, limit=15.23))[0]
     quiet = replace(panel.evidence, hours=0.008, counts=np.zeros(3), dt=0.5)
     assert "none in 28.8 s left out (8 rec" in promises(full, replace(panel, evidence=quiet))[0]
     far = promises(full, replace(panel, evidence=quiet, biases=np.array([0.25, 11.0]) * span))[2]

@@ -228,9 +228,9 @@ def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], pa
         found.setdefault(those, f"{those} nearly move together {why} trade places: {cure}")
     messages = [*found.values()]
     if (groups := len(messages)) > MOST_GROUPS:
-        messages[MOST_GROUPS:] = [
-            f"{groups} combinations of signals nearly move together, of which the {MOST_GROUPS} nearest are named "
-            f"above: few of {len(free)} signals can be told apart; use fewer, or more controls of their own"
+        messages[1:] = [
+            f"{groups} combinations of signals nearly move together, of which the nearest is named above: few of "
+            f"{len(free)} signals can be told apart; use fewer, or more controls of their own"
         ]
     return messages
 

@@ -62,6 +62,8 @@ FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
 CONFIDENCE = 0.9
 """Of the limit of the false-alarm rate, one-sided, and of the largest size in one more recording or group."""
+OFTEN = 60
+"""Of that limit, per hour, above which it says nothing: alarms chatter, and few recordings leave all open."""
 ALIKE = 0.95
 """As CONFIDENCE, of the largest size in one more block of a single recording."""
 TELLING = 4
@@ -534,10 +536,10 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
     if math.isfinite(panel.limit):
         count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
         units = f"{lasting(evidence.hours)} {shown} ({plural(panel.units, panel.what)})"
-        found = [
-            f"false alarms: {count or 'none'} in {units}, which shows at most {most:.7g} per hour with "
-            f"{CONFIDENCE:.0%} confidence, while the machine is run as in the recordings"
-        ]
+        shows = f"which shows at most {most:.7g} per hour with {CONFIDENCE:.0%} confidence"
+        if most > OFTEN and panel.asked is None:
+            shows = "too little to say how rare they are"
+        found = [f"false alarms: {count or 'none'} in {units}, {shows}, while the machine is run as in the recordings"]
         if panel.what != "block":
             alarming = f"{panel.alarming or 'none'} of {plural(panel.units, panel.what)}"
             further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
