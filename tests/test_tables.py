@@ -900,8 +900,62 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
         assert re.search(words, " ".join(read_csv(tmp_path, head, rows).warnings))
     assert not read_csv(tmp_path, "time,x", (f"{45717 + k / 50:.3f},{k}" for k in range(9))).warnings  # since the boot
     assert list(read_csv(tmp_path, "time,Größe °C", ["0,1", "1,2"], "cp1252").columns_by_field) == ["Größe_C"]
-    rows = read_csv(tmp_path, "time,signal,value", (f"{k},{('speed', 'load')[k % 2]},{k * k}" for k in range(90)))
-    assert "column 'signal' names the signal" in rows.topics["/table"].reason
+    rows = read_csv(tmp_path, "time,signal,value", (f"{k},{('a', 'a', 'b')[k % 3]},{k * k}" for k in range(90)))
+    assert "names the signal of a row's one number, and they come at times of" in rows.topics["/table"].reason
+    rows = read_csv(tmp_path, "time,axle,value", (f"{k},{('front', 'rear')[k % 2]},{k * k}" for k in range(90)))
+    assert "write a column for each signal, or call it `signal`" in rows.topics["/table"].reason
+
+
+def _of_tags(form, late=0.0):
+    """Rows of a level and a valve, 20 s apart, as a historian writes them."""
+    return [form.format(t=20 * k + late * i, tag=tag, i=i, x=x) for k in range(60)
+            for i, (tag, x) in enumerate((("LT1.PV", k % 7), ("V1/OP", 5)))]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("header", "rows"),
+    [
+        ("TagName,time,Value,Quality", _of_tags("{tag},{t},{x},Good")),
+        ("TagName,time,Value", ["", *_of_tags("{tag},{t},{x}")[::-1]]),
+        ("ID,Name,time,Value", _of_tags("0x{i},{tag},{t:.3f},{x}", 0.004)),
+        (",result,table,time,_value,_field", sorted(_of_tags(",,{i},{t:04},{x},{tag}"))),
+    ],
+)
+def test_rows_of_one_number_each_are_put_side_by_side(header, rows, tmp_path):
+    """A historian's tags, messages of a bus, each a little later than the other, and blocks one after the other."""
+    bag = read_csv(tmp_path, header, rows)
+    assert {**bag.columns_by_field}.keys() == {"LT1_PV", "V1_OP"} and set(np.diff(bag.times).tolist()) == {20 * 10**9}
+    np.testing.assert_array_equal(bag.columns_by_field["LT1_PV"], [k % 7 for k in range(60)])
+    np.testing.assert_array_equal(bag.columns_by_field["V1_OP"], 5)
+    assert "names the signal of each number in" in bag.warnings[-1]
+
+
+def test_a_signal_that_lacks_some_times_is_missing_there(tmp_path):
+    rows = [row for k, row in enumerate(_of_tags("{tag},{t},{x}")) if k not in (10, 33)]
+    bag = read_csv(tmp_path, "tag,time,value", rows)
+    missing = {name: np.flatnonzero(np.isnan(column)).tolist() for name, column in bag.columns_by_field.items()}
+    assert missing == {"LT1_PV": [5], "V1_OP": [16]} and len(bag.times) == 60
+
+
+def test_a_driver_who_is_named_in_each_row_is_no_signal(tmp_path):
+    rows = (f"{k},{k % 7},{('Ann', 'Bo')[k // 50]}" for k in range(100))
+    assert list(read_csv(tmp_path, "time,speed,name", rows).columns_by_field) == ["speed", "name"]
+
+
+def test_names_above_the_rows_are_no_comments_where_there_are_other_names(tmp_path):
+    """Of a file of InfluxDB the kinds of numbers were the names."""
+    above = ["#group,false,false,true", "#datatype,dateTime:RFC3339,double,double", "#default,,,", "_time,x,y"]
+    rows = [f"2026-03-01T08:00:{k:02}Z,{k % 7},{k % 5}" for k in range(50)]
+    assert list(read_csv(tmp_path, above[0], [*above[1:], *rows]).columns_by_field) == ["x", "y"]
+    assert list(read_csv(tmp_path, "# time,x", (f"{k},{k % 7}" for k in range(50))).columns_by_field) == ["x"]
+
+
+def test_a_day_ends_at_24(tmp_path):
+    hours = [f"2026-03-0{1 + k // 24} {k % 24 + 1:02}:00:00,{k}" for k in range(100)]
+    assert set(np.diff(read_csv(tmp_path, "time,x", hours).times).tolist()) == {3600 * 10**9}
+    late = ["2026-03-01T23:00+01:00,1", "2026-03-01T24:00+01:00,2"]
+    assert np.diff(read_csv(tmp_path, "time,x", late).times).tolist() == [3600 * 10**9]
+    refuses(BagError, "no day or time that there is", read_csv, tmp_path, "time,x", ["2026-03-01 24:01:00,1"])
 
 
 SAID = {  # of a recording, by the historian of a plant and by the tool of a test rig
@@ -1030,9 +1084,12 @@ def test_cells_of_several_numbers_are_told(tmp_path):
         "time,x,raw,at,say,inlet",
         (f'{k},{k % 7},"1.0{k % 9},2.54,59{k}",2026-11-22 06:28:00,3 ok,2{k}.5 °C' for k in range(9)),
     )
-    said, of_unit = bag.warnings
+    of_unit, said = bag.warnings
     assert "column 'raw' left out" in said and "number alone, such as '1.00,2.54,590': write one in each" in said
-    assert "column 'inlet' left out, as most cells are no number alone, such as '20.5 °C'" in of_unit
+    assert "column 'inlet': '°C' taken off each number" in of_unit
+    np.testing.assert_array_equal(bag.columns_by_field["inlet"], 20.5 + np.arange(9))
+    mixed = read_csv(tmp_path, "time,x,flow", (f"{k},{k % 7},{k + 1} {('k', 'M')[k % 2]}" for k in range(9)))
+    assert mixed.columns_by_field["flow"].dtype.kind == "O"
     bag = read_csv(tmp_path, "time,x", [f'{k},"{1000 + k:,}"' if k > 200 else f"{k},{k}" for k in range(500)])
     assert "column 'x' left out" in bag.warnings[0] and "such as '1,2" in bag.warnings[0]
 

@@ -31,7 +31,7 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import Column, RawTable, once, read_table
+from uncertain_lti.recordings.table_files import QUANTITY, Column, RawTable, once, read_table
 from uncertain_lti.recordings.table_times import (
     NO_TIME,
     field_name,
@@ -50,7 +50,6 @@ TYPE = "table"
 """Its message type."""
 
 _PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*")
-_QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*([^\d\s]\S{0,7})")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
 _MOST_RUNS = 100_000
 _HOUR = 3_600 * 10**9  # ns
@@ -59,6 +58,10 @@ _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
 _ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has, of a short log fewer
 _MOST_KINDS = 100  # of messages
+_NAMES = re.compile(
+    r"(?i)(.*[\W_])?(name|(tag|var(iable)?|signal|field|point|channel|sensor|item|parameter)([\W_]*name)?)"
+)
+_TOGETHER = 0.9  # of the times, that have a number of each signal
 _SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
 
 
@@ -89,6 +92,13 @@ class Table(Recording):
         self.path, self.parts, self.layout = path, (file,), layout
         self.size = file.stat().st_size
         self._warnings = [f"{file}: {note}" for note in [*raw.notes, *([words] if words else [])]]
+        signals = {name: raw.columns[name] for name in raw.columns if name not in (time, layout.runs)}
+        naming, value = _naming(signals, times)
+        called = _NAMES.fullmatch(naming) and rows is None
+        wide = _side_by_side(signals[naming], signals[value], times) if called else None
+        if wide is not None:
+            raw, times = RawTable({time: wide[1], **wide[0]}), wide[1]
+            self._warnings.append(f"{file}: column '{naming}' names the signal of each number in '{value}'")
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
         kept = np.arange(len(times)) if rows is None else rows
         known = times[kept] != NO_TIME
@@ -109,7 +119,7 @@ class Table(Recording):
         for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
             cells = [str(cell).strip() for cell in raw.columns[name] if cell]
             cells = cells[:: len(cells) // 100 + 1]
-            units = {found and found[1] for found in map(_QUANTITY.fullmatch, cells)}
+            units = {found and found["unit"] for found in map(QUANTITY.fullmatch, cells)}
             packed = list(filter(_PACKED.fullmatch, cells))
             odd = cells if len(units) == 1 < len(set(cells)) and None not in units else packed
             if 2 * len(odd) > len(cells):
@@ -137,8 +147,10 @@ class Table(Recording):
         reason = ""
         if not names:
             reason = f"there is no column but the time, '{time}'; choose another file"
-        elif of := _names_signals(self.columns_by_field):
-            reason = f"column '{of}' names the signal of a row's one number; write a column for each signal"
+        elif naming and wide is None:
+            reason = f"column '{naming}' names the signal of a row's one number"
+            reason += ", and they come at times of their own: export them at one interval" if called else ""
+            reason += "; write a column for each signal" + ", or call it `signal`" * (not called)
         every = _by_message(self.columns_by_field, len(kept))
         one = len(every) == 1 and not reason
         texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
@@ -437,13 +449,53 @@ def _goes_on(column: Column) -> bool:
     return int(np.count_nonzero(same)) >= 0.9 * len(same)
 
 
-def _names_signals(columns: Mapping[str, Column]) -> str:
-    """The column of text that changes from row to row among few values, beside a single column of numbers."""
-    for name, column in columns.items() if len(_numbers(columns)) == 1 else ():
-        if column.dtype.kind == "O" and 2 * np.count_nonzero(column[1:] != column[:-1]) > len(column):
-            if len(set(column.tolist())) <= len(column) // 20:
-                return name
-    return ""
+def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[str, str]:
+    """The column that names the signal of each row's one number, as historians and logs of a bus write it, and that.
+
+    Few names change from row to row, or the time begins anew with each, where the column is called so. Nothing for
+    other tables, whose rows have several numbers or none.
+    """
+    numbers = [name for name, column in columns.items() if column.dtype.kind in "iuf" and column.ndim == 1]
+    texts = [name for name, column in columns.items() if column.dtype.kind == "O"]
+    for naming in sorted(texts, key=lambda name: not _NAMES.fullmatch(name)) if numbers else ():
+        names, of = np.unique(columns[naming].astype(str), return_inverse=True)
+        if not 2 <= len(names) <= len(of) // _ROWS_EACH or "" in names:
+            continue
+        order = np.argsort(of, kind="stable")
+        first = np.flatnonzero(np.diff(of[order], prepend=-1))
+        least, most = (of_each.reduceat(times[order], first) for of_each in (np.minimum, np.maximum))
+        anew = most.min() > least.max() and _NAMES.fullmatch(naming)
+        if 2 * np.count_nonzero(np.diff(of)) > len(of) or anew:
+            of_rows = {name: columns[name][order] for name in numbers}
+            moving = [n for n, c in of_rows.items() if (np.fmax.reduceat(c, first) > np.fmin.reduceat(c, first)).any()]
+            if len(moving) == 1:  # others, such as an identifier, are the same in all rows of a name
+                return naming, moving[0]
+    return "", ""
+
+
+def _side_by_side(
+    names: Column, values: Column, times: NDArray[np.int64]
+) -> tuple[dict[str, Column], NDArray[np.int64]] | None:
+    """A column for each name, and the times; nothing where the names do not come together, or one after the other.
+
+    Of rows of one name and time the first counts.
+    """
+    known = np.flatnonzero(times != NO_TIME)[::-1]
+    stamps = np.unique(times[known])
+    every, of_row = np.unique(names[known].astype(str), return_inverse=True)
+    each = np.split(known[np.argsort(of_row, kind="stable")], np.cumsum(np.bincount(of_row))[:-1])
+    rows = dict(sorted(zip(every.tolist(), each, strict=True), key=lambda one: one[1][-1]))
+    count = min(map(len, rows.values()))
+    if count < _TOGETHER * len(stamps) and all(len(of) == count for of in rows.values()):
+        rounds = np.sort(times[np.array([*rows.values()])], axis=1)
+        if (rounds[:, 1:].min(axis=0) > rounds[:, :-1].max(axis=0)).all():
+            stamps = rounds.max(axis=0)
+            return {name: values[of[np.argsort(times[of])]] for name, of in rows.items()}, stamps
+    columns = {name: np.full(len(stamps), math.nan) for name in rows}
+    for name, of in rows.items():
+        columns[name][np.searchsorted(stamps, times[of])] = values[of]
+    together = min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER
+    return (columns, stamps) if together else None
 
 
 _QUATERNION = "quaternion"

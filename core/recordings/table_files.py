@@ -51,6 +51,7 @@ _WIDE = {  # by which of a text's first four bytes are not 0
 }  # fmt: skip
 _CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
 _ARROW = re.compile(r"(\d\d:\d\d:\d\d\.\d{3}) -> (.*)", re.DOTALL)  # as the serial monitor of Arduino writes a line
+QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?P<unit>[^\W\d_]\S{0,7}|[%°]\S{0,7})")
 _MOST_COLUMNS = 20_000
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
@@ -247,7 +248,13 @@ def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str
             odd += 1
             first = first or cell
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
-        return np.array(plain, dtype=object), ""
+        with_units = [QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING]
+        units = {match["unit"] if match else "" for match in with_units}
+        unit = units.pop() if len(units) == 1 < len({*plain}) else ""
+        if not unit:
+            return np.array(plain, dtype=object), ""
+        numbers, note = _column([cell.removesuffix(unit) for cell in plain], commas, delimiter)
+        return numbers, " and ".join(filter(None, [note, f"'{unit}' taken off each number"]))
     read = [f"'{by}' between thousands taken out"] * bool(by) + ["decimal commas read as points"] * bool(comma)
     return numbers, " and ".join([left_out(odd, "number", first)] * bool(odd) + read)
 
@@ -326,8 +333,11 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
             f"{path}: its cells are apart by spaces, and not all are numbers, or as many in each line; write commas, "
             "semicolons or tabs between them, or record a bag in place of what `ros2 topic echo` prints"
         )
-    above = [_split(line.lstrip("#% "), delimiter) for line in lines[:first]]
-    above += [cells for cells in split[first:begin] if not any(map(_is_value, cells))]
+    above = [cells for cells in split[first:begin] if not any(map(_is_value, cells))]
+    plain = [cells for line, cells in zip(lines[:first], split, strict=False) if not line.startswith(("#", "%"))]
+    if not any(len(cells) == wide and not any(map(_is_value, cells)) for cells in [*plain, *above]):
+        plain = [_split(line.lstrip("#% "), delimiter) for line in lines[:first]]
+    above = plain + above
     above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
     rows = [cells for cells in split[begin:] if len(cells) == wide]
     named = any(len(cells) == wide and 2 * len(set(cells) - {""}) > wide for cells in above)

@@ -470,12 +470,14 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
     text = f"{day}T{(clock or '00:00').replace(',', '.')}"
     if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
         raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
+    late = 86_400 * 10**9 * bool(re.search(r"T24:00(:00([.]0*)?)?$", text))  # how a day ends in ISO 8601
+    text = text.replace("T24:", "T00:") if late else text
     if not zone or zone in ("Z", "UTC"):
-        return text, 0
+        return text, -late
     hours, minutes = int(zone[1:3]), int(zone[3:].lstrip(":") or 0)  # +01, as PostgreSQL writes it
     if hours > _LARGEST_ZONE or minutes > 59:
         raise BagError(f"{where}: there is no time zone '{zone}'; mend it")
-    return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1)
+    return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1) - late
 
 
 def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
