@@ -950,6 +950,14 @@ def test_names_above_the_rows_are_no_comments_where_there_are_other_names(tmp_pa
     assert list(read_csv(tmp_path, "# time,x", (f"{k},{k % 7}" for k in range(50))).columns_by_field) == ["x"]
 
 
+def test_a_measurement_of_labview_is_a_table(tmp_path):
+    above = ["LabVIEW Measurement", "Separator\tTab", "Date\t2026/03/01", "***End_of_Header***", "", "Channels\t2"]
+    above += ["Samples\t60\t60", "***End_of_Header***", "X_Value\tspeed\tvalve\tComment"]
+    (tmp_path / "a.lvm").write_text("\n".join([*above, *(f"{k / 10:.6f}\t{k % 7}\t{k % 5}\t" for k in range(60))]))
+    bag = open_recording(tmp_path / "a.lvm")
+    assert list(bag.columns_by_field)[:2] == ["speed", "valve"] and set(np.diff(bag.times).tolist()) == {10**8}
+
+
 def test_a_day_ends_at_24(tmp_path):
     hours = [f"2026-03-0{1 + k // 24} {k % 24 + 1:02}:00:00,{k}" for k in range(100)]
     assert set(np.diff(read_csv(tmp_path, "time,x", hours).times).tolist()) == {3600 * 10**9}

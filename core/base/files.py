@@ -123,7 +123,7 @@ def try_to_write(path: Path) -> None:
         raise BagError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 
 
-TABLES = (".csv", ".tsv", ".txt", ".dat", ".parquet", ".feather", ".mat", ".npz")
+TABLES = (".csv", ".tsv", ".txt", ".dat", ".lvm", ".parquet", ".feather", ".mat", ".npz")
 """Suffixes of tables."""
 
 

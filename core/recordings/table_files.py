@@ -585,7 +585,7 @@ def _wants(path: Path, package: str) -> str:
 
 
 _READERS: Mapping[str, Callable[[Path], Any]] = {
-    **dict.fromkeys((".csv", ".txt", ".dat", ".tsv"), _read_csv),
+    **dict.fromkeys((".csv", ".txt", ".dat", ".tsv", ".lvm"), _read_csv),
     ".parquet": _read_arrow,
     ".feather": _read_arrow,
     ".mat": lambda path: aside(_read_mat, path, ".mat file"),  # damage may break its reader down
