@@ -950,6 +950,18 @@ def test_names_above_the_rows_are_no_comments_where_there_are_other_names(tmp_pa
     assert list(read_csv(tmp_path, "# time,x", (f"{k},{k % 7}" for k in range(50))).columns_by_field) == ["x"]
 
 
+@pytest.mark.parametrize("header", ["sec,nanosec,frame,x", "stamp_secs,stamp_nsecs,frame,x", ""])
+def test_the_stamp_of_a_message_in_two_columns_is_the_time(header, tmp_path):
+    """As `ros2 topic echo --csv` writes it, without names; seconds alone made rows of a second even."""
+    stamps = [1_790_000_000_300_000_007 + 20_000_000 * k + 1000 * (k % 3) for k in range(200)]
+    rows = [f"{t // 10**9},{t % 10**9},base,{k % 7}" for k, t in enumerate(stamps)]
+    (tmp_path / "a.csv").write_text("\n".join([*filter(None, [header]), *rows]))
+    bag = open_recording(tmp_path / "a.csv")
+    assert bag.times.tolist() == stamps and not bag.warnings
+    encoder = read_csv(tmp_path, "sec,ticks,x", (f"{t // 10**9},{k * 4_000_000},{k % 7}" for k, t in enumerate(stamps)))
+    assert "ticks" in encoder.columns_by_field
+
+
 def test_a_measurement_of_labview_is_a_table(tmp_path):
     above = ["LabVIEW Measurement", "Separator\tTab", "Date\t2026/03/01", "***End_of_Header***", "", "Channels\t2"]
     above += ["Samples\t60\t60", "***End_of_Header***", "X_Value\tspeed\tvalve\tComment"]

@@ -15,6 +15,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal, InvalidOperation
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +138,8 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
 
 def _likely(path: object, table: RawTable) -> tuple[str, str]:
     """The column that is a time by its name, or by what is in it."""
+    if stamp := _of_stamp(table):
+        return stamp, ""
     names = list(table.columns)
     plain = [name for name in names if table.columns[name].ndim == 1]
     called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
@@ -235,6 +238,25 @@ def _days_and_clocks(table: RawTable) -> tuple[list[str], list[str]]:
     first = {name: _spelt(next((str(cell) for cell in cells if cell), "")) for name, cells in texts.items()}
     days = [name for name, text in first.items() if (m := _ISO.match(text) or _DAY.fullmatch(text)) and ":" not in m[0]]
     return days, [name for name, text in first.items() if _CLOCK.match(text)]
+
+
+def _of_stamp(table: RawTable) -> str:
+    """Put whole seconds since 1970 and the nanoseconds beside them together; what that is called, or nothing.
+
+    So the stamp of a ROS message is in a table, as `ros2 topic echo --csv` writes it.
+    """
+    numbers = {name: c for name, c in table.columns.items() if c.ndim == 1 and c.dtype.kind in "iuf" and len(c) > 2}
+    for (sec, whole), (nanosec, rest) in pairwise(numbers.items()):
+        both = np.array([whole, rest], dtype=np.float64)
+        if not _since_1970(both[0, 0]) or (both != np.rint(both)).any() or not 0 <= both[1].min() < both[1].max() < 1e9:
+            continue
+        next_second = np.diff(both[0]) == 1
+        if both[1].max() > 5e8 and next_second.any() and np.mean(np.diff(both[1])[next_second] < 0) > 0.9:
+            stamps = (both[0].astype(np.int64) * 10**9 + both[1].astype(np.int64)).astype("datetime64[ns]")
+            others = {name: column for name, column in table.columns.items() if name not in (sec, nanosec)}
+            table.columns = {f"{sec} {nanosec}": stamps} | others
+            return f"{sec} {nanosec}"
+    return ""
 
 
 def _of_parts(table: RawTable) -> str:
