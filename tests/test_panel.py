@@ -10,6 +10,7 @@
 """The panel: what `fit` arms without being asked keeps to its promise, and what it says of its worth is so."""
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -557,6 +558,10 @@ def test_as_many_recordings_are_counted_as_alarm_by_what_the_others_show(runs):
     loud = [EnvelopeMonitor(m).check(run).alarm.any() for m, run in zip(others, named, strict=True)]
     assert loud[2] and alarm["units_alarming"] == sum(loud) == 1
     assert f" {alarm['units_alarming']} of 6 recordings would alarm" in alarm["promises"][1]
+    rate = float(re.search(r"--false-alarms (\S+)\)", alarm["promises"][1])[1])  # one above what is shown lowers them
+    raised = fit(named, "lp", additive="both", false_alarms=rate)
+    for rule, usual in zip(raised.alarm, fit(named, "lp", additive="both").alarm, strict=True):
+        assert np.all(np.array(rule.threshold) > np.array(usual.threshold))
 
 
 def test_states_that_are_blind_are_named(learnt):

@@ -29,9 +29,10 @@ from test_signals import quaternion
 from uncertain_lti import EnvelopeMonitor, SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
+from uncertain_lti.identification.evidence import functions
 from uncertain_lti.proposal import init
 from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column, steps_of
-from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose, functions
+from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
@@ -677,6 +678,21 @@ def test_of_a_plant_a_twin_is_judged_and_what_says_the_same_to_the_last_digit_is
     assert re.search("P_error: follows from .*P_set", proposal.text)  # a step of the set point is no fault
 
 
+def test_two_sensors_of_one_row_are_both_states_and_what_is_computed_from_one_is_not(tmp_path):
+    """Of a robot's wheels and gyro, which tell the same, the wheels were left out, and no slip was seen."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=(200, 1)), 20, axis=0)
+    rate = answers(rng, u, pole=0.9)[:, 0]
+    gyro, wheels = rate + 0.004 * rng.normal(size=4000), rate + 0.006 * rng.normal(size=4000)
+    columns = {"gyro": gyro, "wheels": wheels, "rounded": (57.3 * gyro).round(1), "curved": np.exp(gyro)}
+    columns["filtered"] = gyro.copy()
+    for k in range(1, 4000):
+        columns["filtered"][k] = columns["filtered"][k - 1] + 0.9 * (gyro[k] - columns["filtered"][k - 1])
+    proposal = propose([table_of(tmp_path / "a.csv", columns | {"rate_cmd": u[:, 0]}, 0.05 * np.arange(4000))])
+    assert [c.path for c in proposal.states] == ["gyro", "wheels"], proposal.text
+    assert [c.path for c in proposal.controls] == ["rate_cmd"]
+
+
 @pytest.mark.parametrize("step", [0.02, 60.0])
 def test_a_computed_average_is_no_state(tmp_path, step):
     """It would see a fault of itself alone, to the last digit, where a real one moves what it is computed from, too."""
@@ -731,7 +747,7 @@ def test_motors_that_follow_one_command_alike_are_all_states(tmp_path):
     assert "/table imu_ts, row: grows as a clock or a counter does" in proposal.text
     rows = np.column_stack([0.01 * np.arange(len(u)), *columns.values()])[:, [0, 1, 2, 6]]
     np.savetxt(tmp_path / "b.csv", rows, delimiter=",")
-    assert len(propose([tmp_path / "b.csv"]).states) == 1, "no names say that the columns are of parts that are alike"
+    assert len(propose([tmp_path / "b.csv"]).states) == 2, "each has noise of its own, whatever its name"
 
 
 def follows(of, values):

@@ -51,6 +51,7 @@ def test_fit_contains_and_is_not_absurd(recordings, signals_folder, bags, signal
     wide = model.fit_summary["mean_width_recorded"] > 0.5 * span  # an envelope as wide as the range tells nothing
     said = " ".join(m for m in model.fit_summary["messages"] if "as wide as the state's own range" in m)
     assert [f"'{name}' (" in said for name in model.state_names] == wide.tolist()
+    assert "--additive" not in said, "it has one"
     try:
         pure = fit(transients, criterion, additive="none")
     except FitError as error:

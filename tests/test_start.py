@@ -57,6 +57,22 @@ def test_a_model_that_is_not_worth_having_is_not_sent_to_the_robot(folder, capsy
     assert printed.splitlines()[-1].startswith("not on the robot yet: mend what is said above, in rare.yaml or by")
 
 
+def test_of_a_table_nothing_is_sent_to_a_robot(folder, cli, capsys):
+    """The command that was advised ends with an error there: a table is no topic."""
+    t = 0.02 * np.arange(3000)
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=60), 50)
+    x = np.zeros(3000)
+    for k in range(2999):
+        x[k + 1] = 0.9 * x[k] + 0.1 * u[k] + 0.001 * rng.normal()
+    np.savetxt("a.csv", np.column_stack([t, x, u]), delimiter=",", header="time,speed,speed_cmd", comments="")
+    assert main(["start", "a.csv", "--output", "a"]) in (0, 1, 3)
+    printed = capsys.readouterr().out
+    assert "ROBOT" not in printed and "no publisher sends a table" in printed.splitlines()[-1]
+    again = cli("fit", "a.csv", "--signals", "a.yaml", "--output", "b.model.json").out
+    assert "next:" in again and "envelope_monitor" not in again
+
+
 def test_a_name_that_begins_as_an_option_does_is_handed_on(folder, cli):
     (folder / HEALTHY[0]).rename("-run.mcap")
     printed = cli("init", "--output=-s.yaml", "--", "-run.mcap").out

@@ -20,7 +20,7 @@ from typing import Any
 
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.cli.command import RECORDINGS, Result, declared, helped, model_target
+from uncertain_lti.cli.command import RECORDINGS, Result, declared, helped, load_model, model_target
 from uncertain_lti.signals.values import TableLayout
 
 _LONGEST_NAME = 200  # letters
@@ -147,6 +147,7 @@ _WRITTEN = "write NAME.yaml, which is used as it is if it is there already, NAME
 def start(options: argparse.Namespace) -> Result:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.recordings.table import of_table
     from uncertain_lti.reports.findings import NO, findings_text
     from uncertain_lti.reports.pages import page_target
 
@@ -179,6 +180,8 @@ def start(options: argparse.Namespace) -> Result:
         f"  envelope_monitor --ros-args -p model:={shlex.quote(os.path.basename(model))}\n"
         "  ros2 topic echo /envelope_monitor/violation"
     )
+    if any(map(of_table, load_model(model).signals.topics)):
+        then = "not on a robot: no publisher sends a table; for that, start with recordings of the robot's topics"
     if report.data["rely"]["answer"] == NO:
         then = f"not on the robot yet: mend what is said above, in {signals} or by recording, and start with --force"
     options.say(f"what happened and when: {Path(page).resolve().as_uri()}\n{then}")

@@ -148,7 +148,7 @@ def describe(
         messages += _noisy({i: share for i, share in noisy.items() if i not in lacking}, names, part.dt)
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
-    messages += _wide(sums, mean_width, names)
+    messages += _wide(sums, mean_width, names, not problem.columns.names)
     if problem.columns.names == {"c", "v"}:
         messages.append("Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0")
     return rank, messages
@@ -160,7 +160,7 @@ def of_sums(model: UncertainLTI, fleet: Fleet | Problem, sums: Moments, mean_wid
     names, tied, sums = [s.name for s in signals], _tied(model, fleet, sums), sums.one_block()
     rank, messages = _rank(fleet, sums, names)
     messages += [*tied, *_collinear(fleet, sums, names, lagged_states(signals, model.n))]
-    return rank, messages + _wide(sums, mean_width, names)
+    return rank, messages + _wide(sums, mean_width, names, not fleet.columns.names)
 
 
 def _tied(model: UncertainLTI, problem: Fleet | Problem, sums: Moments) -> list[str]:
@@ -571,15 +571,15 @@ def _complex(value: complex) -> str:
     return f"{value.real:.3g}{value.imag:+.3g}j" if value.imag else f"{value.real:.3g}"
 
 
-def _wide(sums: Moments, mean_width: Array, names: Sequence[str]) -> list[str]:
-    """States whose envelope is as wide as what they do, and controls that never moved."""
+def _wide(sums: Moments, mean_width: Array, names: Sequence[str], pure: bool) -> list[str]:
+    """States whose envelope is as wide as what they do, and controls that never moved; `pure`: no additive term."""
     span, n = sums.high - sums.low, len(mean_width)
     wide = np.flatnonzero((span[:n] > 0) & (mean_width > WIDE * span[:n])).tolist()
     listed = shortlist([f"'{names[i]}' ({mean_width[i] / span[i]:.0%})" for i in wide], 8)
+    near_rest = "; without an additive term noise near rest alone does it (--additive noise)" * pure
     messages = [
         f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show there: "
-        f"what moves it is not among the controls, one step is long for it, or the noise is as large; without an "
-        f"additive term noise near rest alone does it (--additive noise)"
+        f"what moves it is not among the controls, one step is long for it, or the noise is as large{near_rest}"
     ] * bool(wide)
     if still := [name for name, moved in zip(names[n:], span[n:].tolist(), strict=True) if not moved]:
         messages.append(f"{quoted(still)} {CONSTANT}, so what a move would do is unknown")

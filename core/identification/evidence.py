@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +42,11 @@ LONGEST_DELAY = 10
 """Delays of a control that are tried, samples."""
 SURE_DELAY = 0.1
 """Share by which a delay leaves less unexplained, below which it must show in either half of the samples."""
+FOLLOWS = 0.15
+"""Standard deviation around a smooth function, as a share, from which on it is none."""
+WHITE, OWN = 0.3, 0.5
+"""Correlation from sample to sample up to which a difference of two signals is noise, and the share of it that each of
+two sensors has of its own."""
 _ENOUGH, _STRETCH = 5_000_000, 128  # elements of the regressors from which on stretches of samples do
 _STRETCHES = 10  # of the samples, dealt out to the halves in turn
 _CLIP = 5.0
@@ -81,6 +87,44 @@ def held_for(before: Array, after: Array) -> int:
     # a rounding sensor repeats few values; a machine at rest is constant in few, long stretches
     even = period * len(instants) > 0.5 * len(after)  # a coarse sensor is new often for a while, and then not at all
     return round(period) if period >= 2 and even and len(np.unique(after[instants])) > 0.5 * len(instants) else 0
+
+
+def functions(X: Array) -> NDArray[np.bool_]:
+    """Whether [i, j] j is a smooth function of i, at the same instants or one sample off, but for noise; X (N, n)."""
+    found = np.zeros((X.shape[1], X.shape[1]), dtype=bool)
+    moving = np.flatnonzero(np.ptp(X[1:-1], axis=0) > 0)
+    values = X[:, moving]
+    for i, (now, after) in product(moving.tolist(), ((0, 0), (1, 0), (0, 1))):
+        a, b = X[now : len(X) - after, i], values[after : len(X) - now]
+        a = (a - a.mean()) / a.std()
+        basis = np.column_stack([np.ones_like(a), a, a**2, a**3])
+        rest = b - basis @ np.linalg.lstsq(basis, b, rcond=None)[0]
+        share = rest.std(axis=0) / b.std(axis=0)
+        for k in np.flatnonzero(share < FOLLOWS).tolist():
+            still = np.diff(b[:, k]).std() < 0.7 * b[:, k].std()
+            white = rest[:, k].std() == 0 or np.corrcoef(rest[1:, k], rest[:-1, k])[0, 1] < WHITE
+            found[i, moving[k]] |= share[k] < 0.02 or (still and white)  # white around what it follows
+    return found
+
+
+def two_sensors(a: Array, b: Array) -> bool:
+    """Whether two signals that follow each other (N,) are read by two sensors, each with noise of its own.
+
+    Their difference is white then, and neither follows from the other and the rows before: a filtered copy would.
+    """
+    a, b = ((z - z.mean()) / z.std() for z in (a, b))
+    rest = _left_of(b, a)
+    past = [z[lag : len(z) - 2 + lag] for z in (a, b) for lag in (0, 1)]
+    own = min(_left_of(one[2:], other[2:], *past).std() for one, other in ((a, b), (b, a)))
+    if not own > OWN * rest.std():
+        return False
+    return bool(abs(np.corrcoef(rest[1:], rest[:-1])[0, 1]) < WHITE)
+
+
+def _left_of(target: Array, *others: Array) -> Array:
+    """What least squares on some signals and a constant leaves of another."""
+    basis = np.column_stack([np.ones_like(target), *others])
+    return np.asarray(target - basis @ np.linalg.lstsq(basis, target, rcond=None)[0])
 
 
 def predicted(X: Array, U: Array, after: Array) -> Array:

@@ -14,13 +14,20 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
-from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.identification.evidence import FASTEST, LONGEST_DELAY, NOISE, held_for, lags, predicted
+from uncertain_lti.identification.evidence import (
+    FASTEST,
+    LONGEST_DELAY,
+    NOISE,
+    functions,
+    held_for,
+    lags,
+    predicted,
+    two_sensors,
+)
 from uncertain_lti.proposal.candidates import (
     FAINT,
     FEWEST,
@@ -50,14 +57,17 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     """Drop candidates that are functions of another one, whatever their topics: copies, other units, squares.
 
     Such a function leaves next to nothing of a candidate, or nothing but noise. Of two that are functions of each
-    other, the one in which the controls show clearly more stays, else the first.
+    other, the one in which the controls show clearly more stays, else the first. Two sensors read at one instant both
+    stay, where each has noise of its own: a fault of one, or what comes between them, such as a slipping wheel, shows
+    in their difference alone.
     """
     if len(steps.X) < FEWEST:
         return pool
     kept: list[int] = []
     function = functions(steps.X)
     for i, j in np.argwhere(function).tolist():
-        function[i, j] = not _alike(pool[i], pool[j]) or _moves_with(pool[j], pool[i], exact=True)
+        twins = _alike(pool[i], pool[j]) or pool[i].topic == pool[j].topic and two_sensors(*steps.X[:, [i, j]].T)
+        function[i, j] = not twins or _moves_with(pool[j], pool[i], exact=True)
 
     def drop(i: int, source: int) -> None:
         of = pool[source]
@@ -74,28 +84,6 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
             drop(j, i)
         kept.append(i)
     return [pool[i] for i in sorted(kept)]
-
-
-FOLLOWS = 0.15
-"""Standard deviation around a smooth function, as a share, from which on it is none."""
-
-
-def functions(X: Array) -> NDArray[np.bool_]:
-    """Whether [i, j] j is a smooth function of i, at the same instants or one sample off, but for noise; X (N, n)."""
-    found = np.zeros((X.shape[1], X.shape[1]), dtype=bool)
-    moving = np.flatnonzero(np.ptp(X[1:-1], axis=0) > 0)
-    values = X[:, moving]
-    for i, (now, after) in product(moving.tolist(), ((0, 0), (1, 0), (0, 1))):
-        a, b = X[now : len(X) - after, i], values[after : len(X) - now]
-        a = (a - a.mean()) / a.std()
-        basis = np.column_stack([np.ones_like(a), a, a**2, a**3])
-        rest = b - basis @ np.linalg.lstsq(basis, b, rcond=None)[0]
-        share = rest.std(axis=0) / b.std(axis=0)
-        for k in np.flatnonzero(share < FOLLOWS).tolist():
-            still = np.diff(b[:, k]).std() < 0.7 * b[:, k].std()
-            white = rest[:, k].std() == 0 or np.corrcoef(rest[1:, k], rest[:-1, k])[0, 1] < 0.3
-            found[i, moving[k]] |= share[k] < 0.02 or (still and white)  # white around what it follows
-    return found
 
 
 _BURSTS = 5  # times the range of nearly all samples that of all is, from which on rare bursts hide the level of noise

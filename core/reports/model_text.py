@@ -21,6 +21,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.likeness import Learnt
+from uncertain_lti.recordings.table import of_table
 from uncertain_lti.sampling.clock import passed
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
@@ -122,8 +123,9 @@ def next_text(model: UncertainLTI, file: str) -> str:
     rows = [
         (f"uncertain-lti check {file} BAG", "is there an alarm on a recording that was not fitted?"),
         (f"uncertain-lti report {file} BAG", "may I rely on it, and what happened? a page with figures"),
-        (f"envelope_monitor --ros-args -p model:={file}", "the same live"),
     ]
+    if not any(map(of_table, model.signals.topics)):  # which no publisher sends
+        rows.append((f"envelope_monitor --ros-args -p model:={file}", "the same live"))
     width = max(len(command) for command, _ in rows)
     first = [f"look first at: {worry}"] if worry else []
     return "\n".join([*first, "next:", *(f"  {command.ljust(width)}  {text}" for command, text in rows)])

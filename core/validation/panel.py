@@ -545,7 +545,8 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
             further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
             further = f"expect {further} of further ones"
             if panel.alarming and panel.asked is None:
-                further += "; to have fewer, ask for a low rate (--false-alarms)"
+                low = float(f"{0.1 * most:.1g}")  # one above the limit lowers the thresholds
+                further += f"; to have fewer, ask for a low rate (--false-alarms {low:g})"
             found.append(f"at thresholds of the others alone {alarming} would alarm: {further}")
     else:
         found = ["false alarms: one stretch says nothing of their rate; record more"]
