@@ -17,8 +17,9 @@ from refusals import refuses
 
 import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
+from uncertain_lti.base import arrays
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
-from uncertain_lti.identification import fit, fleet, passes, programmes, solvers, working_set
+from uncertain_lti.identification import fit, passes, programmes, solvers, working_set
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.problem import Columns, Problem, Regimes, solve_as_written
 from uncertain_lti.identification.structure import Structure
@@ -462,7 +463,7 @@ def test_a_fit_judges_every_transition_as_the_bounds_do(sample):
 def test_a_fit_does_not_depend_on_the_number_of_threads(monkeypatch):
     transient = drawn(leibov2006(), 40_001, 3, noise=1e-3)
     several = fit(transient, "qp", additive="noise", describe_data=False)
-    monkeypatch.setattr(fleet, "core_count", lambda: 1)
+    monkeypatch.setattr(arrays, "core_count", lambda: 1)
     assert fit(transient, "qp", additive="noise", describe_data=False).to_dict() == several.to_dict()
 
 
