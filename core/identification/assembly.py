@@ -31,9 +31,7 @@ def is_constant(dt: Array) -> bool:
 
     `dt` (N,): steps, s.
     """
-    if not dt.size or (dt == dt[0]).all():
-        return True
-    return bool(np.ptp(dt) <= 1e-6 * np.median(dt))
+    return not dt.size or bool(np.ptp(dt) <= 1e-6 * median_step(dt))
 
 
 def median_step(dt: Array) -> float:
