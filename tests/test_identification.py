@@ -400,7 +400,7 @@ def on_the_bounds(model, z, dt, rng, weights, columns):
     x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
     x_next[:, edge[:10]] = np.nextafter(x_next[:, edge[:10]], rng.choice([-np.inf, np.inf]))
     nothing = np.zeros(len(dt), dtype=np.intp)
-    return Problem(z, x_next, dt, nothing, nothing, weights, columns)
+    return Problem(z, x_next, dt, weights, source=nothing, k=nothing, columns=columns)
 
 
 def judged_sample(seed):
@@ -440,8 +440,8 @@ def scheduled_sample(seed):
 
 def by_bounds(model, problem):
     """Transitions outside, the largest width and the largest √w x width of each state, by the model's own bounds."""
-    centre, half = model.columns_centre_and_half(problem.z_columns, problem.dt)
-    inside = (centre - half <= problem.next_columns) & (problem.next_columns <= centre + half)
+    centre, half = model.columns_centre_and_half(problem.z, problem.dt)
+    inside = (centre - half <= problem.x_next) & (problem.x_next <= centre + half)
     weighted = 2 * half * np.sqrt(problem.row_weights().T)
     return (~inside).sum(axis=1), 2 * half.max(axis=1), weighted.max(axis=1)
 

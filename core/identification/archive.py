@@ -82,7 +82,7 @@ def write_cache(folder: str | os.PathLike[str], problems: Iterable[Problem]) -> 
         if isinstance(error, OSError):
             raise FitError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from None
         raise
-    q = 0 if problem.s_columns is None else len(problem.s_columns)
+    q = 0 if problem.s is None else len(problem.s)
     return DiskPartition(folder / _DATA, sizes, problem.n, problem.p, q, np.ones(problem.n), problem.columns)
 
 

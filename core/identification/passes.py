@@ -137,8 +137,8 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
     for block in part.blocks():
         if stride:
             first = -(block.start + offset) % stride
-            index = np.arange(first, len(block), stride) + (block.start + offset)
-            sampled.append((index, block.every(first, stride)))
+            index = np.arange(first, len(block), stride)
+            sampled.append((index + (block.start + offset), block.subset(index)))
         weights, (i, j) = block.weights, np.triu_indices(n)
         factors = None if weights.ndim == 1 else weights.T if weights.ndim == 2 else weights[:, i, j].T
         plain, grams, centre, target, square, width, visits = sums_of(

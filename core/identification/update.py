@@ -189,7 +189,7 @@ def _as_fitted(model: UncertainLTI, transients: Iterable[Transient]) -> list[Tra
 
 def _joined(problems: Sequence[Problem]) -> Problem:
     """Transitions one after the other."""
-    names = ("z_columns", "next_columns", "dt", "source", "k")
+    names = ("z", "x_next", "dt", "source", "k")
     each: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in problems], axis=-1) for name in names}
     return replace(problems[0], **each)
 
