@@ -116,9 +116,9 @@ def describe(
     problem: Problem,
     sums: Moments,
     mean_width: Array,
-    transients: Sequence[Transient] = (),
-    few: Carriers | None = None,
-    discarded: int | None = None,
+    transients: Sequence[Transient],
+    few: Carriers | None,
+    discarded: int | None,
 ) -> tuple[int, list[str]]:
     """Rank, and messages to the user on a fitted model and the recordings it was fitted to.
 
@@ -506,11 +506,8 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
     places: dict[str, list[str]] = {}
     indices = sorted(indices)
     for index in indices[:4]:
-        source, k = int(problem.source[index]), int(problem.k[index])
-        if source < len(transients):
-            places.setdefault(transients[source].name, []).append(f"{moment(transients[source].t[k])} s")
-        else:
-            places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
+        of = transients[problem.source[index]]
+        places.setdefault(of.name, []).append(f"{moment(of.t[problem.k[index]])} s")
     where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())
     return where + (f"; and {len(indices) - 4} more" if len(indices) > 4 else "")
 

@@ -86,7 +86,7 @@ class Fleet:
         """One pass for sums over all transitions, and a sample of them."""
         results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
         self.sums = total = sum((sums for sums, _ in results[1:]), results[0][0])
-        return total, passes.by_row([some for _, sampled in results for some in sampled], self.n, self.p)
+        return total, passes.by_row([some for _, sampled in results for some in sampled], self.n)
 
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:
         """Combinations of two signals that the data hold; see `passes.occupied`.

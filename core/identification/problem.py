@@ -385,15 +385,13 @@ def solve_as_written(
             options = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 200_000, "polishing": True} | options
         _run(programme, solver, options)
         values = np.array([programme.value * scale])
-    elif criterion == "lp":
+    else:
         root = np.sqrt(problem.row_weights())
         delta = cp.Variable(n, nonneg=True)
         limited = [cp.multiply(root[:, i], width[:, i]) <= delta[i] for i in range(n)]
         programme = cp.Problem(cp.Minimize(cp.sum(delta)), contained + limited)  # rows do not meet
         _run(programme, solver or cp.HIGHS, options)
         values = np.asarray(delta.value) * unit_y
-    else:
-        raise ValueError(f"criterion {criterion!r} is not written out")
     nominal = np.asarray(theta.value) / unit_phi[:, None] * unit_y
     return nominal, np.maximum(np.asarray(d.value), 0.0) / unit_psi[:, None] * unit_y, values
 
