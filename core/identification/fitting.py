@@ -31,7 +31,7 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
 from uncertain_lti.identification.memory import Recording, elements_of, remembered
 from uncertain_lti.identification.optimum import optimum
-from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.passes import Judged
 from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
@@ -303,7 +303,7 @@ def fit_fleet(
         "versions": versions(solution.solvers),
     }
     if regimes is not None:
-        facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
+        facts["blocks"] = _block_facts(model, sums.visits, judged)
 
     def said() -> tuple[int, list[str]] | None:
         if not describe_data:
@@ -351,19 +351,17 @@ def with_repeats(model: UncertainLTI, found: Sequence[Found]) -> UncertainLTI:
     return model.replace(repeats=together(model.n, found), domain=domain)
 
 
-def _block_facts(
-    model: UncertainLTI, sums: Moments, total: Array, largest: Array, dt_median: float | None
-) -> list[dict[str, Any]]:
+def _block_facts(model: UncertainLTI, visits: Index, judged: Judged) -> list[dict[str, Any]]:
     """Of each block its transitions, those of which it has the largest weight, and the widths there."""
-    mean = np.divide(total, sums.visits[:, None], out=np.full(total.shape, np.nan), where=sums.visits[:, None] > 0)
+    each = zip(model.blocks, visits.tolist(), judged.widths, judged.widest, strict=True)
     return [
         {
-            "transitions": int(sums.visits[r]),
-            "mean_width": mean[r] if sums.visits[r] else None,
-            "max_width": largest[r] if sums.visits[r] else None,
-            "spectral_radius": block.spectral_radius() if dt_median is not None else None,
+            "transitions": count,
+            "mean_width": total / count if count else None,
+            "max_width": largest if count else None,
+            "spectral_radius": None if model.sampling.dt_median is None else block.spectral_radius(),
         }
-        for r, block in enumerate(model.blocks)
+        for block, count, total, largest in each
     ]
 
 

@@ -101,11 +101,10 @@ def fit_horizons(
     found: list[Horizon] = []
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
-    n, p = problem.n, problem.p
+    p = problem.p
     axes = 0 if model.schedule is None else len(model.schedule.axes)
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
     columns = Columns(_UNKNOWN, regimes)
-    halves = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
     lengths = sorted(set(steps))
     for windows in model.windows(problem.order, _signals(problem), problem.dt, lengths):
         if progress is not None:
@@ -139,8 +138,7 @@ def fit_horizons(
             columns=columns,
         )
         kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
-        structure = Structure(n, p - n, fixed=halves) if kind == "constant" else None
-        horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
+        horizon, fact = _fitted(model, part, windows.steps, kind, criterion, largest)
         solvers |= fact.pop("solvers")
         move = part.largest_moves()
         if (0.5 * fact["mean_width"] > WIDER * move).all():
@@ -156,16 +154,12 @@ def fit_horizons(
 
 
 def _fitted(
-    model: UncertainLTI,
-    part: Problem,
-    steps: int,
-    widths: Widths,
-    criterion: str,
-    structure: Structure | None,
-    largest: Array,
+    model: UncertainLTI, part: Problem, steps: int, widths: Widths, criterion: str, largest: Array
 ) -> tuple[Horizon, dict[str, Any]]:
     """One horizon."""
-    engine = WorkingSet(Fleet.of(part), structure)
+    n, m = part.n, part.p - part.n
+    constant = Structure(n, m, fixed={"dA": np.zeros((n, n)), "dB": np.zeros((n, m))})
+    engine = WorkingSet(Fleet.of(part), constant if widths == "constant" else None)
 
     def build(theta: Array, d: Array) -> Horizon:
         return Horizon(steps, **part.columns.arrays(theta, d), widths=widths)
