@@ -81,9 +81,8 @@ def problem_of(x, u, x_next, additive="none", weights=None):
     columns = Columns.of(additive, True)
     z = np.hstack([x, u]).T.copy()
     origin = np.zeros(N, dtype=np.intp)
-    return Problem(
-        z, x_next.T.copy(), np.full(N, DT), origin, np.arange(N), np.ones(n) if weights is None else weights, columns
-    )
+    weights = np.ones(n) if weights is None else weights
+    return Problem(z, x_next.T.copy(), np.full(N, DT), weights, source=origin, k=np.arange(N), columns=columns)
 
 
 def names(n, m):
@@ -95,8 +94,8 @@ def names(n, m):
 
 def outside(problem, model):
     """Samples outside by `UncertainLTI.bounds`, independent of the fit."""
-    lower, upper = model.bounds(problem.z[:, : problem.n], problem.z[:, problem.n :], problem.dt)
-    return int((~((lower <= problem.x_next) & (problem.x_next <= upper))).any(axis=1).sum())
+    lower, upper = model.bounds(problem.z.T[:, : problem.n], problem.z.T[:, problem.n :], problem.dt)
+    return int((~((lower <= problem.x_next.T) & (problem.x_next.T <= upper))).any(axis=1).sum())
 
 
 def solve(problem, criterion):
@@ -328,7 +327,8 @@ def disk_fit(folder, N, parts):
         part = slice(block.start, block.start + len(block))
         z[:, part], x_next[:, part] = block.z, block.x_next
     origin = np.zeros(N, dtype=np.intp)
-    fitted("in memory", Fleet.of(Problem(z, x_next, np.full(N, DT), origin, origin, np.ones(5), partition.columns)))
+    of = {"source": origin, "k": origin, "columns": partition.columns}
+    fitted("in memory", Fleet.of(Problem(z, x_next, np.full(N, DT), np.ones(5), **of)))
     header = ["arrays", "criterion", "ours", "passes", "peak memory", "optimality gap", "outside"]
     table(f"{N} transitions, n = 5, m = 4", [*header, "objective differs", "elements differ"], rows)
 

@@ -187,11 +187,11 @@ def rows(problem: Problem, structure: Structure | None) -> list[Row]:
     made = []
     for i in range(n):
         low, high, d_low, d_high = (b[:, i] for b in bounds)
-        y = problem.x_next[:, i] - problem.z[:, i]
+        y = problem.x_next[i] - problem.z[i]
         free = np.flatnonzero((low < high) & phi.any(axis=0))
         fixed = np.where(low == high, low, 0.0)
         y = y - phi @ fixed
-        floor = LEAST * float(np.abs(problem.x_next[:, i] - problem.z[:, i]).max())
+        floor = LEAST * float(np.abs(problem.x_next[i] - problem.z[i]).max())
         size = np.sqrt(np.mean(phi[:, free] ** 2, axis=0))
         left, values, right = np.linalg.svd(phi[:, free] / size, full_matrices=False)
         keep = values > 1e-13 * values.max(initial=0.0)
@@ -399,7 +399,7 @@ def compare(drawn: Case, criterion: str) -> Comparison:
         return Comparison(criterion, seconds, np.full(len(optimum), np.nan), error=error, optimum=optimum)
     objective = np.atleast_1d(np.asarray(model.fit_summary["objective"]))
     roots = np.sqrt(problem.row_weights())
-    rounding = 16 * np.finfo(float).eps * np.abs(problem.x_next).max(axis=0)
+    rounding = 16 * np.finfo(float).eps * np.abs(problem.x_next.T).max(axis=0)
     if criterion == "lp":
         reachable = optimum + roots.max(axis=0) * rounding
     else:

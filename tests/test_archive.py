@@ -164,7 +164,7 @@ def test_many_blocks_and_passes_from_disk(tmp_path, criterion):
     partition = write_cache(tmp_path / "c", (p for _, p in parts))
     assert partition.N == sum(p.N for _, p in parts)
     stacked = np.hstack([block.z for block in partition.blocks()])
-    assert np.array_equal(stacked, np.hstack([p.z_columns for _, p in parts]))
+    assert np.array_equal(stacked, np.hstack([p.z for _, p in parts]))
     model = fit_fleet(Fleet([partition]), whole.signals, criterion)
     objective = pytest.approx(whole.fit_summary["objective"], rel=1e-12)
     assert model.fit_summary["objective"] == objective

@@ -322,7 +322,7 @@ def test_one_jump_does_not_hide_how_noise_is_correlated():
     z, white = rng.normal(size=(2000, 2)), 1e-3 * rng.normal(size=2001)
     moved = white[1:] + white[:-1]
     moved[700] += 0.1
-    problem = SimpleNamespace(z=z, N=2000, n=1, dt=np.ones(2000), x_next=z[:, :1] + moved[:, None])
+    problem = SimpleNamespace(z=z.T, N=2000, n=1, dt=np.ones(2000), x_next=(z[:, :1] + moved[:, None]).T)
     np.testing.assert_allclose(evidence._correlation(problem, np.arange(1, 2000)), [[0.5, 0.0]], atol=0.05)
 
 

@@ -17,8 +17,9 @@ from refusals import refuses
 
 import uncertain_lti
 from uncertain_lti import OperatingPoint, Transient, UncertainLTI
+from uncertain_lti.base import arrays
 from uncertain_lti.base.errors import FitError, ModelError, TransientError
-from uncertain_lti.identification import fit, fleet, passes, programmes, solvers, working_set
+from uncertain_lti.identification import fit, passes, programmes, solvers, working_set
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.problem import Columns, Problem, Regimes, solve_as_written
 from uncertain_lti.identification.structure import Structure
@@ -399,7 +400,7 @@ def on_the_bounds(model, z, dt, rng, weights, columns):
     x_next[:, edge] = centre[:, edge] + half[:, edge] * rng.choice([-1, 1], size=20)
     x_next[:, edge[:10]] = np.nextafter(x_next[:, edge[:10]], rng.choice([-np.inf, np.inf]))
     nothing = np.zeros(len(dt), dtype=np.intp)
-    return Problem(z, x_next, dt, nothing, nothing, weights, columns)
+    return Problem(z, x_next, dt, weights, source=nothing, k=nothing, columns=columns)
 
 
 def judged_sample(seed):
@@ -439,8 +440,8 @@ def scheduled_sample(seed):
 
 def by_bounds(model, problem):
     """Transitions outside, the largest width and the largest √w x width of each state, by the model's own bounds."""
-    centre, half = model.columns_centre_and_half(problem.z_columns, problem.dt)
-    inside = (centre - half <= problem.next_columns) & (problem.next_columns <= centre + half)
+    centre, half = model.columns_centre_and_half(problem.z, problem.dt)
+    inside = (centre - half <= problem.x_next) & (problem.x_next <= centre + half)
     weighted = 2 * half * np.sqrt(problem.row_weights().T)
     return (~inside).sum(axis=1), 2 * half.max(axis=1), weighted.max(axis=1)
 
@@ -462,7 +463,7 @@ def test_a_fit_judges_every_transition_as_the_bounds_do(sample):
 def test_a_fit_does_not_depend_on_the_number_of_threads(monkeypatch):
     transient = drawn(leibov2006(), 40_001, 3, noise=1e-3)
     several = fit(transient, "qp", additive="noise", describe_data=False)
-    monkeypatch.setattr(fleet, "core_count", lambda: 1)
+    monkeypatch.setattr(arrays, "core_count", lambda: 1)
     assert fit(transient, "qp", additive="noise", describe_data=False).to_dict() == several.to_dict()
 
 

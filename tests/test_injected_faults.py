@@ -60,9 +60,7 @@ def inject(run, kind, signal, size, at, model=None):
     i -= 0 if KINDS[kind].of == "actuator" else len(run.control_names)
     windows = Windows(run.t[None], run.x[None], run.u[None], run.s[None], int(np.searchsorted(run.t, at - 1e-12)))
     noise = np.random.default_rng(0).standard_normal((1, len(run)))
-    signals = run.signals if model is None else model.signals
-    recalled = () if signals is None else signals.recalled
-    x, u = faulty(windows, kind, i, np.array([size]), noise, recalled, model)
+    x, u = faulty(windows, kind, i, np.array([size]), noise, model or leibov2006())
     return run.replace(x=x[0], u=u[0])
 
 
@@ -186,7 +184,7 @@ def test_a_memory_of_a_state_follows_the_fault():
     faulty = inject(healthy, "offset", "u", 0.2, 1.0, model)
     assert faulty.x == pytest.approx(truth.x, abs=1e-12) and faulty.u == pytest.approx(truth.u, abs=1e-12)
     assert np.abs(truth.x - healthy.x).max() > 0.05
-    biased = inject(healthy, "bias", "x", 0.7, 1.0)
+    biased = inject(healthy, "bias", "x", 0.7, 1.0, model)
     expected = [recalled(biased.t, biased.x[:, 0], k) for k in range(12, 40)]
     assert biased.u[12:, 1:] == pytest.approx(np.array(expected), abs=1e-12)
     assert np.array_equal(biased.u[:10], healthy.u[:10])

@@ -275,8 +275,8 @@ def test_facts_of_each_block():
     transient = drawn(THREE, 500, 9, noise=1e-3, jitter=0.0)
     model = fit(transient, additive="both", schedule=THREE)
     problem = written(transient, THREE, "both")
-    centre, half = model.columns_centre_and_half(problem.z_columns, problem.dt)
-    largest = THREE.weights(problem.z_columns[[2]]).argmax(axis=0)
+    centre, half = model.columns_centre_and_half(problem.z, problem.dt)
+    largest = THREE.weights(problem.z[[2]]).argmax(axis=0)
     for r, facts in enumerate(model.fit_summary["blocks"]):
         assert facts["transitions"] == np.count_nonzero(largest == r) == model.block_data[r].transitions
         assert facts["mean_width"] == pytest.approx(2 * half[:, largest == r].mean(axis=1))

@@ -44,7 +44,7 @@ def _run(module: str, function: str) -> int:
         signal.signal(number, lambda *_: os._exit(0))
     try:
         hold_middleware()
-        main = getattr(import_module(f"uncertain_lti_ros.{module}"), function)
+        return int(getattr(import_module(f"uncertain_lti_ros.{module}"), function)())
     except UncertainLTIError as error:
         print(f"{name}: {error}", file=sys.stderr)
         return _BAD_USAGE
@@ -55,16 +55,7 @@ def _run(module: str, function: str) -> int:
         remedy = "source a ROS 2 Jazzy installation, or in the checkout: pip install '.[ros]'"
         print(f"{name}: {what}; {remedy}", file=sys.stderr)
         return _BAD_USAGE
-    except Exception:
-        return _fault(name)
-    try:
-        return int(main())
-    except Exception:
-        return _fault(name)
-
-
-def _fault(name: str) -> int:
-    """Print what nobody expected; a traceback alone would end with 1, which means an alarm elsewhere."""
-    traceback.print_exc()
-    print(f"{name}: this is a fault of the program; please report it with the lines above", file=sys.stderr)
-    return _FAULT
+    except Exception:  # a traceback alone would end with 1, which means an alarm elsewhere
+        traceback.print_exc()
+        print(f"{name}: this is a fault of the program; please report it with the lines above", file=sys.stderr)
+        return _FAULT

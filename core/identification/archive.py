@@ -25,7 +25,7 @@ from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.assembly import assemble, is_constant
-from uncertain_lti.identification.fitting import contradiction_named, fit_fleet, structure_of, with_repeats
+from uncertain_lti.identification.fitting import fit_fleet, structure_of, with_repeats
 from uncertain_lti.identification.fleet import DaskFleet, Fleet
 from uncertain_lti.identification.problem import Columns, DiskPartition, Problem, Regimes
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of, unused
@@ -82,7 +82,7 @@ def write_cache(folder: str | os.PathLike[str], problems: Iterable[Problem]) -> 
         if isinstance(error, OSError):
             raise FitError(f"{folder}: cannot be written: {error.strerror}; choose another folder") from None
         raise
-    q = 0 if problem.s_columns is None else len(problem.s_columns)
+    q = 0 if problem.s is None else len(problem.s)
     return DiskPartition(folder / _DATA, sizes, problem.n, problem.p, q, np.ones(problem.n), problem.columns)
 
 
@@ -205,16 +205,16 @@ def fit_archive(
         return f"transition {index - starts[which]} of {named[which][0]}"
 
     fleet.check_solvable(where, [s.name for s in signals.states])
-    with contradiction_named(where, signals):
-        model = fit_fleet(
-            fleet,
-            signals,
-            criterion,
-            structure=structure_of(signals, scheduled),
-            alarm_rule=alarm_rule,
-            progress=progress,
-            dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
-        )
+    model = fit_fleet(
+        fleet,
+        signals,
+        criterion,
+        structure=structure_of(signals, scheduled),
+        alarm_rule=alarm_rule,
+        progress=progress,
+        dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
+        where=where,
+    )
     facts = {
         **model.fit_summary,
         "messages": [*model.fit_summary.get("messages", []), *messages],

@@ -31,9 +31,7 @@ def is_constant(dt: Array) -> bool:
 
     `dt` (N,): steps, s.
     """
-    if not dt.size or (dt == dt[0]).all():
-        return True
-    return bool(np.ptp(dt) <= 1e-6 * np.median(dt))
+    return not dt.size or bool(np.ptp(dt) <= 1e-6 * median_step(dt))
 
 
 def median_step(dt: Array) -> float:
@@ -94,7 +92,7 @@ def assemble(
     if factors is not None:
         factors = factors[source]
         chosen = factors[:, None] * chosen if chosen.ndim < 3 else factors[:, None, None] * chosen
-    problem = Problem(z, x_next, dt, source, k, chosen, columns, further if len(further) else None)
+    problem = Problem(z, x_next, dt, chosen, further if len(further) else None, source=source, k=k, columns=columns)
     if regimes is not None:
         refuse_unlisted(problem, regimes, transients)
     return problem
@@ -102,7 +100,7 @@ def assemble(
 
 def refuse_unlisted(problem: Problem, regimes: Regimes, transients: Sequence[Transient]) -> None:
     """Refuse a mode that the schedule does not list."""
-    vectors = regimes.vectors(problem.z_columns, problem.s_columns)
+    vectors = regimes.vectors(problem.z, problem.s)
     for axis, values, row in zip(regimes.schedule.axes, vectors, regimes.positions, strict=True):
         unlisted = np.flatnonzero(~np.isin(values, axis.modes))
         if axis.modes and len(unlisted):

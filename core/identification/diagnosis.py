@@ -116,9 +116,9 @@ def describe(
     problem: Problem,
     sums: Moments,
     mean_width: Array,
-    transients: Sequence[Transient] = (),
-    few: Carriers | None = None,
-    discarded: int | None = None,
+    transients: Sequence[Transient],
+    few: Carriers | None,
+    discarded: int | None,
 ) -> tuple[int, list[str]]:
     """Rank, and messages to the user on a fitted model and the recordings it was fitted to.
 
@@ -265,7 +265,7 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], lat
     follows = successive(problem)
     if len(follows) <= 4 * problem.p:
         return []
-    before, now = problem.z[follows], problem.z[follows + 1]
+    before, now = problem.z.T[follows], problem.z.T[follows + 1]
     n = problem.n
     basis = np.column_stack([now[:, :n], np.delete(before, later, axis=1), np.ones(len(before))])
     gram = basis.T @ basis
@@ -293,7 +293,7 @@ def _coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[s
     for j, signal in enumerate(signals):
         if too_small(float(sums.low[j]), float(sums.high[j])):
             continue
-        z, steady, scale = problem.z[:, j], float(signal.steady), float(signal.scale)
+        z, steady, scale = problem.z[j], float(signal.steady), float(signal.scale)
         if not (found := codes(z)):
             continue
         others = z[~np.isin(z, list(found))] * scale + steady
@@ -314,7 +314,7 @@ def _wrapped(problem: Problem, signals: Sequence[Signal], transients: Sequence[T
     near_a_turn = problem.largest_moves() * scale > 0.8 * 2 * np.pi
 
     def ends(those: list[int]) -> tuple[Array, Array]:
-        columns = problem.z[:, those], problem.x_next[:, those]
+        columns = problem.z.T[:, those], problem.x_next.T[:, those]
         return columns[0] * scale[those] + steady[those], columns[1] * scale[those] + steady[those]
 
     for i, signal in enumerate(states):
@@ -368,7 +368,7 @@ def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> li
     Over the uneven steps, what a constant step explains is compared with what the stated one does. Of samples that are
     really uneven the stated one explains more.
     """
-    dt, x = problem.dt, problem.z[:, : problem.n]
+    dt, x = problem.dt, problem.z.T[:, : problem.n]
     usual = float(np.median(dt))
     uneven = uneven_steps(dt)
     speed = max((abs(v) for block in model.blocks for v in block.eigenvalues()), default=0.0) * usual
@@ -377,8 +377,8 @@ def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> li
         return []
     left = []
     for length in (dt, np.full(len(dt), usual)):
-        basis = np.column_stack([problem.z, np.ones(problem.N)]) * length[:, None]
-        rest = problem.x_next - x
+        basis = np.column_stack([problem.z.T, np.ones(problem.N)]) * length[:, None]
+        rest = problem.x_next.T - x
         rest = rest - basis @ (np.linalg.pinv(basis.T @ basis, hermitian=True) @ (basis.T @ rest))
         left.append(np.sqrt(np.mean(rest[uneven] ** 2, axis=0)))
     ratio = (left[0] / np.maximum(left[1], 1e-300))[moving]
@@ -400,7 +400,7 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     if len(successive(problem)) < 0.5 * problem.N:
         return []
     for i, signal in enumerate(signals[: problem.n]):
-        before, after = problem.z[:, i], problem.x_next[:, i]
+        before, after = problem.z[i], problem.x_next[i]
         if rows := held_for(before, after):
             alone = len({other.topic for other in signals}) == 1
             remedy = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
@@ -416,19 +416,19 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transient]) -> list[str]:
     """States that keep exactly one value for long while the other signals move; at an end of its range one may rest."""
     messages = []
-    low, high = problem.z_columns.min(axis=1), problem.z_columns.max(axis=1)
+    low, high = problem.z.min(axis=1), problem.z.max(axis=1)
     spread = high - low
     for i in range(problem.n):
-        still = problem.x_next[:, i] == problem.z[:, i]
+        still = problem.x_next[i] == problem.z[i]
         if still.mean() > 0.5:  # held, quantised, or at rest most of the time
             continue
         still[1:] &= problem.source[1:] == problem.source[:-1]
         for start, stop in runs(still):
             if stop - start < FROZEN:
                 continue
-            moving = (np.ptp(problem.z[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
+            moving = (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
             moving[i] = False
-            if moving.any() and low[i] < problem.z[start, i] < high[i]:
+            if moving.any() and low[i] < problem.z.T[start, i] < high[i]:
                 messages.append(
                     f"'{names[i]}' stands at exactly one value for {stop - start} samples "
                     f"({_where(problem, [start], transients)}) while '{names[int(np.argmax(moving))]}' moves: a frozen "
@@ -506,11 +506,8 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
     places: dict[str, list[str]] = {}
     indices = sorted(indices)
     for index in indices[:4]:
-        source, k = int(problem.source[index]), int(problem.k[index])
-        if source < len(transients):
-            places.setdefault(transients[source].name, []).append(f"{moment(transients[source].t[k])} s")
-        else:
-            places.setdefault(f"recording {source + 1}", []).append(f"sample {k}")
+        of = transients[problem.source[index]]
+        places.setdefault(of.name, []).append(f"{moment(of.t[problem.k[index]])} s")
     where = "; ".join(f"{name} at {', '.join(at)}" for name, at in places.items())
     return where + (f"; and {len(indices) - 4} more" if len(indices) > 4 else "")
 
@@ -518,8 +515,8 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
 def _noise_like(problem: Problem) -> dict[int, float]:
     """States whose next sample cannot be predicted from those before, and the share of its variance that can."""
     n = problem.n
-    share = predicted(problem.z[:, :n], problem.z[:, n:], problem.x_next)
-    moving = np.ptp(problem.z[:, :n], axis=0) > 0
+    share = predicted(problem.z.T[:, :n], problem.z.T[:, n:], problem.x_next.T)
+    moving = np.ptp(problem.z.T[:, :n], axis=0) > 0
     return {i: max(0.0, float(share[i])) for i in np.flatnonzero(moving & (share < NOISE)).tolist()}
 
 

@@ -178,10 +178,10 @@ def autocorrelation(problem: Problem) -> Autocorrelation | None:
     if not any(_autocorrelated(*of) for of in correlation.tolist()):  # nothing follows: what would explain it is idle
         return Autocorrelation(correlation, np.ones(n), np.ones(n))
     dt = problem.dt[now, None]
-    z = problem.z[now]
-    step = problem.x_next[now] - z[:, :n]
+    z = problem.z.T[now]
+    step = problem.x_next.T[now] - z[:, :n]
     base = np.column_stack([z, np.ones(len(z))])
-    lagged = problem.z[before, :n]
+    lagged = problem.z.T[before, :n]
     basis = np.column_stack([base, lagged, _curves(z)]) * dt
     gram, cross, total = basis.T @ basis, basis.T @ step, np.einsum("kn,kn->n", step, step)
     total = np.maximum(total, 1e-300)
@@ -208,9 +208,9 @@ def _curves(z: Array) -> Array:
 
 def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
     """Autocorrelation at one and two samples, (n, 2); `now`: transitions that continue the one before."""
-    basis = np.column_stack([problem.z, np.ones(problem.N)]) * problem.dt[:, None]
+    basis = np.column_stack([problem.z.T, np.ones(problem.N)]) * problem.dt[:, None]
     basis = basis / np.maximum(np.abs(basis).max(axis=0), 1e-300)
-    step = problem.x_next - problem.z[:, : problem.n]
+    step = problem.x_next.T - problem.z.T[:, : problem.n]
     residual = step - basis @ np.linalg.lstsq(basis, step, rcond=None)[0]
     spread = np.median(np.abs(residual), axis=0) / 0.6745
     limit = np.where(spread > 0, _CLIP * spread, np.inf)
@@ -259,9 +259,9 @@ def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tup
         return {}
     share = 1 + usable.size * (p + LONGEST_DELAY * (p - n)) // _ENOUGH
     usable = usable[in_stretches(np.arange(usable.size), share, _STRETCH)]
-    lagged = np.stack([problem.z_columns[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
-    now = problem.z_columns[:n, usable]
-    found = lags(now, lagged, problem.next_columns[:, usable] - now, problem.dt[usable])
+    lagged = np.stack([problem.z[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
+    now = problem.z[:n, usable]
+    found = lags(now, lagged, problem.x_next[:, usable] - now, problem.dt[usable])
     return {j: late for j, late in found.items() if n + j not in past}
 
 

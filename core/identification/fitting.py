@@ -12,8 +12,8 @@
 from __future__ import annotations
 
 import platform
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from typing import Any, Literal
@@ -31,7 +31,7 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
 from uncertain_lti.identification.memory import Recording, elements_of, remembered
 from uncertain_lti.identification.optimum import optimum
-from uncertain_lti.identification.passes import Moments
+from uncertain_lti.identification.passes import Judged
 from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
@@ -138,7 +138,8 @@ def fit(
         of, k = transients[problem.source[index]], int(problem.k[index])
         return f"the step from sample {k} of {of.name} (t = {moment(of.t[k])} s)"
 
-    Fleet([problem]).check_solvable(where, [s.name for s in signals.states])
+    whole = Fleet([problem])
+    whole.check_solvable(where, [s.name for s in signals.states])
 
     discarded: list[dict[str, Any]] = []
     if budget := _budget(discard, problem.N):
@@ -147,8 +148,7 @@ def fit(
                 f"discard is {discard!r}, which leaves {plural(left, 'transition')} for {unknowns} unknowns per row; "
                 f"discard {problem.N - unknowns} at most, or record more"
             )
-        with contradiction_named(where, signals):
-            before = fit_fleet(Fleet([problem]), signals, criterion, structure=structure, describe_data=False)
+        before = fit_fleet(whole, signals, criterion, structure=structure, describe_data=False, where=where)
         chosen = choose_discards(problem, criterion, structure, budget, progress)
         for index, effect in chosen:
             of, k = transients[problem.source[index]], int(problem.k[index])
@@ -158,24 +158,24 @@ def fit(
     fleet = Fleet.of(problem) if method == "working-set" else Fleet([problem])
     plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
     keeps = plain and describe_data and not horizons
-    with contradiction_named(where, signals):
-        model = fit_fleet(
-            fleet,
-            signals,
-            criterion,
-            structure=structure,
-            method=method,
-            alarm_rule=alarm_rule,
-            progress=progress,
-            dt_median=median_step(problem.dt),
-            describe_data=describe_data,
-            describe_on=problem,
-            transients=transients,
-            discarded=len(discarded),
-            seek_carriers=seek_carriers,
-            near=near if scheduled is None else None,
-            remember=partial(_memory, problem, transients, fleet) if keeps else None,
-        )
+    model = fit_fleet(
+        fleet,
+        signals,
+        criterion,
+        structure=structure,
+        method=method,
+        alarm_rule=alarm_rule,
+        progress=progress,
+        dt_median=median_step(problem.dt),
+        describe_data=describe_data,
+        describe_on=problem,
+        transients=transients,
+        discarded=len(discarded),
+        seek_carriers=seek_carriers,
+        near=near if scheduled is None else None,
+        remember=partial(_memory, problem, transients, fleet) if keeps else None,
+        where=where,
+    )
     facts = {
         **model.fit_summary,
         "additive": additive,
@@ -235,11 +235,12 @@ def fit_fleet(
     seek_carriers: bool = False,
     near: UncertainLTI | None = None,
     remember: Callable[[UncertainLTI, list[Index]], dict[str, Any] | None] | None = None,
+    where: Callable[[int], str] = "transition {}".format,
 ) -> UncertainLTI:
     """`fit` on transitions that are already normalised, wherever they lie.
 
     `describe_on`: the transitions, where they are all at hand; `remember`: what the model's file keeps, of the model
-    and `WorkingSet.nearest`.
+    and `WorkingSet.nearest`; `where`: what a transition is called.
     """
     if large := fleet.N * fleet.p * fleet.n > _LARGE:
         return_memory()
@@ -277,7 +278,10 @@ def fit_fleet(
             alarm_rule=alarm_rule,
         )
 
-    found = optimum(engine, criterion, build, [s.name for s in signals.states], method)
+    try:
+        found = optimum(engine, criterion, build, [s.name for s in signals.states], method)
+    except InfeasibleError as error:
+        raise _contradiction(error, where(error.index), signals) from None
     nearest = engine.nearest() if remember is not None else []
     del engine  # with the samples that its rows hold
     if large:
@@ -299,7 +303,7 @@ def fit_fleet(
         "versions": versions(solution.solvers),
     }
     if regimes is not None:
-        facts["blocks"] = _block_facts(model, sums, judged.widths, judged.widest, dt_median)
+        facts["blocks"] = _block_facts(model, sums.visits, judged)
 
     def said() -> tuple[int, list[str]] | None:
         if not describe_data:
@@ -310,7 +314,7 @@ def fit_fleet(
         whole = describe_on.N == sums.count and method == "working-set"
         few = None
         if seek_carriers and whole:
-            with suppress(FitError):  # a fit that is done does not end for what is said of it
+            with suppress(FitError, InfeasibleError):  # a fit that is done does not end for what is said of it
                 few = carriers(describe_on, structure)
         gone = discarded if criterion == "qp" else None
         rank, messages = describe(model, describe_on, sums, found.mean_width, transients, few, gone)
@@ -347,19 +351,17 @@ def with_repeats(model: UncertainLTI, found: Sequence[Found]) -> UncertainLTI:
     return model.replace(repeats=together(model.n, found), domain=domain)
 
 
-def _block_facts(
-    model: UncertainLTI, sums: Moments, total: Array, largest: Array, dt_median: float | None
-) -> list[dict[str, Any]]:
+def _block_facts(model: UncertainLTI, visits: Index, judged: Judged) -> list[dict[str, Any]]:
     """Of each block its transitions, those of which it has the largest weight, and the widths there."""
-    mean = np.divide(total, sums.visits[:, None], out=np.full(total.shape, np.nan), where=sums.visits[:, None] > 0)
+    each = zip(model.blocks, visits.tolist(), judged.widths, judged.widest, strict=True)
     return [
         {
-            "transitions": int(sums.visits[r]),
-            "mean_width": mean[r] if sums.visits[r] else None,
-            "max_width": largest[r] if sums.visits[r] else None,
-            "spectral_radius": block.spectral_radius() if dt_median is not None else None,
+            "transitions": count,
+            "mean_width": total / count if count else None,
+            "max_width": largest if count else None,
+            "spectral_radius": None if model.sampling.dt_median is None else block.spectral_radius(),
         }
-        for r, block in enumerate(model.blocks)
+        for block, count, total, largest in each
     ]
 
 
@@ -376,16 +378,7 @@ def distance_in_words(gap: float) -> list[str]:
     return []
 
 
-@contextmanager
-def contradiction_named(where: Callable[[int], str], signals: SignalMap) -> Iterator[None]:
-    """A transition that the structure cannot contain is named, as `where` calls it."""
-    try:
-        yield
-    except InfeasibleError as error:
-        raise contradiction_in(error, where(error.index), signals) from None
-
-
-def contradiction_in(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:
+def _contradiction(error: InfeasibleError, where: str, signals: SignalMap) -> FitError:
     """The error for a transition that the structure cannot contain."""
     signal = signals.states[error.row]
     distance = f"{error.distance * float(signal.scale):.3g} {signal.unit}".rstrip()

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from uncertain_lti.base.arrays import LARGEST, Array, core_count
+from uncertain_lti.base.arrays import LARGEST, Array, on_cores
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import passes
@@ -52,17 +51,15 @@ _Facts = tuple[int, int, int, Columns, Array | None]
 
 
 class Fleet:
-    """Partitions visited in this process, in turn or by threads; passes over all data as map and reduce.
+    """Partitions visited in this process, on all cores; passes over all data as map and reduce.
 
-    `partitions`: with the same columns, states and controls; `threads`: how many partitions a pass visits at a time,
-    which the kernel does without the interpreter's lock; `sums`: those of the last `moments`.
+    `partitions`: with the same columns, states and controls; `sums`: those of the last `moments`.
     """
 
     sums: Moments
 
-    def __init__(self, partitions: Sequence[Partition], threads: int = 1) -> None:
+    def __init__(self, partitions: Sequence[Partition]) -> None:
         self.partitions = list(partitions)
-        self._pool = ThreadPoolExecutor(threads) if threads > 1 else None
         self._describe([_facts(part) for part in self.partitions])
 
     @classmethod
@@ -70,7 +67,7 @@ class Fleet:
         """A problem in memory, in parts for all cores if it is large; how many there are depends on its size alone."""
         count = max(problem.N // _PART, 1)
         edges = np.linspace(0, problem.N, count + 1).astype(int).tolist()
-        return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)], min(count, core_count()))
+        return cls([problem.subset(slice(a, b)) for a, b in itertools.pairwise(edges)])
 
     def _describe(self, facts: Sequence[_Facts]) -> None:
         self.counts = [count for count, *_ in facts]
@@ -80,10 +77,7 @@ class Fleet:
 
     def map(self, function: Callable[..., T], arguments: Sequence[tuple[Any, ...]]) -> list[T]:
         """function(partition, *arguments of that partition) for every partition."""
-        if self._pool is None:
-            return [function(part, *args) for part, args in zip(self.partitions, arguments, strict=True)]
-        futures = [self._pool.submit(function, p, *args) for p, args in zip(self.partitions, arguments, strict=True)]
-        return [future.result() for future in futures]
+        return on_cores(function, [(part, *args) for part, args in zip(self.partitions, arguments, strict=True)])
 
     def _same(self, *arguments: Any) -> list[tuple[Any, ...]]:
         return [arguments] * len(self.counts)
@@ -92,7 +86,7 @@ class Fleet:
         """One pass for sums over all transitions, and a sample of them."""
         results = self.map(passes.moments, [(offset, stride) for offset in self.offsets])
         self.sums = total = sum((sums for sums, _ in results[1:]), results[0][0])
-        return total, passes.by_row([some for _, sampled in results for some in sampled], self.n, self.p)
+        return total, passes.by_row([some for _, sampled in results for some in sampled], self.n)
 
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:
         """Combinations of two signals that the data hold; see `passes.occupied`.
@@ -142,19 +136,15 @@ class Fleet:
             )
         if self.columns.half:
             return
-        count, first, state, step = self.moving_from_rest()
-        if count:
+        results = self.map(passes.moving_from_rest, [(offset,) for offset in self.offsets])
+        if count := sum(found[0] for found in results):
+            _, first, state, step = next(found for found in results if found[0])
             also = f" (so {'does' if count == 2 else 'do'} {plural(count - 1, 'other sample')})" if count > 1 else ""
             raise FitError(
                 f"{where(first)} begins at rest, x = u = 0, and '{names[state]}' moves by {step:.3g} in it, which no "
                 f"interval matrices can contain{also}; use an additive term: --additive noise for measurement noise, "
                 f"--additive disturbance for unmodelled inputs"
             )
-
-    def moving_from_rest(self) -> tuple[int, int, int, float]:
-        """Samples with x = u = 0 and a successor that is not 0; see `passes.moving_from_rest`."""
-        results = self.map(passes.moving_from_rest, [(offset,) for offset in self.offsets])
-        return sum(r[0] for r in results), *next((r for r in results if r[0]), results[0])[1:]
 
     def least_eigenvalue(self) -> float:
         """Least eigenvalue of any full weight; see `passes.least_eigenvalue`."""

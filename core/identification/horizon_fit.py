@@ -60,7 +60,7 @@ def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], stru
     """
     lengths = sorted(set(steps))
     k, signals = problem.order, _signals(problem)
-    dt, after = problem.dt, problem.next_columns
+    dt, after = problem.dt, problem.x_next
     piece = max(20 * lengths[-1], 1000)
     if len(dt) > _COMPARED:
         starts = np.linspace(0, len(dt) - piece, max(_COMPARED // piece, 1)).astype(np.intp)
@@ -84,7 +84,7 @@ def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], stru
 
 def _signals(problem: Problem) -> Array:
     """[x; u; s] of the transitions, one column for each."""
-    return problem.z_columns if problem.s_columns is None else np.vstack([problem.z_columns, problem.s_columns])
+    return problem.z if problem.s is None else np.vstack([problem.z, problem.s])
 
 
 @one_thread_each()
@@ -101,11 +101,10 @@ def fit_horizons(
     found: list[Horizon] = []
     facts: list[dict[str, Any]] = []
     messages: list[str] = []
-    n, p = problem.n, problem.p
+    p = problem.p
     axes = 0 if model.schedule is None else len(model.schedule.axes)
     regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
     columns = Columns(_UNKNOWN, regimes)
-    halves = {"dA": np.zeros((n, n)), "dB": np.zeros((n, p - n))}
     lengths = sorted(set(steps))
     for windows in model.windows(problem.order, _signals(problem), problem.dt, lengths):
         if progress is not None:
@@ -129,18 +128,17 @@ def fit_horizons(
         unbroken = len(last) == int(last[-1]) - int(last[0]) + 1
         part = Problem(
             windows.z[:p],
-            problem.next_columns[:, int(last[0]) : int(last[-1]) + 1] if unbroken else problem.next_columns[:, last],
+            problem.x_next[:, int(last[0]) : int(last[-1]) + 1] if unbroken else problem.x_next[:, last],
             windows.time,
-            problem.source[windows.start],
-            problem.k[windows.start],
             problem.weights if problem.weights.ndim == 1 else problem.weights[last],
-            columns,
             windows.z[p:] if axes else None,
             windows.run,
+            source=problem.source[windows.start],
+            k=problem.k[windows.start],
+            columns=columns,
         )
         kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
-        structure = Structure(n, p - n, fixed=halves) if kind == "constant" else None
-        horizon, fact = _fitted(model, part, windows.steps, kind, criterion, structure, largest)
+        horizon, fact = _fitted(model, part, windows.steps, kind, criterion, largest)
         solvers |= fact.pop("solvers")
         move = part.largest_moves()
         if (0.5 * fact["mean_width"] > WIDER * move).all():
@@ -156,16 +154,12 @@ def fit_horizons(
 
 
 def _fitted(
-    model: UncertainLTI,
-    part: Problem,
-    steps: int,
-    widths: Widths,
-    criterion: str,
-    structure: Structure | None,
-    largest: Array,
+    model: UncertainLTI, part: Problem, steps: int, widths: Widths, criterion: str, largest: Array
 ) -> tuple[Horizon, dict[str, Any]]:
     """One horizon."""
-    engine = WorkingSet(Fleet.of(part), structure)
+    n, m = part.n, part.p - part.n
+    constant = Structure(n, m, fixed={"dA": np.zeros((n, n)), "dB": np.zeros((n, m))})
+    engine = WorkingSet(Fleet.of(part), constant if widths == "constant" else None)
 
     def build(theta: Array, d: Array) -> Horizon:
         return Horizon(steps, **part.columns.arrays(theta, d), widths=widths)

@@ -55,7 +55,7 @@ class Recording(NamedTuple):
     @classmethod
     def of(cls, name: str, problem: Problem) -> Recording:
         """That of these transitions."""
-        some = problem.block(slice(None)).every(0, max(1, problem.N // _LOOKED_AT))
+        some = problem.subset(np.arange(0, problem.N, max(1, problem.N // _LOOKED_AT)))
         return cls(name, _mark((some.z, some.x_next, some.dt, np.array([problem.N]))))
 
 
@@ -171,7 +171,7 @@ class Memory:
     def to_dict(self, model: UncertainLTI) -> dict[str, Any]:
         """As it is in the file of its model."""
         of = self.kept
-        kept = {"z": of.z_columns, "next": of.next_columns, "dt": of.dt, "source": of.source, "k": of.k}
+        kept = {"z": of.z, "next": of.x_next, "dt": of.dt, "source": of.source, "k": of.k}
         return {
             "of": _mark_of(model),
             "columns": sorted(of.columns.names),
@@ -206,7 +206,8 @@ class Memory:
         try:
             z, x_next, dt, source, k = (of_text(data["kept"][name]) for name in ("z", "next", "dt", "source", "k"))
             columns, weights = Columns(frozenset(data["columns"])), of_text(data["weights"])
-            kept = Problem(z, x_next, dt, source.astype(np.intp), k.astype(np.intp), weights, columns)
+            whose: dict[str, Any] = {"source": source.astype(np.intp), "k": k.astype(np.intp)}
+            kept = Problem(z, x_next, dt, weights, **whose, columns=columns)
             rest = None
             if data["rest"] is not None:
                 found: dict[str, Any] = {name: of_text(text) for name, text in data["rest"].items()}
@@ -252,7 +253,7 @@ def remembered(
         left = np.ones(problem.N, dtype=bool)
         left[kept] = False
         if not problem.columns.half:  # at rest there is no room, and no model changes that
-            left &= problem.z_columns.any(axis=0)
+            left &= problem.z.any(axis=0)
         chosen = problem.subset(kept)
         share = min(max(room - most * each, room // 5) // box / (first + problem.N - len(kept)), 1.0)
         tasks = []
@@ -288,9 +289,7 @@ def _nearest(
     to_nominal, to_half = (np.linalg.inv(_root(gram / sums.count)) for gram in (sums.centre, sums.plain_gram))
     wide = np.square(to_half @ psi).sum(axis=0)
     size = np.square(to_nominal @ phi).sum(axis=0) + wide
-    *_, room = boxes_of(
-        model.tables, of.z_columns, of.dt, of.next_columns, None, widest, np.arange(len(some)), len(some)
-    )
+    *_, room = boxes_of(model.tables, of.z, of.dt, of.x_next, None, widest, np.arange(len(some)), len(some))
     near = np.minimum(room[:n], room[n : 2 * n]) / np.sqrt(np.maximum(size, 1e-300))
     if widest is not None:
         differ = room[2 * n :].max(axis=1) > 1e-9 * widest  # where noise alone makes the widths, none is wider

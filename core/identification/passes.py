@@ -137,8 +137,8 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
     for block in part.blocks():
         if stride:
             first = -(block.start + offset) % stride
-            index = np.arange(first, len(block), stride) + (block.start + offset)
-            sampled.append((index, block.every(first, stride)))
+            index = np.arange(first, len(block), stride)
+            sampled.append((index + (block.start + offset), block.subset(index)))
         weights, (i, j) = block.weights, np.triu_indices(n)
         factors = None if weights.ndim == 1 else weights.T if weights.ndim == 2 else weights[:, i, j].T
         plain, grams, centre, target, square, width, visits = sums_of(
@@ -158,10 +158,8 @@ def moments(part: Partition, offset: int = 0, stride: int = 0) -> tuple[Moments,
     return sums, sampled
 
 
-def by_row(numbered: Sequence[Numbered], n: int, p: int) -> list[Samples]:
+def by_row(numbered: Sequence[Numbered], n: int) -> list[Samples]:
     """Transitions as every row sees them, what is not its own held once for all."""
-    if not numbered:
-        return [Samples.join([], p)] * n
     index, blocks = zip(*numbered, strict=True)
     z, dt = np.hstack([b.z for b in blocks]), np.concatenate([b.dt for b in blocks])
     rate = (np.hstack([b.x_next for b in blocks]) - np.hstack([b.origin for b in blocks])) / dt

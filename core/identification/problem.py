@@ -12,14 +12,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, TERMS, Term
@@ -169,20 +169,20 @@ class Columns:
 
 @dataclass(frozen=True)
 class Block:
-    """Some transitions in columns.
+    """Some transitions, normalised, in columns.
 
-    `start`: position of the first among those of the partition; `z` (p, K): [x; u]; `x_next` (n, K): next states; `dt`
-    (K,): Δt, s; `weights` (n,): W(t_{k+1}); `s` (q, K): scheduling signals that are neither state nor control; `base`
-    (n, K): what a step is counted from, over a horizon the run of the nominal model; default the states.
+    `z` (p, K): [x; u]; `x_next` (n, K): next states; `dt` (K,): Δt, s; `weights` (n,): W(t_{k+1}); `s` (q, K):
+    scheduling signals that are neither state nor control; `base` (n, K): what a step is counted from, over a horizon
+    the run of the nominal model; default the states; `start`: position of the first among those of the partition.
     """
 
-    start: int
     z: Array
     x_next: Array
     dt: Array
     weights: Array
     s: Array | None = None
     base: Array | None = None
+    start: int = 0
 
     def __len__(self) -> int:
         return len(self.dt)
@@ -191,14 +191,6 @@ class Block:
     def n(self) -> int:
         """Number of states."""
         return len(self.x_next)
-
-    def every(self, first: int, stride: int) -> Block:
-        """A copy of every stride-th transition from the first."""
-        part = slice(first, None, stride)
-        weights = self.weights if self.weights.ndim == 1 else self.weights[part].copy()
-        s, base = (None if rows is None else rows[:, part].copy() for rows in (self.s, self.base))
-        z, x_next, dt = self.z[:, part].copy(), self.x_next[:, part].copy(), self.dt[part].copy()
-        return Block(self.start, z, x_next, dt, weights, s, base)
 
     @property
     def origin(self) -> Array:
@@ -215,10 +207,19 @@ class Block:
         diagonal = np.diagonal(self.weights, axis1=1, axis2=2) if self.weights.ndim == 3 else self.weights
         return np.sqrt(diagonal).T
 
+    def subset(self, index: Index | NDArray[np.bool_] | slice) -> Self:
+        """Some of them; a slice is no copy."""
+        z, x_next = self.z[:, index], self.x_next[:, index]
+        if not isinstance(index, slice):  # numpy would lay the copy out in rows
+            z, x_next = np.ascontiguousarray(z), np.ascontiguousarray(x_next)
+        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
+        s, base = (None if rows is None else rows[:, index] for rows in (self.s, self.base))
+        return replace(self, z=z, x_next=x_next, dt=self.dt[index], weights=weights, s=s, base=base)
+
 
 @dataclass(frozen=True)
-class Problem:
-    """Usable transitions, normalised, in memory; of all recordings, or a part of them.
+class Problem(Block):
+    """Usable transitions in memory, of all recordings, or a part of them.
 
     They are in the form
 
@@ -227,22 +228,13 @@ class Problem:
     where rate = (x_next - x) / Δt, which is (8)(9) of Leibov (2006) divided by Δt_k. θ_i is row i of [A B], d_i of
     [ΔA ΔB].
 
-    `z_columns` (p, N): [x; u], samples in columns; `next_columns` (n, N): next states, samples in columns; `dt` (N,):
-    Δt, s; `source` (N,): transient that a transition comes from; `k` (N,): its sample in that transient; `weights`
-    (n,): W(t_{k+1}); `columns`: terms that are unknown; `s_columns` (q, N): scheduling signals that are neither state
-    nor control, samples in columns; `base_columns` (n, N): what a step is counted from, over a horizon the run of the
-    nominal model; default the states.
+    `source` (N,): transient that a transition comes from; `k` (N,): its sample in that transient; `columns`: terms that
+    are unknown.
     """
 
-    z_columns: Array
-    next_columns: Array
-    dt: Array
-    source: NDArray[np.intp]
-    k: NDArray[np.intp]
-    weights: Array
-    columns: Columns
-    s_columns: Array | None = None
-    base_columns: Array | None = None
+    source: Index = field(kw_only=True)
+    k: Index = field(kw_only=True)
+    columns: Columns = field(kw_only=True)
 
     @property
     def N(self) -> int:
@@ -250,35 +242,14 @@ class Problem:
         return len(self.dt)
 
     @property
-    def n(self) -> int:
-        """Number of states."""
-        return len(self.next_columns)
-
-    @property
     def p(self) -> int:
         """Number of states and controls."""
-        return len(self.z_columns)
+        return len(self.z)
 
     @property
-    def z(self) -> Array:
-        """[x u] with samples in rows, (N, p)."""
-        return self.z_columns.T
-
-    @property
-    def x_next(self) -> Array:
-        """Next states with samples in rows, (N, n)."""
-        return self.next_columns.T
-
-    @property
-    def order(self) -> NDArray[np.intp]:
+    def order(self) -> Index:
         """Numbers of the samples (N,), with those of another recording never following."""
         return self.k + self.source * (int(self.k.max(initial=0)) + 2)
-
-    def block(self, part: slice) -> Block:
-        """Transitions of a slice, without a copy."""
-        of = self.subset(part)
-        start = part.start or 0
-        return Block(start, of.z_columns, of.next_columns, of.dt, of.weights, of.s_columns, of.base_columns)
 
     def largest_moves(self) -> Array:
         """The largest change of each state in one transition, (n,)."""
@@ -288,44 +259,39 @@ class Problem:
     def blocks(self) -> Iterator[Block]:
         """All transitions, in blocks."""
         for start in range(0, self.N, BLOCK):
-            yield self.block(slice(start, min(start + BLOCK, self.N)))
+            yield replace(self.subset(slice(start, start + BLOCK)), start=start)
 
     def rate(self) -> Array:
         """(x_next - x) / Δt with samples in rows.
 
         Returns (N, n): 1/s.
         """
-        return ((self.next_columns - self.block(slice(None)).origin) / self.dt).T
+        return ((self.x_next - self.origin) / self.dt).T
 
     def phi(self) -> Array:
         """Regressors of the nominal row with samples in rows.
 
         Returns (N, r): as of `Columns.phi`.
         """
-        return self.columns.phi(self.z_columns, self.s_columns).T
+        return self.columns.phi(self.z, self.s).T
 
     def psi(self) -> Array:
         """Regressors of the half-width with samples in rows.
 
         Returns (N, q): as of `Columns.psi`.
         """
-        return self.columns.psi(self.z_columns, self.dt, self.s_columns).T
+        return self.columns.psi(self.z, self.dt, self.s).T
 
     def row_weights(self) -> Array:
         """Diagonal weights with samples in rows.
 
         Returns (N, n): w_ii(t_{k+1}).
         """
-        return np.broadcast_to(self.block(slice(None)).root_weights().T ** 2, (self.N, self.n))
+        return np.broadcast_to(self.root_weights().T ** 2, (self.N, self.n))
 
-    def subset(self, index: NDArray[np.intp] | NDArray[np.bool_] | slice) -> Problem:
+    def subset(self, index: Index | NDArray[np.bool_] | slice) -> Self:
         """The same problem on some transitions; a slice is no copy."""
-        z, x_next = self.z_columns[:, index], self.next_columns[:, index]
-        if not isinstance(index, slice):  # numpy would lay the copy out in rows
-            z, x_next = np.ascontiguousarray(z), np.ascontiguousarray(x_next)
-        weights = self.weights if self.weights.ndim == 1 else self.weights[index]
-        s, base = (None if rows is None else rows[:, index] for rows in (self.s_columns, self.base_columns))
-        return Problem(z, x_next, self.dt[index], self.source[index], self.k[index], weights, self.columns, s, base)
+        return replace(super().subset(index), source=self.source[index], k=self.k[index])
 
     def without(self, index: NDArray[np.intp]) -> Problem:
         """The same problem without some transitions."""
@@ -369,7 +335,7 @@ class DiskPartition:
                     raise FitError(f"{self.path.parent}: the cache is cut short; delete the folder and fit again")
                 table = data.reshape(lines, size)
                 s = table[self.p : first] if self.q else None
-                yield Block(start, table[: self.p], table[first:-1], table[-1], self.weights, s)
+                yield Block(table[: self.p], table[first:-1], table[-1], self.weights, s, start=start)
                 start += size
 
 
@@ -419,15 +385,13 @@ def solve_as_written(
             options = {"eps_abs": 1e-9, "eps_rel": 1e-9, "max_iter": 200_000, "polishing": True} | options
         _run(programme, solver, options)
         values = np.array([programme.value * scale])
-    elif criterion == "lp":
+    else:
         root = np.sqrt(problem.row_weights())
         delta = cp.Variable(n, nonneg=True)
         limited = [cp.multiply(root[:, i], width[:, i]) <= delta[i] for i in range(n)]
         programme = cp.Problem(cp.Minimize(cp.sum(delta)), contained + limited)  # rows do not meet
         _run(programme, solver or cp.HIGHS, options)
         values = np.asarray(delta.value) * unit_y
-    else:
-        raise ValueError(f"criterion {criterion!r} is not written out")
     nominal = np.asarray(theta.value) / unit_phi[:, None] * unit_y
     return nominal, np.maximum(np.asarray(d.value), 0.0) / unit_psi[:, None] * unit_y, values
 

@@ -241,7 +241,7 @@ def values_of(problem: Problem, row: int) -> Array:
 
     Returns (N,): normalised.
     """
-    return row_of(problem.z_columns, problem.s_columns, row)
+    return row_of(problem.z, problem.s, row)
 
 
 def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tuple[int, float]:
@@ -251,8 +251,8 @@ def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tupl
     """
     regimes = Regimes(Schedule((Axis("s", knots=tuple(knots)),)), (row,))
     columns = replace(problem.columns, regimes=regimes)
-    phi = columns.phi(problem.z_columns, problem.s_columns) * problem.dt
-    step = problem.next_columns - problem.z_columns[: problem.n]
+    phi = columns.phi(problem.z, problem.s) * problem.dt
+    step = problem.x_next - problem.z[: problem.n]
     gram = phi @ phi.T
     main = regimes.schedule.main_block(values_of(problem, row)[None])
     visits = each * np.bincount(main, minlength=len(knots))

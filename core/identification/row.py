@@ -401,8 +401,6 @@ class Row:
     def drop(self, index: int) -> None:
         """Take a transition out of what the row holds."""
         keep = self.samples.index != index
-        if keep.all():
-            return
         position = np.cumsum(keep) - 1
         self.pool = position[self.pool[keep[self.pool]]]
         self.samples = self.samples[keep]

@@ -23,12 +23,11 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.assembly import assemble, is_constant, median_step
 from uncertain_lti.identification.diagnosis import of_sums
-from uncertain_lti.identification.fitting import common_signals, contradiction_in, distance_in_words, fit_fleet
+from uncertain_lti.identification.fitting import common_signals, distance_in_words, fit_fleet
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.memory import Boxes, Memory, Recording, remembered
 from uncertain_lti.identification.passes import Envelope, Judged, Moments, Samples, moments
 from uncertain_lti.identification.problem import Problem
-from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.domain import Domain, Occupancy
 from uncertain_lti.model.horizon import Residuals
@@ -136,20 +135,20 @@ def updated(
         boxes = fleet.boxes_after(of, np.asarray(of.fit_summary["max_width"]))
         return remembered(of, _joined([here, new]), every, fleet.sums, nearest, memory.rest, boxes)
 
-    try:
-        found = fit_fleet(
-            fleet,
-            model.signals,
-            facts["criterion"],
-            structure=structure,
-            progress=progress,
-            dt_median=sampling.dt_median if facts["transitions"] >= new.N else median_step(new.dt),
-            transients=runs,
-            remember=remember,
-        )
-    except InfeasibleError as error:
-        number = int(np.concatenate([here.source, new.source])[error.index])
-        raise contradiction_in(error, f"a step of {every[number].name}", model.signals) from None
+    def where(index: int) -> str:
+        return f"a step of {every[int(np.append(here.source, new.source)[index])].name}"
+
+    found = fit_fleet(
+        fleet,
+        model.signals,
+        facts["criterion"],
+        structure=structure,
+        progress=progress,
+        dt_median=sampling.dt_median if facts["transitions"] >= new.N else median_step(new.dt),
+        transients=runs,
+        remember=remember,
+        where=where,
+    )
     same = ("additive", "weights", "count", "structure", "group", "alarm")
     gap = facts["optimality_gap"]
     of_them += distance_in_words(np.inf if gap is None else gap)
@@ -190,7 +189,7 @@ def _as_fitted(model: UncertainLTI, transients: Iterable[Transient]) -> list[Tra
 
 def _joined(problems: Sequence[Problem]) -> Problem:
     """Transitions one after the other."""
-    names = ("z_columns", "next_columns", "dt", "source", "k")
+    names = ("z", "x_next", "dt", "source", "k")
     each: dict[str, Any] = {name: np.concatenate([getattr(p, name) for p in problems], axis=-1) for name in names}
     return replace(problems[0], **each)
 

@@ -122,7 +122,6 @@ class Alarm:
         self._windows = [part for part in self._parts if isinstance(part, Window)]
         over = [(part, row) for part, row in zip(self._parts, self._rows, strict=True) if isinstance(part, Statistic)]
         self._statistics = Statistics([part for part, _ in over], [row * model.n for _, row in over])
-        self._only = self._windows[0] if len(self._parts) == len(self._windows) == 1 else None
 
     def _part(self, rule: Rule, row: int) -> Window | Statistic:
         """What a rule makes of verdicts; a row of the table begins at its number times n."""
@@ -145,9 +144,6 @@ class Alarm:
 
     def push(self, dt: float, violated: bool, table: Any = None) -> bool:
         """Take one verdict."""
-        if self._only is not None:
-            self.alarm = self._only.push(violated, table)
-            return self.alarm
         alarm = bool(self.names) and bool(self._statistics.push(dt, table))
         for window in self._windows:
             alarm = window.push(violated, table) or alarm

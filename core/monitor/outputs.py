@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.verdict import place
-from uncertain_lti.recordings.mcap_writer import INDEX_ENTRY, MESSAGE_HEAD
+from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD
 
 VECTOR_TYPE, FLAG_TYPE, TEXT_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool", "std_msgs/msg/String"
 NODE = "/envelope_monitor"
@@ -374,7 +374,6 @@ class VerdictRecords:
             entries = np.column_stack([log_time[published], starts[published] + begin]).astype("<u8")
             if len(entries):
                 index[self._channels[kind]] = entries.tobytes()
-            assert INDEX_ENTRY.size == 8 * entries.shape[1]
         if judged.all():
             return rows.tobytes(), index
         kept = np.arange(self.size) < lengths[:, None]

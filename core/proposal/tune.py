@@ -166,7 +166,7 @@ def memory_candidates(transients: Sequence[Transient], additive: Additive = "noi
     found = autocorrelation(problem)
     follow = [i for i in range(problem.n) if found is not None and found.follows(i) and i not in remembered]
     rate = "rate" if first.step is None else "diff"
-    changes = np.count_nonzero(np.diff(problem.z, axis=0), axis=0)
+    changes = np.count_nonzero(np.diff(problem.z.T, axis=0), axis=0)
     seldom = (changes >= FEWEST_STEPS) & (changes <= MOST_STEPS * problem.N)
     events = [j for j in range(problem.n, problem.p) if seldom[j] and j not in remembered]
     names = [*first.state_names, *first.control_names]

@@ -234,8 +234,7 @@ def detectable(
         if progress is not None:
             progress(CountedStep("faults of each kind", number + 1, ROUNDS + 2))
         going = [s for s in searches if number == 0 or s.reached.any()]
-        recalled = model.signals.recalled
-        faults = [faulty(every, s.kind, s.i, s.signs * s.sizes(number), every.noise, recalled, model) for s in going]
+        faults = [faulty(every, s.kind, s.i, s.signs * s.sizes(number), every.noise, model) for s in going]
         for search, delay in zip(going, every.delays(faults), strict=True):
             search.learn(delay, number)
     found |= {(s.kind, s.name): s.seen(model, every.unit, confidence) for s in searches}

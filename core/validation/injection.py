@@ -21,7 +21,7 @@ stays as recorded, and no controller reacts to the fault.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,36 +80,29 @@ class Windows:
     onset: int
 
 
-def faulty(
-    windows: Windows,
-    kind: str,
-    i: int,
-    size: Array,
-    noise: Array,
-    recalled: Sequence[Recalled],
-    model: UncertainLTI | None,
-) -> tuple[Array, Array]:
+def faulty(windows: Windows, kind: str, i: int, size: Array, noise: Array, model: UncertainLTI) -> tuple[Array, Array]:
     """States and controls of many recordings at once, each with a fault of its own size.
 
     `size` (W,): size of the fault in each; `noise` (W, L): standard normal numbers; `model`: how the machine moves, for
-    faults that change that; Returns (W, L, n): states, recorded units; Returns (W, L, m): controls, recorded units:
-    those of `windows`, but for the memories of states.
+    faults that change that, and what its controls recall of its states; Returns (W, L, n): states, recorded units;
+    Returns (W, L, m): controls, recorded units: those of `windows`, but for the memories of states.
     """
     if KINDS[kind].of == "sensor":
         x = windows.x.copy()
         x[:, windows.onset :, i] = _reading(windows, kind, windows.x[:, :, i], size, noise)
     else:
-        assert model is not None
-        x = _response(windows, kind, i, size, recalled, model)
-    n = x.shape[2]
-    of_states = [r for r in recalled if r.of < n <= r.position < n + windows.u.shape[2]]
-    if not of_states:
-        return x, windows.u
+        x = _response(windows, kind, i, size, model)
+    n = model.n
     u, moved, dt = windows.u.copy(), np.nan_to_num(x - windows.x), np.diff(windows.t, axis=1)
-    for r in of_states:
+    for r in _of_states(model):
         for k in range(windows.onset, x.shape[1]):
             u[:, k, r.position - n] += _recall(r, moved[:, :, r.of], k, dt)
     return x, u
+
+
+def _of_states(model: UncertainLTI) -> list[Recalled]:
+    """Controls that are made of earlier values of states."""
+    return [r for r in model.signals.recalled if r.of < model.n <= r.position < model.n + model.m]
 
 
 def _recall(recalled: Recalled, moved: Array, k: int, dt: Array) -> Array:
@@ -146,18 +139,15 @@ def _reading(windows: Windows, kind: str, true: Array, size: Array, noise: Array
     return late
 
 
-def _response(
-    windows: Windows, kind: str, i: int, size: Array, recalled: Sequence[Recalled], model: UncertainLTI
-) -> Array:
+def _response(windows: Windows, kind: str, i: int, size: Array, model: UncertainLTI) -> Array:
     """States (W, L, n) of machines whose actuator or dynamics fail."""
     point = model.operating_point
     x, u, s = point.normalise_x(windows.x), point.normalise_u(windows.u), point.normalise_s(windows.s)
     done = windows.u.copy()
-    n, m, dt = model.n, model.m, np.diff(windows.t, axis=1)
-    of_states = [r for r in recalled if r.of < n <= r.position < n + m]
+    n, m, dt, of_states = model.n, model.m, np.diff(windows.t, axis=1), _of_states(model)
     if KINDS[kind].of == "actuator":
         done[:, windows.onset :, i] = _reading(windows, kind, windows.u[:, :, i], size, np.empty((0, 0)))
-        for r in recalled:
+        for r in model.signals.recalled:
             if r.of == n + i and n <= r.position < n + m:
                 moved = done[:, :, i] - windows.u[:, :, i]
                 for k in range(windows.onset, done.shape[1]):

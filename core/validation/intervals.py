@@ -127,9 +127,7 @@ def scenario_interval(support: int, transients: int, confidence: float) -> tuple
     if k == N:
         root = brentq(excess, -60.0, 10.0) if excess(-60.0) < 0 < excess(10.0) else 0.0
         return max(0.0, 1.0 - math.exp(root)), 1.0
-    centre = math.log(max(1.0 - k / N, 1e-12))  # the stretch of log t where the excess is negative holds 1 - k/N
-    if excess(centre) >= 0:
-        centre = min(np.linspace(-30.0 / (N - k), 3.0, 4001).tolist(), key=excess)
+    centre = math.log(1.0 - k / N)  # the stretch of log t where the excess is negative holds 1 - k/N
     below, above = centre - 1.0, centre + 1.0
     while excess(below) < 0:
         below -= 5.0
