@@ -17,6 +17,7 @@ import re
 import reprlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from itertools import chain
 from typing import Any, Literal, TextIO, TypeVar, get_args
 
 from uncertain_lti.base.errors import SignalError
@@ -83,26 +84,17 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
     return data
 
 
-def _repeated_key(top: Any) -> Any:
+def _repeated_key(node: Any) -> Any:
     """The first key node that is twice in its mapping, of which YAML readers keep the last; None without any."""
-    waiting, seen = [top], set()
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen or not isinstance(getattr(node, "value", None), list):
-            continue  # an alias, or a scalar
-        seen.add(id(node))
-        keys = set()
-        for entry in node.value:
-            if not isinstance(entry, tuple):
-                waiting.append(entry)
-                continue
-            key, value = entry
-            waiting += [key, value]
-            if isinstance(key.value, str):
-                if key.value in keys:
-                    return key
-                keys.add(key.value)
-    return None
+    if not isinstance(getattr(node, "value", None), list):
+        return None  # a scalar, or an empty file
+    pairs = node.value if node.id == "mapping" else []
+    keys = [key.value for key, _ in pairs]
+    for i, (key, _) in enumerate(pairs):
+        if key.value in keys[:i]:
+            return key
+    inside = chain.from_iterable(pairs) if pairs else node.value
+    return next(filter(None, map(_repeated_key, inside)), None)
 
 
 def checked_mapping(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
