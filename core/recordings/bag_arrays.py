@@ -15,7 +15,7 @@ import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -30,7 +30,6 @@ from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan, header_stamp_ns
 from uncertain_lti.recordings.message_types import Definition, RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress
-from uncertain_lti.recordings.unreadable import changed, os_error
 from uncertain_lti.signals.field_path import FieldPath
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
@@ -186,7 +185,10 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
     missing = {channel: contents.tally[channel].count for channel in channels if channel in contents.tally}
     groups = list(_groups([block for block in contents.blocks if not block.channels.isdisjoint(missing)]))
     for group in groups:
-        data, ends = _load(contents, group, channels)
+        data, ends = bytearray(), []
+        for block in group:
+            data += _records(contents, block) if contents.indexed else contents.records(block, channels)
+            ends.append(len(data))
         batch = _messages(data, ends, wanted, contents)
         counts = np.bincount(batch.channel, minlength=1 << 16)
         for channel in missing:
@@ -210,31 +212,14 @@ def _groups(blocks: Sequence[Block]) -> Iterator[list[Block]]:
         yield group
 
 
-def _load(contents: Contents, blocks: Sequence[Block], channels: Collection[int]) -> tuple[bytearray, list[int]]:
-    """Read and decompress blocks, and check those that nobody has read before."""
-    data, ends = bytearray(), []
-    try:
-        with open(contents.path, "rb", buffering=0) as stream:
-            for block in blocks:
-                whole = not contents.converted
-                data += _records(contents, block, stream) if whole else contents.records(block, channels)
-                ends.append(len(data))
-    except OSError as error:
-        raise os_error(contents.path, error) from None
-    return data, ends
-
-
-def _records(contents: Contents, block: Block, stream: BinaryIO) -> bytes | memoryview:
-    stream.seek(block.offset - block.unchecked)
-    packed = memoryview(stream.read(block.unchecked + block.size))
+def _records(contents: Contents, block: Block) -> bytes | memoryview:
+    """Records of a block that nobody has read before, compared with what the index states."""
+    packed = contents.packed(block)
     records, trouble = inflate(block.compression, packed[block.unchecked :], block.length)
-    if contents.indexed:
-        whole = not trouble and len(records) == block.length
-        if not whole or not _as_stated(contents, block, packed[: block.unchecked], records):
-            raise IndexMismatchError
-    elif len(records) < block.length:
-        raise changed(contents.path)
-    return records[: block.length]
+    whole = not trouble and len(records) == block.length
+    if not whole or not _as_stated(contents, block, packed[: block.unchecked], records):
+        raise IndexMismatchError
+    return records
 
 
 def _as_stated(contents: Contents, block: Block, head: memoryview, records: bytes | memoryview) -> bool:
