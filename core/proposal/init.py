@@ -356,10 +356,8 @@ def _leave_out_places(source: Source) -> None:
         left = list(places.values())
     elif len(velocities) < 2 and len(source.free) > len(headed):  # more than a pose is measured
         turning = {m["of"] for c, m in headed.items() if not m["place"] and np.ptp(c.finite) > 1.0}  # rad
-        reason, left = (
-            "a place of a body that turns",
-            [c for c, m in headed.items() if m["place"] and m["of"] in turning],
-        )
+        reason = "a place of a body that turns"
+        left = [c for c, m in headed.items() if m["place"] and m["of"] in turning]
     for candidate in left:
         candidate.reason, candidate.ready = reason, "state"
 

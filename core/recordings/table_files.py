@@ -384,7 +384,7 @@ def _read_arrow(path: Path) -> RawTable:
         import pyarrow.feather  # type: ignore[import-not-found, import-untyped, unused-ignore]
         import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
     except ImportError:
-        raise BagError(_wants(path, "pyarrow")) from None
+        raise BagError(f"{path}: it cannot be read: {absent('pyarrow')}") from None
     try:
         if path.suffix.lower() == ".parquet":
             rows = pa.parquet.read_metadata(path)
@@ -461,7 +461,7 @@ def _read_mat(path: Path) -> RawTable:
     try:
         from scipy.io import loadmat
     except ImportError:
-        raise BagError(_wants(path, "scipy")) from None
+        raise BagError(f"{path}: it cannot be read: {absent('scipy')}") from None
     try:
         variables = loadmat(path, simplify_cells=True, verify_compressed_data_integrity=True)
     except MemoryError:
@@ -568,10 +568,6 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, lis
 def _by_reason(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """A sentence for each reason why variables are left out."""
     return [f"{shortlist([repr(name) for name in names], 4)} left out, {why}" for why, names in notes.items()]
-
-
-def _wants(path: Path, package: str) -> str:
-    return f"{path}: it cannot be read: {absent(package)}"
 
 
 _READERS: Mapping[str, Callable[[Path], Any]] = {
