@@ -15,6 +15,7 @@ import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -191,15 +192,10 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
 
 
 def _groups(blocks: Sequence[Block]) -> Iterator[list[Block]]:
-    group, size = list[Block](), 0
-    for block in blocks:
-        if group and size + block.length > _BATCH:
-            yield group
-            group, size = [], 0
-        group.append(block)
-        size += block.length
-    if group:
-        yield group
+    """Blocks in file order, about `_BATCH` bytes of records together."""
+    numbers = np.cumsum([block.length for block in blocks]) // _BATCH
+    for _, group in itertools.groupby(zip(blocks, numbers.tolist(), strict=True), key=itemgetter(1)):
+        yield [block for block, _ in group]
 
 
 def _records(contents: Contents, block: Block) -> bytes | memoryview:
