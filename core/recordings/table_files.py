@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, absent
-from uncertain_lti.base.text import plural, shortlist
+from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"
@@ -277,19 +277,6 @@ def left_out(odd: int, what: str, first: str) -> str:
 def _unique(names: Iterable[str]) -> list[str]:
     """Names of columns as they are called, each once."""
     return once([" ".join(n.replace("\ufffd", "").split()) or f"column {i}" for i, n in enumerate(names, start=1)], " ")
-
-
-def once(names: Iterable[str], between: str) -> list[str]:
-    """Names of which none is there twice; the second gets a number."""
-    found: dict[str, None] = {}
-    repeats: dict[str, int] = {}
-    for name in names:
-        chosen = name
-        while chosen in found:
-            repeats[name] = repeats.get(name, 1) + 1
-            chosen = f"{name}{between}{repeats[name]}"
-        found[chosen] = None
-    return list(found)
 
 
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:
