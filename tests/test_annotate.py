@@ -11,6 +11,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -310,8 +311,9 @@ def test_the_command_writes_and_says_so(engine, tmp_path, cli):
     said = cli.json("check", model_file, *both, "--write", tmp_path / "all", *rule)["recordings"]
     assert [Path(r["written"]["file"]).name for r in said] == ["bad_annotated.mcap", "run_annotated.mcap"]
     (bag,) = group_recordings([bad])
-    names = [path.name for path in targets(tmp_path / "new", [bag, bag])]
-    assert names == ["bad_annotated.mcap", "bad_2_annotated.mcap"], "of recordings of one name in two folders"
+    (second,) = group_recordings([shutil.copy(bad, tmp_path / "bad_2.mcap")])
+    names = [path.name for path in targets(tmp_path / "new", [bag, second, bag])]  # the last as of another folder
+    assert names == ["bad_annotated.mcap", "bad_2_annotated.mcap", "bad_3_annotated.mcap"]
     found = by_rosbags(tmp_path / "all" / "bad_annotated.mcap")
     assert not any(m.data for _, m in found["violation"]) and len(found["violation"]) == 300
     with open(tmp_path / "all" / "bad_annotated.mcap", "rb") as stream:

@@ -775,7 +775,8 @@ def test_what_is_looked_for_at_once_leaves_out_nothing(seed, missing):
     found, pairs = functions(X), list(permutations(range(X.shape[1]), 2))
     assert found.any() and [bool(found[i, j]) for i, j in pairs] == [follows(X[:, i], X[:, j]) for i, j in pairs]
     X[rng.random(X.shape) < 0.1 * missing] = rng.choice([np.nan, np.inf])
-    pool = [Candidate("/table", f"c{j}", [column[:50], column[50:]]) for j, column in enumerate(X.T)]
+    table = Source("/table", "table", "state", False, None)
+    pool = [Candidate(table, f"c{j}", [column[:50], column[50:]]) for j, column in enumerate(X.T)]
     pairs = [(a, b) for a, b in combinations(pool, 2) if _moves_with(b, a)]
     assert {(id(a), id(b)) for a, b in pairs} <= _may_move_with(pool)
 
@@ -951,22 +952,22 @@ def test_every_signals_file_that_is_written_can_be_read(tmp_path, monkeypatch, m
     rng, t = np.random.default_rng(0), 10**18 + 20 * MS * np.arange(200)
     for path, delay, ignore, recalled in product(("a[{}]", "unwrap(a[{}])"), (0, 3), ((), (-1e-7, 1e9)), (0, 1)):
 
-        def moving(topic, form, path=path, ignore=ignore, **more):
+        def moving(topic, role, form, ignore=ignore, **more):
+            source = Source(topic, FLOAT64, role, False, None, [t], [0 * t - 1])
             paths = [form.replace("{}", member) for member in members]
-            return [Candidate(topic, p, [1e-9 * rng.normal(size=200)], ignore=ignore, **more) for p in paths]
+            noise = [[1e-9 * rng.normal(size=200)] for _ in paths]
+            source.candidates = [Candidate(source, *of, ignore=ignore, **more) for of in zip(paths, noise, strict=True)]
+            return source
 
-        states, controls = moving("/x", path), moving("/u", "a[{}]", delay=delay)
-        sources = [
-            Source(c[0].topic, FLOAT64, role, False, None, [t], [0 * t - 1], c)
-            for c, role in ((states, "state"), (controls, "control"))
-        ]
+        sources = [moving("/x", "state", path), moving("/u", "control", "a[{}]", delay=delay)]
+        states, controls = (source.candidates for source in sources)
         one = [states[0]], [controls[0]]
         name_signals(*one)
-        set_operating_point(*one, sources)
+        set_operating_point(*one)
         remembered = (Remembered(one[recalled][0].name, Memory(kind)),) if kind else ()
         monkeypatch.setattr(init, "choose_memories", lambda *_, found=remembered: (found, 0.5))
         alike = init._members(*one, {(c.topic, c.path): c for c in [*states, *controls]})
-        text = signals_file([SimpleNamespace(path=tmp_path)], sources, *one, "", init._memories(*one, sources), alike)
+        text = signals_file([SimpleNamespace(path=tmp_path)], sources, *one, "", init._memories(*one), alike)
         signals = SignalMap.from_dict(yaml.safe_load(text))
         assert len(signals.states) == max(1, len(alike)), text
 
@@ -1034,9 +1035,10 @@ def test_a_thousand_transitions_of_each_carry_more_signals_than_eight(tmp_path, 
 
 def test_of_a_long_recording_stretches_from_everywhere_are_looked_at():
     t, values = np.arange(120_000), np.arange(120_000.0)
-    x, u = (Candidate(topic, "data", [values]) for topic in ("/x", "/u"))
-    of = {c.topic: Source(c.topic, "t", "", False, None, [t], [0 * t - 1], [c]) for c in (x, u)}
-    steps = steps_of([x], of, [u], [3])
+    x, u = (
+        Candidate(Source(topic, "t", "", False, None, [t], [0 * t - 1]), "data", [values]) for topic in ("/x", "/u")
+    )
+    steps = steps_of([x], [u], [3])
     at = steps.X[:, 0]
     assert 35_000 < len(at) < 50_000 and at[0] < 1_000 and at[-1] > 118_000
     assert (steps.U[:, 0] == at - 3).all() and (steps.dX == 1).all() and np.median(np.diff(at)) == 1
@@ -1062,11 +1064,11 @@ def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):
     commands = np.repeat(rng.normal(size=(200, 2)), 20, axis=0)
     roll, pitch = answers(rng, commands).T * [[1.0], [0.5]] + rng.normal(size=(2, 4000)) * [[1e-4], [4e-3]]
     driven_by = {"aileron_cmd": commands[:, 0], "elevator_cmd": commands[:, 1]}
-    pool = [Candidate("/pose", f"{name}(orientation)", [v]) for name, v in (("roll", roll), ("pitch", pitch))]
-    used = [Candidate("/cmd", name, [v]) for name, v in driven_by.items()]
     at = np.arange(4000, dtype=np.int64) * 10**7
-    body = Source("/pose", "geometry_msgs/msg/PoseStamped", "state", False, None, [at], [at], pool)
-    surfaces = Source("/cmd", "std_msgs/msg/Float64MultiArray", "control", False, None, [at], [at], used)
+    body = Source("/pose", "geometry_msgs/msg/PoseStamped", "state", False, None, [at], [at])
+    body.candidates = [Candidate(body, f"{n}(orientation)", [v]) for n, v in (("roll", roll), ("pitch", pitch))]
+    surfaces = Source("/cmd", "std_msgs/msg/Float64MultiArray", "control", False, None, [at], [at])
+    surfaces.candidates = [Candidate(surfaces, name, [v]) for name, v in driven_by.items()]
     states, _ = choose([body], [surfaces])
     assert [c.path for c in states] == ["roll(orientation)", "pitch(orientation)"]
 

@@ -516,9 +516,9 @@ def test_aliases_and_old_numbers_of_yaml(tmp_path):
     bomb += "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 10))
     path.write_text(bomb)
     refuses(SignalError, r"at line 2: an alias \(\*name\); write out what it stands for", SignalMap.load, path)
-    from uncertain_lti.signals.values import compose, construct
+    from uncertain_lti.signals.values import read_yaml
 
-    read = construct(compose("{a: 010, b: 1:30, c: 1_000, d: 10, f: -0.5, g: 0x10, h: 0}"))
+    read = read_yaml("{a: 010, b: 1:30, c: 1_000, d: 10, f: -0.5, g: 0x10, h: 0}")
     assert read == {"a": "010", "b": "1:30", "c": "1_000", "d": 10, "f": -0.5, "g": 16, "h": 0}
 
 

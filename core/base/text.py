@@ -51,6 +51,19 @@ def shortlist(names: Sequence[str], limit: int) -> str:
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 
 
+def once(names: Iterable[str], between: str) -> list[str]:
+    """Names of which none is there twice; the second gets a number."""
+    found: dict[str, None] = {}
+    repeats: dict[str, int] = {}
+    for name in names:
+        chosen = name
+        while chosen in found:
+            repeats[name] = repeats.get(name, 1) + 1
+            chosen = f"{name}{between}{repeats[name]}"
+        found[chosen] = None
+    return list(found)
+
+
 def meant(word: object, known: Iterable[str], most: int = 3) -> str:
     """(is X meant?), with the known names that are near to a word, or nothing."""
     names = {name.lower(): name for name in sorted(known)}

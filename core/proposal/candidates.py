@@ -42,7 +42,7 @@ WRAPPING = "|".join(name for name, function in FUNCTIONS.items() if function.wra
 class Candidate:
     """One number of a topic that could be a signal.
 
-    `topic`: its topic; `path`: of the number in the message, as `FieldPath` reads it; `values` (messages,): one array
+    `source`: its topic; `path`: of the number in the message, as `FieldPath` reads it; `values` (messages,): one array
     per recording; NaN where there is none; `name`: of the signal, once it is chosen; `unit`: of the signal; empty where
     it is unknown; `reason`: why it is not proposed; empty if it is, or if there is no reason against it; `ready`:
     `state` or `control` for one that a person may well want back; empty for others; `steady`: steady state, recorded
@@ -51,7 +51,7 @@ class Candidate:
     that is judged as well.
     """
 
-    topic: str
+    source: Source = field(repr=False)
     path: str
     values: list[Array] = field(default_factory=list, repr=False)
     name: str = ""
@@ -64,6 +64,11 @@ class Candidate:
     ignore: tuple[float, ...] = ()
     why: str = ""
     judged: bool = False
+
+    @property
+    def topic(self) -> str:
+        """Name of its topic."""
+        return self.source.topic
 
     @property
     def element(self) -> str:
@@ -146,6 +151,8 @@ class Source:
         """Some of its numbers, which leave it for a topic of their own."""
         found = replace(self, candidates=[c for c in self.candidates if c in some], role=role, reason="")
         self.candidates = [c for c in self.candidates if c not in some]
+        for candidate in found.candidates:
+            candidate.source = found
         return found
 
     @property
@@ -242,21 +249,24 @@ def left(Z: Array, *of: Array) -> tuple[Array, ...]:
 ENOUGH, _STRETCH = 50_000, 500  # samples that tell what shows in what, in stretches of a long recording
 
 
-def steps_of(
-    state: Sequence[Candidate], of: dict[str, Source], controls: Sequence[Candidate], lags: Sequence[int] = ()
-) -> Steps:
+def clock_of(states: Sequence[Candidate]) -> Source:
+    """The slowest of the topics of the states."""
+    return min((c.source for c in states), key=lambda source: (source.rate, source.topic))
+
+
+def steps_of(states: Sequence[Candidate], controls: Sequence[Candidate], lags: Sequence[int] = ()) -> Steps:
     """Samples on the messages of the slowest of the states' topics; of the others, the latest message before."""
     lags = lags or [0] * len(controls)
     longest = max(lags, default=0)
-    clock = min((c.topic for c in state), key=lambda topic: of[topic].rate)
-    share = 1 + of[clock].count // ENOUGH
-    found = [tuple(np.empty((0, len(columns))) for columns in (state, controls, state))]
-    for number, every in enumerate(of[clock].arrival):
+    clock = clock_of(states)
+    share = 1 + clock.count // ENOUGH
+    found = [tuple(np.empty((0, len(columns))) for columns in (states, controls, states))]
+    for number, every in enumerate(clock.arrival):
         rows = np.arange(len(every))
         rows = rows[in_stretches(rows, share, _STRETCH)]
         arrival = every[rows]
-        columns = [held(c, of[c.topic], number, of[clock], rows=rows) for c in [*state, *controls]]
-        x, u = np.hsplit(np.column_stack(columns), [len(state)])
+        columns = [held(c, number, clock, rows=rows) for c in [*states, *controls]]
+        x, u = np.hsplit(np.column_stack(columns), [len(states)])
         step = np.diff(arrival)
         if len(step) < 2 + longest:
             continue
@@ -299,17 +309,13 @@ def earlier(values: Array, samples: int) -> Array:
 
 
 def held(
-    candidate: Candidate,
-    source: Source,
-    number: int,
-    clock: Source,
-    oldest: float | None = None,
-    rows: Any = slice(None),
+    candidate: Candidate, number: int, clock: Source, oldest: float | None = None, rows: Any = slice(None)
 ) -> Array:
     """Latest value at each message of the clock, or at some of them, its `rows`.
 
     Returns (messages,): naN before the first value, and where it is too old.
     """
+    source = candidate.source
     if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
         return np.full(len(clock.arrival[number][rows]), np.nan)
     mine, at = source.instants(clock, number)
@@ -323,13 +329,12 @@ def held(
 
 def explained(state: Source, controls: Sequence[Source]) -> float:
     """How clearly some topics show in the next step of the best of a topic's numbers."""
-    every = {s.topic: s for s in [state, *controls]}
-    return most_shown(state.free, every, [c for s in controls for c in s.free])
+    return most_shown(state.free, [c for s in controls for c in s.free])
 
 
-def most_shown(states: Sequence[Candidate], every: dict[str, Source], controls: Sequence[Candidate]) -> float:
+def most_shown(states: Sequence[Candidate], controls: Sequence[Candidate]) -> float:
     """How clearly some numbers show in the next step of the best of others."""
-    steps = steps_of(states, every, controls)
+    steps = steps_of(states, controls)
     return float(np.max(steps.effects()[0], initial=0.0)) if len(steps.X) >= FEWEST else 0.0
 
 
@@ -562,7 +567,7 @@ def _held_columns(table: Source) -> Source | None:
     told = {c for c in table.free for named in (_STATE, _APART, _TOLD) if named.search(c.path.lower())}
     held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows) and c not in told]
     rest = [c for c in table.free if c not in held]
-    shows = held and rest and most_shown(rest, {table.topic: table}, held) > SHOWS
+    shows = held and rest and most_shown(rest, held) > SHOWS
     return table.parted(held, "guess") if shows else None
 
 

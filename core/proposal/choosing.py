@@ -89,15 +89,13 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
 _BURSTS = 5  # times the range of nearly all samples that of all is, from which on rare bursts hide the level of noise
 
 
-def drop_noise(
-    pool: list[Candidate], every: dict[str, Source], used: Sequence[Candidate]
-) -> tuple[list[Candidate], str]:
+def drop_noise(pool: list[Candidate], used: Sequence[Candidate]) -> tuple[list[Candidate], str]:
     """Drop candidates that are noise from sample to sample, unless all are.
 
     What the controls show in stays where another of its family does: all axes of a body turn by the same law.
     """
     late = [*used] * (SHORT_DELAY + 1)
-    steps = steps_of(pool, every, late, [lag for lag in range(SHORT_DELAY + 1) for _ in used])
+    steps = steps_of(pool, late, [lag for lag in range(SHORT_DELAY + 1) for _ in used])
     if len(steps.X) < max(FEWEST, 2 * (len(pool) + len(late))):
         return pool, ""
     share = predicted(steps.X, steps.U, steps.X + steps.dX)
@@ -106,7 +104,7 @@ def drop_noise(
             "nothing here is more than noise from one sample to the next: record the machine at work before you "
             "fit a model"
         )
-    shown = steps_of(pool, every, used).effects()[0] > SHOWS
+    shown = steps_of(pool, used).effects()[0] > SHOWS
     families = {c.family for c, known in zip(pool, share, strict=True) if known >= NOISE}
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
@@ -244,7 +242,6 @@ class _Room:
 
 def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
     """States of the model, and a sentence where they look like none; reasons go to what is left out."""
-    every = {s.topic: s for s in [*states, *controls]}
     for source in states:
         prefer_rates(source)
     shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
@@ -263,25 +260,25 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
-    pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], every, like)
+    pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], like)
     used = drop_copies(used)
-    before = drop_functions(steps_of(pool, every, used), pool)
-    pool, doubt = drop_noise(before, every, used)
+    before = drop_functions(steps_of(pool, used), pool)
+    pool, doubt = drop_noise(before, used)
     noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TYPE]  # measured, in a table
-    N = len(steps_of(pool, every, used).X)
+    N = len(steps_of(pool, used).X)
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(_driven(pool, every, used, 0), used, _Room(N, room // 2, "controls"))
-    steps = steps_of(pool, every, used)
-    states_room, driven = _Room(N, room - len(used), "states"), _driven(pool, every, used)
+    used = _strongest(_driven(pool, used, 0), used, _Room(N, room // 2, "controls"))
+    steps = steps_of(pool, used)
+    states_room, driven = _Room(N, room - len(used), "states"), _driven(pool, used)
     if N < FEWEST:
         keep = pool[:MOST]
     elif all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool):  # place and attitude of a body
         keep = _steered(pool, states_room, driven)
     else:
         keep = _coupled(steps, pool, states_room, driven.max(axis=0, initial=0.0))
-    drop_idle_controls(steps_of(keep, every, used), used, _driven(keep, every, used, 0)[1:].max(axis=1, initial=0.0))
+    drop_idle_controls(steps_of(keep, used), used, _driven(keep, used, 0)[1:].max(axis=1, initial=0.0))
     used = [c for c in used if not c.reason]
-    _delay(keep, every, used)
+    _delay(keep, used)
     levels = [c for c in noise if np.ptp(c.finite) <= _BURSTS * np.ptp(np.percentile(c.finite, (1, 99)))]
     for candidate in levels[: max(0, states_room.most - len(keep))]:
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
@@ -289,9 +286,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     return keep, doubt
 
 
-def _driven(
-    pool: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate], latest: int = LONGEST_DELAY
-) -> Array:
+def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
     """How clearly all controls, and each, show in the next step of each candidate, at the delay at which they do most.
 
     It may be none: a servo carries a command out before the next message, which is the first to hold it.
@@ -306,8 +301,8 @@ def _driven(
         return np.maximum(found, steps.effects())
 
     for lag in range(latest + 1):
-        found = most(steps_of(pool, every, used, [lag] * m))
-    steps = steps_of(pool, every, [*used, *used], [0] * m + [-1] * m)
+        found = most(steps_of(pool, used, [lag] * m))
+    steps = steps_of(pool, [*used, *used], [0] * m + [-1] * m)
     if not m or len(steps.X) < FEWEST:
         return found
     U, V = np.hsplit(steps.U / size_of(steps.U), 2)
@@ -315,9 +310,7 @@ def _driven(
     return np.where(servo, most(Steps(steps.X, V, steps.dX)), found)
 
 
-def _one_element(
-    pool: list[Candidate], used: list[Candidate], every: dict[str, Source], like: str
-) -> tuple[list[Candidate], list[Candidate]]:
+def _one_element(pool: list[Candidate], used: list[Candidate], like: str) -> tuple[list[Candidate], list[Candidate]]:
     """Where state and command name the same joints, those of the joint whose command shows most."""
     shared = [e for e in dict.fromkeys(c.element for c in used) if e and any(s.element == e for s in pool)]
     if len(shared) < 2:
@@ -325,7 +318,7 @@ def _one_element(
 
     def effect(element: str) -> float:
         mine, its = ([c for c in group if c.element == element] for group in (pool, used))
-        return most_shown(mine, every, its)
+        return most_shown(mine, its)
 
     best = like if like in shared else max(shared, key=effect)
     for candidate in [*pool, *used]:
@@ -406,14 +399,14 @@ def _first(pool: list[Candidate], room: _Room) -> list[Candidate]:
     return pool[: room.most]
 
 
-def _delay(states: Sequence[Candidate], every: dict[str, Source], used: Sequence[Candidate]) -> None:
+def _delay(states: Sequence[Candidate], used: Sequence[Candidate]) -> None:
     """Samples by which each control must be taken earlier to explain clearly more of the next step: as the fit says."""
     if not used or not states:
         return
     for _ in range(2 * len(used)):
         late = [*used] * (LONGEST_DELAY + 1)
         by = [c.delay + lag for lag in range(LONGEST_DELAY + 1) for c in used]
-        steps = steps_of(states, every, late, by)
+        steps = steps_of(states, late, by)
         N = len(steps.X)
         if N < PER_UNKNOWN * (len(states) + len(used)):
             return
@@ -476,7 +469,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for candidate in alike if len(controls) + len(alike) < len(free) else ():  # they go together, unless none is left
         candidate.why = f"one of the {stem[candidate]}, of which the others are controls"
         controls.append(candidate)
-    controls += _set_or_analysed([c for c in free if c not in controls], {s.topic: s for s in sources})
+    controls += _set_or_analysed([c for c in free if c not in controls])
     known = [c for c in controls if not c.judged]
     for candidate in free:
         if candidate not in controls and not candidate.reason and (share := _told(candidate, known)) >= TOLD:
@@ -539,7 +532,7 @@ def _held_for(candidate: Candidate) -> int:
     return rows if rows > 1 and counts[rows] >= HELD * len(gaps) else 0
 
 
-def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> list[Candidate]:
+def _set_or_analysed(measured: Sequence[Candidate]) -> list[Candidate]:
     """Of columns that hold each value for some rows those that are set; the others, which an analyser holds, go.
 
     A set value shows in the next rows of what is measured, of which none tells before what it will be. Columns that
@@ -549,9 +542,9 @@ def _set_or_analysed(measured: Sequence[Candidate], of: dict[str, Source]) -> li
     rest, found = [c for c in measured if c not in held and np.ptp(c.finite) > 0], []
     for rows in dict.fromkeys(held.values()) if rest else ():
         group = [c for c in held if held[c] == rows]
-        leads = steps_of(rest, of, group).effects()[1:].max(axis=1, initial=0.0) > SHOWS
+        leads = steps_of(rest, group).effects()[1:].max(axis=1, initial=0.0) > SHOWS
         for j, candidate in enumerate(group):
-            before = steps_of([candidate], of, rest)
+            before = steps_of([candidate], rest)
             set_at = before.dX[:, 0] != 0
             leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effects()[0, 0] <= SHOWS
         found += group if 2 * leads.sum() > len(group) else []

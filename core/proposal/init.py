@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import BagError, SignalError, TransientError, absent
+from uncertain_lti.base.errors import BagError, TransientError, absent
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.proposal.candidates import (
     FEWEST,
@@ -37,6 +37,7 @@ from uncertain_lti.proposal.candidates import (
     assign_roles,
     at_rest,
     bare,
+    clock_of,
     earlier,
     is_label,
     role_by_name,
@@ -46,7 +47,6 @@ from uncertain_lti.proposal.candidates import (
 )
 from uncertain_lti.proposal.choosing import choose, is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
-    clock_of,
     columns_of,
     endless,
     entry,
@@ -130,7 +130,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
         elif any(b.topics[topic].type != fact.info.type for b in bags):
             source.reason = "of different types in these recordings"
         else:
-            source.candidates = _candidates(topic, fact.fields)
+            source.candidates = _candidates(source, fact.fields)
             if not source.candidates:
                 source.reason = "no number in it"
     _limit(bags, sources)
@@ -203,9 +203,10 @@ def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Sou
     reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if any(everywhere.values()) else _APART
     sources = []
     for role, fields in by_role.items():
-        candidates = [] if reason else _candidates(topic, [f for f in fields if everywhere[f]])
-        candidates += [Candidate(topic, f, reason=_APART) for f in fields if not everywhere[f] and not reason]
-        sources.append(Source(topic, TYPE, role, False, None, candidates=candidates, reason=reason))
+        sources.append(source := Source(topic, TYPE, role, False, None, reason=reason))
+        if not reason:
+            source.candidates = _candidates(source, [f for f in fields if everywhere[f]])
+            source.candidates += [Candidate(source, f, reason=_APART) for f in fields if not everywhere[f]]
     return sources
 
 
@@ -220,18 +221,18 @@ def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
                 candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
 
 
-def _candidates(topic: str, fields: Sequence[str]) -> list[Candidate]:
+def _candidates(source: Source, fields: Sequence[str]) -> list[Candidate]:
     """Paths as they would stand in a file; arrays entry by entry, long ones once with the reason."""
     found: list[Candidate] = []
     for path in (path for path in fields if "variance" not in path):
         size = math.prod(int(b) - int(a) + 1 for a, b in _SPREAD.findall(path))
         if size > LONGEST_ARRAY:
-            found.append(Candidate(topic, path, reason=f"an array of {size} numbers"))
+            found.append(Candidate(source, path, reason=f"an array of {size} numbers"))
             continue
         *inner, last = _SPREAD.split(path)  # text, first, last, text, ...
         starts, firsts, lasts = inner[::3], map(int, inner[1::3]), map(int, inner[2::3])
         entries = [[f"{text}[{i}]" for i in range(a, b + 1)] for text, a, b in zip(starts, firsts, lasts, strict=True)]
-        found += [Candidate(topic, "".join(parts) + last) for parts in product(*entries)]
+        found += [Candidate(source, "".join(parts) + last) for parts in product(*entries)]
     return found
 
 
@@ -240,20 +241,13 @@ def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) 
     for source in sources:
         readable = [c for c in source.candidates if not c.reason]
         paths = [FieldPath(c.path) for c in readable]
-        try:
-            columns = bag.columns([source.topic], [paths], progress)
-            arrival, stamp, values = columns.arrival, columns.stamp, columns.values[0]
-            stamps = columns.stamp[columns.stamp >= 0]
-            if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(arrival) - 1):
-                source.halting = True
-        except SignalError:
-            read = [(t, [path.read(message) for path in paths]) for _, t, message in bag.messages([source.topic])]
-            arrival = np.array([t for t, _ in read], dtype=np.int64)
-            values = np.array([row for _, row in read], dtype=np.float64).reshape(len(read), len(paths))
-            stamp = np.full(len(arrival), -1, dtype=np.int64)
-        source.arrival.append(arrival)
-        source.stamp.append(stamp)
-        for column, candidate in zip(values.T, readable, strict=True):
+        columns = bag.columns([source.topic], [paths], progress)
+        stamps = columns.stamp[columns.stamp >= 0]
+        if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(columns.arrival) - 1):
+            source.halting = True
+        source.arrival.append(columns.arrival)
+        source.stamp.append(columns.stamp)
+        for column, candidate in zip(columns.values[0].T, readable, strict=True):
             candidate.values.append(column)
 
 
@@ -362,10 +356,8 @@ def _leave_out_places(source: Source) -> None:
         left = list(places.values())
     elif len(velocities) < 2 and len(source.free) > len(headed):  # more than a pose is measured
         turning = {m["of"] for c, m in headed.items() if not m["place"] and np.ptp(c.finite) > 1.0}  # rad
-        reason, left = (
-            "a place of a body that turns",
-            [c for c, m in headed.items() if m["place"] and m["of"] in turning],
-        )
+        reason = "a place of a body that turns"
+        left = [c for c, m in headed.items() if m["place"] and m["of"] in turning]
     for candidate in left:
         candidate.reason, candidate.ready = reason, "state"
 
@@ -529,7 +521,7 @@ def propose(
     further = ([c for c in ready if c.ready == kind] for kind in ("state", "control"))
     name_signals(*([*some, *more] for some, more in zip((chosen, used), further, strict=True)))
     levels = [c for c in chosen if c.why]  # mostly noise, which is never still
-    set_operating_point([c for c in chosen if c not in levels] or chosen, used, sources)
+    set_operating_point([c for c in chosen if c not in levels] or chosen, used)
     for candidate in [*ready, *levels]:
         set_own_scale(candidate)
     warnings += [doubt] * bool(doubt)
@@ -543,7 +535,7 @@ def propose(
             warnings.append(f"{without}, so it is no control; leave those recordings out")
     members = _members(chosen, used, moving)
     try:
-        memories = _memories(chosen, used, sources)
+        memories = _memories(chosen, used)
     except ModuleNotFoundError as error:  # all but this needs no solver
         memories = []
         warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
@@ -568,11 +560,11 @@ def _members(
     return found if len(found) > 1 else {}
 
 
-def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[str]:
+def _memories(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[str]:
     """Lines of what narrows the envelope of the proposed states on left-out data, and of how fast wheels turned."""
-    group, clock = [*states, *controls], clock_of(states, sources)
+    group, clock = [*states, *controls], clock_of(states)
     names, n, transients = [c.name for c in group], len(states), []
-    for number, z in enumerate(columns_of(states, controls, sources)):
+    for number, z in enumerate(columns_of(states, controls)):
         if len(z) < FEWEST:
             continue
         z = np.column_stack([earlier(column, c.delay) for column, c in zip(z.T, group, strict=True)])
@@ -582,7 +574,7 @@ def _memories(states: Sequence[Candidate], controls: Sequence[Candidate], source
             transients.append(Transient(t, z[:, :n], z[:, n:], state_names=names[:n], control_names=names[n:]))
     if not transients:
         return []
-    on = endless(states, controls, sources)
+    on = endless(states, controls)
     if chosen := tuple(Remembered(c.name, Memory("rate")) for c in on if of_wheel(c)):
         gain = "how fast it turned"
     else:

@@ -23,7 +23,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, held, steps_of
+from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, clock_of, held, steps_of
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.sampling.clock import coarse_ns, longest_pause
@@ -127,25 +127,17 @@ def _called(candidate: Candidate) -> str:
     return candidate.topic.rpartition("/")[2] if angle == "data" else angle
 
 
-def clock_of(states: Sequence[Candidate], sources: Sequence[Source]) -> Source:
-    """The slowest of the topics of the states."""
-    topics = {c.topic for c in states}
-    return min((s for s in sources if s.topic in topics), key=lambda s: s.rate)
-
-
-def columns_of(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[Array]:
+def columns_of(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[Array]:
     """Of each recording the values (messages of the clock, signals) of states and controls, as old as they may be."""
-    every, clock = {s.topic: s for s in sources}, clock_of(states, sources)
-    limits = [None] * len(states) + [longest_hold(every[c.topic], clock)[0] for c in controls]
-    each = [(c, every[c.topic], limit) for c, limit in zip([*states, *controls], limits, strict=True)]
-    numbers = range(len(clock.arrival))
-    return [np.column_stack([held(c, source, k, clock, limit) for c, source, limit in each]) for k in numbers]
+    clock = clock_of(states)
+    oldest = [(c, None) for c in states] + [(c, longest_hold(c.source, clock)[0]) for c in controls]
+    return [np.column_stack([held(c, k, clock, age) for c, age in oldest]) for k in range(len(clock.arrival))]
 
 
-def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> None:
+def set_operating_point(states: Sequence[Candidate], controls: Sequence[Candidate]) -> None:
     """Steady states and scales by the rule for `auto`; the range where the magnitude is small compared with it."""
     group = [*states, *controls]
-    recordings = [r for r in columns_of(states, controls, sources) if len(r)]
+    recordings = [r for r in columns_of(states, controls) if len(r)]
     signals = [Signal(c.name, c.topic, c.path, "auto", "auto") for c in group]
     steady, scale, _ = resolve_auto(signals, recordings)
     pooled = np.concatenate(recordings)
@@ -203,9 +195,8 @@ def signals_file(
     layout: TableLayout = _OPEN, plant: bool = False,
 ) -> str:  # fmt: skip
     """Write the text of the file."""
-    every = {s.topic: s for s in sources}
-    topics = list(dict.fromkeys(c.topic for c in [*states, *controls]))
-    clock, around = clock_of(states, sources), endless(states, controls, sources)
+    topics = {c.topic: c.source for c in [*states, *controls]}
+    clock, around = clock_of(states), endless(states, controls)
     lines = [
         "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
         *_recordings(bags),
@@ -214,8 +205,8 @@ def signals_file(
         "",
         *([] if plant else [_ADDITIVE, f"additive: {'both' if any(map(of_wheel, around)) else 'noise'}", ""]),
     ]
-    offsets = [every[t].offset or 0.0 for t in topics]  # log time where there is no stamp
-    by_arrival = any(every[t].halting for t in topics) or max(offsets) - min(offsets) > 1.0
+    offsets = [source.offset or 0.0 for source in topics.values()]  # log time where there is no stamp
+    by_arrival = any(source.halting for source in topics.values()) or max(offsets) - min(offsets) > 1.0
     instants = clock.arrival if by_arrival else [clock.instants(clock, k)[0] for k in range(len(clock.arrival))]
     by_them = replace(clock, arrival=instants)
     lines += [
@@ -250,12 +241,12 @@ def signals_file(
     lines += [entry(c, comment=c.reason, out=True) for c in ready if c.ready == "state"]
     if controls:
         lines += ["", "controls:"]
-        if any(every[c.topic].role == "guess" for c in controls):
+        if any(c.source.role == "guess" for c in controls):
             lines.append("  # by correlation alone: nothing is called a command here")
         if any(c.delay for c in controls):
             lines.append("  # delay: number of samples by which the states follow later")
         for candidate in [*controls, *(c for c in ready if c.ready == "control")]:
-            limit, why = (None, candidate.why) if plant else longest_hold(every[candidate.topic], clock)
+            limit, why = (None, candidate.why) if plant else longest_hold(candidate.source, clock)
             lines.append(entry(candidate, limit, candidate.reason or why, out=bool(candidate.ready)))
     else:
         lines += ["", "# No command can be used. Without controls the envelope must cover what they do."]
@@ -276,24 +267,24 @@ def _recordings(bags: Sequence[Recording]) -> list[str]:
     names = [bag.path.name for bag in bags]
     if len(set(names)) < len(names):  # files of one name in several folders
         names = [str(bag.path) for bag in bags]
-    return (
-        [f"#   {name}" for name in names] if len(names) <= _LISTED else [f"#   {names[0]} to {names[-1]}: {len(names)}"]
-    )
+    if len(names) > _LISTED:
+        return [f"#   {names[0]} to {names[-1]}: {len(names)}"]
+    return [f"#   {name}" for name in names]
 
 
 _LISTED = 40
 
 
-def endless(states: Sequence[Candidate], controls: Sequence[Candidate], sources: Sequence[Source]) -> list[Candidate]:
+def endless(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[Candidate]:
     """States on which nothing depends, as they go on from turn to turn, or where the next drive goes."""
-    every, holds = {s.topic: s for s in sources}, any(map(_goes_round, controls))
+    holds = any(map(_goes_round, controls))
     steered = holds or any(_COURSE.search(_called(c)) for c in controls)
 
     def is_free(state: Candidate) -> bool:
         if of_wheel(state):
-            return not _is_pulled(state, controls, every)
+            return not _is_pulled(state, controls)
         heads = of_compass(state) and FieldPath(state.path).unwrap
-        goes_on = heads and not steered and not _is_pulled(state, controls, every)
+        goes_on = heads and not steered and not _is_pulled(state, controls)
         return bool(goes_on or (_goes_round(state) and not holds))
 
     return [c for c in states if is_free(c)]
@@ -303,12 +294,12 @@ TELLS = 0.02
 """Share of what else is not known of a change that a count, or a heading, tells, from which on it matters."""
 
 
-def _is_pulled(state: Candidate, controls: Sequence[Candidate], every: dict[str, Source]) -> bool:
+def _is_pulled(state: Candidate, controls: Sequence[Candidate]) -> bool:
     """Whether a count changes by what it is, given how fast it changed: that of a pendulum, or of a servo.
 
     Or a heading by what it is and what is commanded.
     """
-    steps = steps_of([state], every, [state, *controls], [1] + [c.delay for c in controls])
+    steps = steps_of([state], [state, *controls], [1] + [c.delay for c in controls])
     rate, of = steps.X - steps.U[:, :1], np.hstack([steps.X, steps.U[:, 1:]])
     shown = Steps(rate, of, steps.dX).effects()[1:, 0] > max(SHOWS, TELLS * len(rate))
     return bool(shown[0] and (of_wheel(state) or shown[1:].any()))

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, TransientError, UncertainLTIError
@@ -398,26 +397,11 @@ def _row(words: str, size: float, base: float, model: UncertainLTI) -> dict[str,
     }
 
 
-def recall(values: Array, memory: Memory, dt: Array, opens: NDArray[np.bool_]) -> Array:
-    """What each sample takes from the samples up to it, as the `Sampler` has it.
-
-    `values` (N,): of the field itself; `dt` (N,): step that leads to each sample, s; that of the first of a segment
-    does not count; `opens` (N,): the first sample of each segment; Returns (N,): naN where the segment has too few
-    samples before.
-    """
-    place = np.arange(len(values))
-    begin = np.maximum.accumulate(np.where(opens, place, 0)) if len(values) else place
-    source = place - memory.samples
-    past = np.where(source >= begin, values[np.maximum(source, 0)], math.nan)
-    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-        return np.asarray(memory.taken(values, past, dt))
-
-
 def with_memories(transient: Transient, memories: Sequence[Remembered]) -> Transient:
     """The same run with further controls that follow from earlier samples of its states and controls."""
     places = {name: j for j, name in enumerate([*transient.state_names, *transient.control_names])}
     z, signals = np.hstack([transient.x, transient.u]), transient.signals
-    u = np.column_stack([transient.u, *(_column(transient, z[:, places[one.of]], one.memory) for one in memories)])
+    u = np.column_stack([transient.u, *(recall(transient, z[:, places[one.of]], one.memory) for one in memories)])
     if signals is None:
         return transient.replace(u=u, control_names=(*transient.control_names, *(one.name for one in memories)))
     added = [memory_of(signals[places[one.of]], one.memory, one.name) for one in memories]
@@ -430,7 +414,7 @@ def with_delays(transient: Transient, delays: Mapping[str, int]) -> Transient:
     u, signals = transient.u.copy(), transient.signals
     for j, name in enumerate(transient.control_names):
         if name in delays:
-            u[:, j] = _column(transient, u[:, j], Memory("lag", delays[name]))
+            u[:, j] = recall(transient, u[:, j], Memory("lag", delays[name]))
     if signals is not None:
         controls = [replace(s, delay=s.delay + delays[s.name]) if s.name in delays else s for s in signals.controls]
         signals = replace(signals, controls=tuple(controls))
@@ -450,6 +434,16 @@ def memory_of(signal: Signal, memory: Memory, name: str) -> Signal:
     )
 
 
-def _column(transient: Transient, values: Array, memory: Memory) -> Array:
+def recall(transient: Transient, values: Array, memory: Memory) -> Array:
+    """What each sample takes from the samples up to it, as the `Sampler` has it.
+
+    `values` (N+1,): of the field itself; Returns (N+1,): NaN where the segment has too few samples before.
+    """
+    place = np.arange(len(values))
     opens = np.diff(transient.segment, prepend=-1) != 0
-    return recall(values, memory, np.concatenate([[math.nan], transient.dt])[: len(values)], opens)
+    source = place - memory.samples
+    there = source >= np.maximum.accumulate(np.where(opens, place, 0))
+    past = np.where(there, values[np.maximum(source, 0)], math.nan)
+    dt = np.concatenate([[math.nan], transient.dt])[: len(values)]  # of the step that leads to each
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        return np.asarray(memory.taken(values, past, dt))

@@ -242,13 +242,12 @@ class Bag(Recording):
         Blocks are read in order of their smallest log time; what is earlier than every block still to be read
         is final.
         """
-        blocks: list[tuple[int, int, int, Block]] = [
+        blocks: list[tuple[int, int, int, Block]] = sorted(
             (block.start, part, number, block)
             for part, (contents, wanted) in enumerate(parts)
             for number, block in enumerate(contents.blocks)
             if not block.channels.isdisjoint(wanted)
-        ]
-        blocks.sort(key=lambda entry: entry[:3])
+        )
         pending: list[tuple[int, int, int, int, RawMessage]] = []  # a heap; no two have the same place
         held = 0
         for position, (_, part, number, block) in enumerate(blocks):
@@ -309,15 +308,11 @@ def group_bags(paths: Sequence[Path], indexed: bool = False) -> list[Bag]:
 
     In doubt files stay apart: that loses the one transition at a seam, while joining two runs would invent one.
     """
-    order: list[tuple[Path, str]] = []
-    files: dict[tuple[Path, str], list[Path]] = {}
+    groups: dict[tuple[Path, str], list[Path]] = {}
     for path in paths:
         pair = None if path.is_dir() else stem_and_index(path)
-        group = (path.parent, f"{pair[0]}_*.mcap" if pair else path.name)
-        if group not in files or path.is_dir():
-            order.append(group)
-        files.setdefault(group, []).append(path)
-    return [bag for group in order for bag in _group(files[group], indexed)]
+        groups.setdefault((path.parent, f"{pair[0]}_*.mcap" if pair else path.name), []).append(path)
+    return [bag for group in groups.values() for bag in _group(group, indexed)]
 
 
 def _group(paths: list[Path], indexed: bool) -> list[Bag]:

@@ -15,7 +15,8 @@ import itertools
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, BinaryIO
+from operator import itemgetter
+from typing import Any
 
 import numpy as np
 from mcap.opcode import Opcode
@@ -30,7 +31,6 @@ from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan, header_stamp_ns
 from uncertain_lti.recordings.message_types import Definition, RecordedChannel
 from uncertain_lti.recordings.recording import Columns, Progress
-from uncertain_lti.recordings.unreadable import changed, os_error
 from uncertain_lti.signals.field_path import FieldPath
 
 _BATCH = 1 << 22  # bytes; small blocks are put together until they reach this
@@ -91,12 +91,8 @@ class ColumnReader:
         self.total = sum(counts.values())
         self.readers: dict[tuple[int, Definition], FieldReader] = {}
         self.undecoded: dict[str, tuple[int, str]] = {}
-        self.filled = 0
-        self.filled_of = [0] * len(counts)
-        self.topic = np.empty(self.total, dtype=np.int64)
-        self.arrival = np.empty(self.total, dtype=np.int64)
-        self.stamp = np.empty(self.total, dtype=np.int64)
-        self.values = [np.empty((n, len(p)), dtype=np.float64) for n, p in zip(counts.values(), paths, strict=True)]
+        self.messages: list[tuple[NDArray[Any], ...]] = [(np.empty(0),) * 3]  # topics, log times, stamps of batches
+        self.values = [[np.empty((0, len(of)))] for of in paths]
 
     def run(self, progress: Progress | None) -> Columns:
         """Read all; raises `IndexMismatchError`."""
@@ -136,20 +132,14 @@ class ColumnReader:
                         number, least = self.undecoded.get(self.topics[where], (0, why))
                         self.undecoded[self.topics[where]] = number + 1, min(least, why)
                 values[mine], stamp[at] = read, stamps
-            begin = self.filled_of[where]
-            if begin + len(rows) > len(self.values[where]):
-                raise IndexMismatchError  # more than it states
-            self.filled_of[where] = end = begin + int(kept[rows].sum())
-            self.values[where][begin:end] = values[kept[rows]]
-        log_time = batch.log_time[kept]
-        to = slice(self.filled, self.filled + len(log_time))
-        self.topic[to], self.arrival[to], self.stamp[to] = topic[kept], log_time, stamp[kept]
-        self.filled += len(log_time)
+            self.values[where].append(values[kept[rows]])
+        self.messages.append((topic[kept], batch.log_time[kept], stamp[kept]))
 
     def _in_order(self) -> Columns:
         """Stable sort by log time: messages are in file order so far."""
-        topic, arrival, stamp = self.topic[: self.filled], self.arrival[: self.filled], self.stamp[: self.filled]
-        values = [v[:n] for v, n in zip(self.values, self.filled_of, strict=True)]
+        columns = zip(*self.messages, strict=True)
+        topic, arrival, stamp = (np.concatenate(of, dtype=np.int64, casting="unsafe") for of in columns)
+        values = [np.concatenate(self.values.pop(0)) for _ in self.topics]
         alone = sum(reader.alone for reader in self.readers.values())
         if (arrival[1:] >= arrival[:-1]).all():
             return Columns(topic, arrival, stamp, values, alone)
@@ -186,55 +176,36 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
     missing = {channel: contents.tally[channel].count for channel in channels if channel in contents.tally}
     groups = list(_groups([block for block in contents.blocks if not block.channels.isdisjoint(missing)]))
     for group in groups:
-        data, ends = _load(contents, group, channels)
+        data, ends = bytearray(), []
+        for block in group:
+            data += _records(contents, block) if contents.indexed else contents.records(block, channels)
+            ends.append(len(data))
         batch = _messages(data, ends, wanted, contents)
         counts = np.bincount(batch.channel, minlength=1 << 16)
         for channel in missing:
             missing[channel] -= int(counts[channel])
-        if contents.indexed and min(missing.values()) < 0:
+        if min(missing.values()) < 0:
             raise IndexMismatchError
         yield batch
-    if contents.indexed and any(missing.values()):
+    if any(missing.values()):
         raise IndexMismatchError
 
 
 def _groups(blocks: Sequence[Block]) -> Iterator[list[Block]]:
-    group, size = list[Block](), 0
-    for block in blocks:
-        if group and size + block.length > _BATCH:
-            yield group
-            group, size = [], 0
-        group.append(block)
-        size += block.length
-    if group:
-        yield group
+    """Blocks in file order, about `_BATCH` bytes of records together."""
+    numbers = np.cumsum([block.length for block in blocks]) // _BATCH
+    for _, group in itertools.groupby(zip(blocks, numbers.tolist(), strict=True), key=itemgetter(1)):
+        yield [block for block, _ in group]
 
 
-def _load(contents: Contents, blocks: Sequence[Block], channels: Collection[int]) -> tuple[bytearray, list[int]]:
-    """Read and decompress blocks, and check those that nobody has read before."""
-    data, ends = bytearray(), []
-    try:
-        with open(contents.path, "rb", buffering=0) as stream:
-            for block in blocks:
-                whole = not contents.converted
-                data += _records(contents, block, stream) if whole else contents.records(block, channels)
-                ends.append(len(data))
-    except OSError as error:
-        raise os_error(contents.path, error) from None
-    return data, ends
-
-
-def _records(contents: Contents, block: Block, stream: BinaryIO) -> bytes | memoryview:
-    stream.seek(block.offset - block.unchecked)
-    packed = memoryview(stream.read(block.unchecked + block.size))
+def _records(contents: Contents, block: Block) -> bytes | memoryview:
+    """Records of a block that nobody has read before, compared with what the index states."""
+    packed = contents.packed(block)
     records, trouble = inflate(block.compression, packed[block.unchecked :], block.length)
-    if contents.indexed:
-        whole = not trouble and len(records) == block.length
-        if not whole or not _as_stated(contents, block, packed[: block.unchecked], records):
-            raise IndexMismatchError
-    elif len(records) < block.length:
-        raise changed(contents.path)
-    return records[: block.length]
+    whole = not trouble and len(records) == block.length
+    if not whole or not _as_stated(contents, block, packed[: block.unchecked], records):
+        raise IndexMismatchError
+    return records
 
 
 def _as_stated(contents: Contents, block: Block, head: memoryview, records: bytes | memoryview) -> bool:

@@ -48,7 +48,7 @@ from uncertain_lti.recordings.mcap_records import (
     parse,
 )
 from uncertain_lti.recordings.mcap_scan import outline, scan
-from uncertain_lti.recordings.message_types import Definition, define, distribution_text, ros2_text
+from uncertain_lti.recordings.message_types import define, distribution_text, ros2_text
 from uncertain_lti.recordings.unreadable import (
     SUFFIXES,
     aside,
@@ -60,7 +60,7 @@ from uncertain_lti.recordings.unreadable import (
     os_error,
 )
 from uncertain_lti.signals.field_path import full_name
-from uncertain_lti.signals.values import compose, construct
+from uncertain_lti.signals.values import read_yaml
 
 _DATABASE = b"SQLite format 3\0"
 _BAG = b"#ROSBAG V2.0\n"
@@ -95,7 +95,8 @@ class Foreign(Contents):
         """Messages of one block as MCAP has them."""
         convert: dict[int, Callable[[bytes], bytes]] = {}
         if self.magic == _BAG:
-            convert = {number: self._definition(number).from_ros1 for number in block.channels}
+            schemas = {number: self.schemas[self.channels[number].schema_id] for number in block.channels}
+            convert = {number: define(s.name, s.encoding, s.data).from_ros1 for number, s in schemas.items()}
         asked = block.channels if channels is None else channels
         pieces: list[bytes] = []
         try:
@@ -111,10 +112,6 @@ class Foreign(Contents):
         if block is self.blocks[-1]:
             _indexed.cache_clear()  # of millions of messages it is a GB
         return b"".join(pieces)
-
-    def _definition(self, number: int) -> Definition:
-        schema = self.schemas[self.channels[number].schema_id]
-        return define(schema.name, schema.encoding, schema.data)
 
 
 def scan_foreign(path: Path) -> Foreign | None:
@@ -304,7 +301,7 @@ def _about(folder: Path) -> dict[str, Any]:
 
     try:
         text = (folder / "metadata.yaml").read_text(encoding="utf-8")
-        about = construct(compose(text))["rosbag2_bagfile_information"]
+        about = read_yaml(text)["rosbag2_bagfile_information"]
     except (OSError, ValueError, yaml.YAMLError, KeyError, TypeError, RecursionError):
         return {}
     return about if isinstance(about, dict) else {}

@@ -115,16 +115,18 @@ class Contents:
         """Messages that can be read."""
         return sum(entry.count for entry in self.tally.values())
 
-    def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
-        """Records of one block that `scan` found, not compressed."""
-        assert not block.unchecked
+    def packed(self, block: Block) -> memoryview:
+        """One block as it stands in the file, with what precedes it and is unchecked."""
         try:
             with open(self.path, "rb", buffering=0) as stream:
-                stream.seek(block.offset)
-                stored = stream.read(block.size)
+                stream.seek(block.offset - block.unchecked)
+                return memoryview(stream.read(block.unchecked + block.size))
         except OSError as error:
             raise os_error(self.path, error) from None
-        records, _ = inflate(block.compression, memoryview(stored), block.length)
+
+    def records(self, block: Block, channels: Collection[int] | None = None) -> bytes:
+        """Records of one block that `scan` found, not compressed."""
+        records, _ = inflate(block.compression, self.packed(block), block.length)
         if len(records) < block.length:
             raise changed(self.path)
         return bytes(records[: block.length])

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, absent
-from uncertain_lti.base.text import plural, shortlist
+from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
 _DELIMITERS = ",;\t|"
@@ -286,19 +286,6 @@ def _unique(names: Iterable[str]) -> list[str]:
     return once([" ".join(n.replace("\ufffd", "").split()) or f"column {i}" for i, n in enumerate(names, start=1)], " ")
 
 
-def once(names: Iterable[str], between: str) -> list[str]:
-    """Names of which none is there twice; the second gets a number."""
-    found: dict[str, None] = {}
-    repeats: dict[str, int] = {}
-    for name in names:
-        chosen = name
-        while chosen in found:
-            repeats[name] = repeats.get(name, 1) + 1
-            chosen = f"{name}{between}{repeats[name]}"
-        found[chosen] = None
-    return list(found)
-
-
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     """Find the delimiter with which most lines have as many values as each other, and the first line of data."""
     if all(re.fullmatch(r'\s*("[^"]*[,;\t][^"]*"\s*)?', line) for line in lines) and any(map(str.strip, lines)):
@@ -394,7 +381,7 @@ def _read_arrow(path: Path) -> RawTable:
         import pyarrow.feather  # type: ignore[import-not-found, import-untyped, unused-ignore]
         import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
     except ImportError:
-        raise BagError(_wants(path, "pyarrow")) from None
+        raise BagError(f"{path}: it cannot be read: {absent('pyarrow')}") from None
     try:
         if path.suffix.lower() == ".parquet":
             rows = pa.parquet.read_metadata(path)
@@ -471,7 +458,7 @@ def _read_mat(path: Path) -> RawTable:
     try:
         from scipy.io import loadmat
     except ImportError:
-        raise BagError(_wants(path, "scipy")) from None
+        raise BagError(f"{path}: it cannot be read: {absent('scipy')}") from None
     try:
         variables = loadmat(path, simplify_cells=True, verify_compressed_data_integrity=True)
     except MemoryError:
@@ -578,10 +565,6 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, lis
 def _by_reason(notes: Mapping[str, Sequence[str]]) -> list[str]:
     """A sentence for each reason why variables are left out."""
     return [f"{shortlist([repr(name) for name in names], 4)} left out, {why}" for why, names in notes.items()]
-
-
-def _wants(path: Path, package: str) -> str:
-    return f"{path}: it cannot be read: {absent(package)}"
 
 
 _READERS: Mapping[str, Callable[[Path], Any]] = {

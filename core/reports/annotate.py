@@ -32,6 +32,7 @@ from uncertain_lti import __version__
 from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import TABLES, sha256, try_to_write, written
+from uncertain_lti.base.text import once
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, REASON, RECORDED, VerdictRecords, names_of, text_message
@@ -87,13 +88,9 @@ def targets(output: str | os.PathLike[str], bags: Sequence[Recording]) -> list[P
     elif not path.is_dir() and (path.exists() or path.suffix.lower() in (*SUFFIXES, *TABLES)):
         raise BagError(f"{path}: is neither a folder nor called *.mcap; choose another name")
     else:
-        chosen, taken = [], Counter[str]()
-        for bag in bags:
-            whole = bag.path.resolve()
-            stem = whole.stem if bag.path.suffix in SUFFIXES else whole.name
-            taken[stem] += 1
-            chosen.append(path / (f"{stem}_{taken[stem]}" if taken[stem] > 1 else stem))
-        chosen = [path.with_name(f"{path.name}_annotated.mcap") for path in chosen]
+        whole = [bag.path.resolve() for bag in bags]
+        stems = [p.stem if bag.path.suffix in SUFFIXES else p.name for p, bag in zip(whole, bags, strict=True)]
+        chosen = [path / f"{stem}_annotated.mcap" for stem in once(stems, "_")]
     parts = [part for bag in bags for part in bag.parts]
     folders = [bag.path.resolve() for bag in bags if bag.path.is_dir()]
     for target in chosen:

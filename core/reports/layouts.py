@@ -27,7 +27,7 @@ from uncertain_lti.base.files import target
 from uncertain_lti.base.text import named
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.outputs import NODE, OUTPUTS, Output
-from uncertain_lti.reports.pages import asset, write_page
+from uncertain_lti.reports.pages import asset, visible, write_page
 from uncertain_lti.signals.signal_map import Signal
 
 BOUND, RECORDED, VIOLATED, CONTAINED, UNKNOWN = "#56B4E9", "#E69F00", "#D55E00", "#009E73", "#999999"
@@ -117,7 +117,7 @@ def plotjuggler_layout(states: Sequence[Signal], base: str = NODE) -> str:
             tabs.append((f"{name}{numbers}", drawn))
         tabs[-1][1].append(("alarm", [(f"{base}/{_ALARM.name}/data", VIOLATED)]))
     made = Environment(trim_blocks=True, keep_trailing_newline=True)
-    made.filters["attribute"] = _attribute
+    made.filters["attribute"] = lambda text: quoteattr(visible(text))
     return made.from_string(asset("plotjuggler.xml")).render(tabs=tabs)
 
 
@@ -150,8 +150,3 @@ def _stack(panels: Sequence[Any]) -> Any:
     if len(panels) == 1:
         return panels[0]
     return _split("column", panels[0], _stack(panels[1:]), round(100 / len(panels), 3))
-
-
-def _attribute(text: str) -> str:
-    """Text of a file as a value in XML, which has no control characters."""
-    return quoteattr("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text))

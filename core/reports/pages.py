@@ -98,7 +98,7 @@ def packed_data(recordings: Sequence[Plotted], every: int = 0) -> str:
 @cache
 def environment() -> Environment:
     """Templates: what they are given is escaped, and control characters are replaced."""
-    made = Environment(autoescape=True, finalize=lambda v: v if isinstance(v, Markup) else _printable(v))
+    made = Environment(autoescape=True, finalize=lambda v: v if isinstance(v, Markup) else visible(v))
     made.filters["name"] = _name
     return made
 
@@ -108,14 +108,14 @@ def asset(name: str) -> str:
     return files("uncertain_lti.reports").joinpath("assets", name).read_text(encoding="utf-8")
 
 
-def _printable(value: object) -> str:
-    """A value of a file as text of the page."""
-    return "".join(c if c.isprintable() or c == " " else "\N{REPLACEMENT CHARACTER}" for c in str(value))
+def visible(value: object) -> str:
+    """A value of a file as text of a page or a layout, which have no control characters."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in str(value))
 
 
 def _name(value: object) -> Markup:
     """A name: where a line must end inside it, it ends after a low line, a slash or a dash."""
-    return Markup("<wbr>").join(escape(_printable(part)) for part in re.split(r"(?<=[_/-])(?=[^_/-])", str(value)))
+    return Markup("<wbr>").join(escape(visible(part)) for part in re.split(r"(?<=[_/-])(?=[^_/-])", str(value)))
 
 
 # --- report ------------------------------------------------------------------------------------------------------
@@ -333,14 +333,14 @@ def _packed(recording: Plotted) -> dict[str, Any]:
             at = np.flatnonzero(columns.apart)  # what parts two lines is drawn with the second
             times.append(_text(np.insert(columns.t, at, columns.t[at]).astype("<f8")))
         return {
-            "title": _printable(drawn.title), "unit": _printable(drawn.unit), "time": axes[id(columns)],
-            "note": _printable(drawn.note), "rank": drawn.count, "levels": drawn.levels,
+            "title": visible(drawn.title), "unit": visible(drawn.unit), "time": axes[id(columns)],
+            "note": visible(drawn.note), "rank": drawn.count, "levels": drawn.levels,
             "word": next(s.role for s in drawn.series if s.role != "bounds"), "values": _series(columns, drawn),
         }  # fmt: skip
 
     return {
-        "name": _printable(recording.name), "note": _printable(recording.note),
-        "title": _printable(recording.title or recording.name),
+        "name": visible(recording.name), "note": visible(recording.note),
+        "title": visible(recording.title or recording.name),
         "top": [panel(p) for p in recording.top],
         "views": {view: [panel(p) for p in panels] for view, panels in recording.views}, "times": times,
         "alarms": recording.alarms, "silent": recording.silent,

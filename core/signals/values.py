@@ -27,8 +27,12 @@ T = TypeVar("T")
 _ODD = re.compile(r"[-+]?0[0-7_]+|.*[:_].*")  # octal, sexagesimal, with underscores
 
 
-def compose(text: str | TextIO) -> Any:
-    """Nodes of a text; aliases are refused, and `010` and `1:30`, 8 and 90 by YAML 1.1, stay the words they are."""
+class RepeatedKeyError(ValueError):
+    """A key is twice in one mapping, of which YAML readers keep the last."""
+
+
+def read_yaml(text: str | TextIO) -> Any:
+    """What a text stands for, without aliases; `010` and `1:30`, 8 and 90 by YAML 1.1, stay the words they are."""
     import yaml  # the live node reads signals from the model file and needs no YAML
 
     class Loader(yaml.SafeLoader):
@@ -41,14 +45,17 @@ def compose(text: str | TextIO) -> Any:
                 node.tag = "tag:yaml.org,2002:str"
             return node
 
-    return yaml.compose(text, Loader=Loader)
+        def compose_mapping_node(self, anchor: Any) -> Any:
+            node: Any = super().compose_mapping_node(anchor)
+            seen: set[str] = set()
+            for key, _ in node.value:
+                if str(key.value) in seen:
+                    again = f"again at line {key.start_mark.line + 1}"
+                    raise RepeatedKeyError(f"key '{key.value}' is twice in one mapping, {again}; keep one")
+                seen.add(str(key.value))
+            return node
 
-
-def construct(node: Any) -> Any:
-    """What nodes of `compose` stand for."""
-    import yaml
-
-    return yaml.SafeLoader("").construct_document(node) if node else None
+    return yaml.load(text, Loader=Loader)
 
 
 def load_yaml(path: str | os.PathLike[str]) -> Any:
@@ -61,11 +68,9 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
         raise SignalError(f"{path}: this is {kind}, and a signals file is wanted here; {remedy}")
     try:
         with open(path, encoding="utf-8") as stream:
-            node = compose(stream)
-        if repeated := _repeated_key(node):
-            line = repeated.start_mark.line + 1
-            raise SignalError(f"{path}: key '{repeated.value}' is twice in one mapping, again at line {line}; keep one")
-        data = construct(node)
+            data = read_yaml(stream)
+    except RepeatedKeyError as error:
+        raise SignalError(f"{path}: {error}") from None
     except FileNotFoundError:
         raise SignalError(f"{path}: there is no such signals file; check the path") from None
     except OSError as error:
@@ -81,28 +86,6 @@ def load_yaml(path: str | os.PathLike[str]) -> Any:
         remedy = "list the states and controls, or let `uncertain-lti init` propose them"
         raise SignalError(f"{path}: nothing is in it; {remedy}")
     return data
-
-
-def _repeated_key(top: Any) -> Any:
-    """The first key node that is twice in its mapping, of which YAML readers keep the last; None without any."""
-    waiting, seen = [top], set()
-    while waiting:
-        node = waiting.pop()
-        if id(node) in seen or not isinstance(getattr(node, "value", None), list):
-            continue  # an alias, or a scalar
-        seen.add(id(node))
-        keys = set()
-        for entry in node.value:
-            if not isinstance(entry, tuple):
-                waiting.append(entry)
-                continue
-            key, value = entry
-            waiting += [key, value]
-            if isinstance(key.value, str):
-                if key.value in keys:
-                    return key
-                keys.add(key.value)
-    return None
 
 
 def checked_mapping(data: Any, where: str, known: set[str] | None) -> dict[str, Any]:
