@@ -15,6 +15,7 @@ import math
 import struct
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import cython
@@ -34,7 +35,6 @@ NUMBERS = ("flags", "lower", "upper", "state", "utilisation")
 """Numbers of a verdict, for each state."""
 _OF_JUDGEMENT = {"lower": LOWER, "upper": UPPER, "flags": FLAGS, "utilisation": UTILISATION}
 _KINDS = 2 + UTILISATION  # of the state and of a judgement
-_NAN = struct.pack("<d", math.nan)
 
 
 def place(name: str, n: int) -> slice:
@@ -227,8 +227,8 @@ class Verdict:
             Little-endian doubles.
         """
         n = len(self._after)
-        state = struct.pack(f"<{n}d", *self._after)
-        numbers = _NAN * (n * (_KINDS - 1)) if self._judgement is None else self._judgement.packed()
+        state = _packer(n)(*self._after)
+        numbers = _nothing(n) if self._judgement is None else self._judgement.packed()
         return state + numbers if self._longer is None else state + numbers + bytes(self._longer.tobytes())
 
     def packed_statistics(self) -> bytes:
@@ -277,6 +277,16 @@ class Verdict:
         """The same for one step and for each of the model's horizons (H, n); NaN where a window is broken."""
         longer = () if self._longer is None else self._longer
         return np.concatenate([self.utilisation, longer]).reshape(-1, self.n)
+
+
+@cache
+def _packer(n: int) -> Callable[..., bytes]:
+    return struct.Struct(f"<{n}d").pack
+
+
+@cache
+def _nothing(n: int) -> bytes:
+    return struct.pack("<d", math.nan) * (n * (_KINDS - 1))
 
 
 class Foreseen:

@@ -91,8 +91,12 @@ class ColumnReader:
         self.total = sum(counts.values())
         self.readers: dict[tuple[int, Definition], FieldReader] = {}
         self.undecoded: dict[str, tuple[int, str]] = {}
-        self.messages: list[tuple[NDArray[Any], ...]] = [(np.empty(0),) * 3]  # topics, log times, stamps of batches
-        self.values = [[np.empty((0, len(of)))] for of in paths]
+        self.filled = 0
+        self.filled_of = [0] * len(counts)
+        self.topic = np.empty(self.total, dtype=np.int64)
+        self.arrival = np.empty(self.total, dtype=np.int64)
+        self.stamp = np.empty(self.total, dtype=np.int64)
+        self.values = [np.empty((n, len(p)), dtype=np.float64) for n, p in zip(counts.values(), paths, strict=True)]
 
     def run(self, progress: Progress | None) -> Columns:
         """Read all; raises `IndexMismatchError`."""
@@ -132,14 +136,20 @@ class ColumnReader:
                         number, least = self.undecoded.get(self.topics[where], (0, why))
                         self.undecoded[self.topics[where]] = number + 1, min(least, why)
                 values[mine], stamp[at] = read, stamps
-            self.values[where].append(values[kept[rows]])
-        self.messages.append((topic[kept], batch.log_time[kept], stamp[kept]))
+            begin = self.filled_of[where]
+            if begin + len(rows) > len(self.values[where]):
+                raise IndexMismatchError  # more than it states
+            self.filled_of[where] = end = begin + int(kept[rows].sum())
+            self.values[where][begin:end] = values[kept[rows]]
+        log_time = batch.log_time[kept]
+        to = slice(self.filled, self.filled + len(log_time))
+        self.topic[to], self.arrival[to], self.stamp[to] = topic[kept], log_time, stamp[kept]
+        self.filled += len(log_time)
 
     def _in_order(self) -> Columns:
         """Stable sort by log time: messages are in file order so far."""
-        columns = zip(*self.messages, strict=True)
-        topic, arrival, stamp = (np.concatenate(of, dtype=np.int64, casting="unsafe") for of in columns)
-        values = [np.concatenate(self.values.pop(0)) for _ in self.topics]
+        topic, arrival, stamp = self.topic[: self.filled], self.arrival[: self.filled], self.stamp[: self.filled]
+        values = [v[:n] for v, n in zip(self.values, self.filled_of, strict=True)]
         alone = sum(reader.alone for reader in self.readers.values())
         if (arrival[1:] >= arrival[:-1]).all():
             return Columns(topic, arrival, stamp, values, alone)
@@ -184,10 +194,10 @@ def batches(contents: Contents, channels: Collection[int]) -> Iterator[Batch]:
         counts = np.bincount(batch.channel, minlength=1 << 16)
         for channel in missing:
             missing[channel] -= int(counts[channel])
-        if min(missing.values()) < 0:
+        if contents.indexed and min(missing.values()) < 0:
             raise IndexMismatchError
         yield batch
-    if any(missing.values()):
+    if contents.indexed and any(missing.values()):
         raise IndexMismatchError
 
 

@@ -48,6 +48,7 @@ from uncertain_lti.recordings.mcap_records import (
     FOOTER_SIZE,
     LARGEST_CHUNK,
     LATEST,
+    MESSAGE,
     PIECE,
     PRIVATE,
     RECORD,
@@ -424,10 +425,12 @@ def _contents(path: Path, size: int, stated: _Summary, statistics: Statistics, s
     shared: dict[frozenset[int], frozenset[int]] = {}  # most chunks hold the same channels
     counts = {channel: number for channel, number in statistics.channel_message_counts.items() if number}
     found = Contents(path, size, channels=stated.channels, schemas=stated.schemas, indexed=True, summed=summed)
+    room: dict[int, int] = {}  # messages that the blocks of a channel can hold
     for block in blocks:
         if block.channels:
             found.blocks.append(block._replace(channels=shared.setdefault(block.channels, block.channels)))
         for channel in block.channels:
+            room[channel] = room.get(channel, 0) + block.length // (RECORD.size + MESSAGE.size)
             there = found.tally.setdefault(channel, Tally(counts.get(channel, 0), block.start, block.end))
             there.first, there.last = min(there.first, block.start), max(there.last, block.end)
     can_be = (
@@ -438,7 +441,8 @@ def _contents(path: Path, size: int, stated: _Summary, statistics: Statistics, s
         and sum(block.length for block in blocks) <= most_inflated(size)
         and all(channel.schema_id in (0, *found.schemas) for channel in found.channels.values())  # else in the chunks
         and 0 < statistics.message_count == found.count <= most_records(size)
-        and found.tally.keys() == counts.keys() <= found.channels.keys()
+        and room.keys() == counts.keys() <= found.channels.keys()
+        and all(number <= room[channel] for channel, number in counts.items())
     )
     return found if can_be else None
 
