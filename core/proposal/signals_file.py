@@ -267,9 +267,9 @@ def _recordings(bags: Sequence[Recording]) -> list[str]:
     names = [bag.path.name for bag in bags]
     if len(set(names)) < len(names):  # files of one name in several folders
         names = [str(bag.path) for bag in bags]
-    return (
-        [f"#   {name}" for name in names] if len(names) <= _LISTED else [f"#   {names[0]} to {names[-1]}: {len(names)}"]
-    )
+    if len(names) > _LISTED:
+        return [f"#   {names[0]} to {names[-1]}: {len(names)}"]
+    return [f"#   {name}" for name in names]
 
 
 _LISTED = 40
