@@ -10,6 +10,7 @@
 """Update: a model and further recordings to the optimum of all, proven by what the model keeps, or refused by name."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -245,3 +246,29 @@ def test_the_command_updates(tmp_path, capsys):
     old.replace(signatures=[Signature("worn", [1], [np.eye(old.n)])]).save(names[0])
     assert main(["fit", bags[2], "--update", names[0], "--output", names[1], "--force"]) == 0
     assert "its signatures" in capsys.readouterr().err
+
+
+def test_the_command_reads_earlier_recordings_again_where_they_are_needed(tmp_path, monkeypatch, capsys):
+    """And still there and as they were: else one sentence names them."""
+    monkeypatch.chdir(tmp_path)
+    for name, run in (("quiet", runs_of(3, (20_000,))[0]), ("loud", runs_of(4, (500,), noise=0.05)[0])):
+        table = np.column_stack([run.t, run.x, run.u])
+        np.savetxt(f"{name}.csv", table, "%.12g", ",", header="t,a,b,c,u,v", comments="")
+    of = [f"{{name: {name}, topic: /table, field: {name}}}" for name in "abcuv"]
+    Path("s.yaml").write_text(f"additive: noise\nstates: [{', '.join(of[:3])}]\ncontrols: [{', '.join(of[3:])}]\n")
+    fitted = ["--signals", "s.yaml", "--criterion", "qp", "--alarm", "containment", "--quiet", "--output"]
+    assert (
+        main(["fit", "quiet.csv", *fitted, "old.json"])
+        == main(["fit", "quiet.csv", "loud.csv", *fitted, "all.json"])
+        == 0
+    )
+    capsys.readouterr()
+    assert main(["fit", "loud.csv", "--update", "old.json", "--output", "new.json"]) == 0
+    assert (
+        "what old.json keeps does not prove the optimum of all recordings: 1 earlier one read again"
+        in capsys.readouterr().err
+    )
+    equal(UncertainLTI.load("new.json"), UncertainLTI.load("all.json"))
+    Path("quiet.csv").write_text(Path("quiet.csv").read_text() + "400.02,0,0,0,0,0\n")
+    assert main(["fit", "loud.csv", "--update", "old.json", "--output", "new.json", "--force"]) == 2
+    assert "give quiet.csv again, together with the new ones" in capsys.readouterr().err

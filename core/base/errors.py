@@ -47,6 +47,10 @@ class FitError(UncertainLTIError):
     """The identification problem has no usable solution for this data."""
 
 
+class UnprovenError(FitError):
+    """What a model keeps of its recordings does not prove the optimum of all: earlier ones are needed again."""
+
+
 def refuse_other(value: object, kind: type | tuple[type, ...], what: str, instead: str, error: type[Exception]) -> None:
     """Refuse a value of another type than the one asked for."""
     if not isinstance(value, kind):

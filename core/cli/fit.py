@@ -20,7 +20,8 @@ from contextlib import ExitStack
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from uncertain_lti.base.errors import BagError, FitError, ModelError
+from uncertain_lti.base.errors import BagError, FitError, ModelError, UnprovenError
+from uncertain_lti.base.text import plural
 from uncertain_lti.cli import interrupted
 from uncertain_lti.cli.command import (
     OPTIONS,
@@ -106,7 +107,16 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
     model = load_model(options.update)
     transients = _read(options, model.signals)
     with options.progress.stage("fitting") as step:
-        updated = model.update(transients, step)
+        try:
+            updated = model.update(transients, step)
+        except UnprovenError:
+            earlier = _earlier(options, model)
+            updated = model.update([*earlier, *transients], step) if earlier else model
+            new = updated.fit_summary["transients"] - model.fit_summary["transients"]
+            if not 0 < new <= len(transients):  # they are not there, or are read in another way now
+                raise
+            needed = f"what {options.update} keeps does not prove the optimum of all recordings"
+            options.progress.note(f"{needed}: {plural(len(earlier), 'earlier one')} read again")
     if model.signatures:
         lost = (
             f"its signatures ({len(model.signatures)}) are of the bounds of before and are left out; learn them again"
@@ -115,6 +125,17 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
     there = model.fit_summary["sources"]
     new = [file for file in _files(transients) if file["file"] not in [source["file"] for source in there]]
     return _with_sources(updated, [*there, *new])
+
+
+def _earlier(options: argparse.Namespace, model: UncertainLTI) -> list[Transient]:
+    """The recordings that a model was fitted to, if all are where its file says, or beside it, and unchanged."""
+    from uncertain_lti import read_transients
+    from uncertain_lti.base.files import sha256
+
+    files = {_found(source["file"], options.update): source.get("sha256") for source in model.fit_summary["sources"]}
+    if not all(os.path.isfile(file) and sha256(file) == known for file, known in files.items()):
+        return []
+    return read_transients(list(files), model.signals, options.progress.iterate("reading"), processes=None)
 
 
 def _fit_archive(options: argparse.Namespace) -> UncertainLTI:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array, Index
-from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.errors import FitError, UnprovenError
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.assembly import assemble, is_constant, median_step
 from uncertain_lti.identification.diagnosis import of_sums
@@ -56,7 +56,7 @@ class _Updated(Fleet):
         """What the bounds are on the transitions that are there; refused if another may be outside."""
         judged = super().judge(model)
         if names := self._memory.unproven(self.boxes_after(model, judged.largest)):
-            raise FitError(
+            raise UnprovenError(
                 f"what the model keeps does not prove the optimum of all recordings; give {', '.join(names)} again, "
                 f"together with the new ones"
             )
