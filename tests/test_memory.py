@@ -111,7 +111,8 @@ def test_a_free_run_follows_its_own_memory_and_its_radius_is_that_of_the_recursi
     for _ in range(30):
         truth.append(2.0 + 1.6 * (truth[-1] - 2.0) - 0.8 * (truth[-2] - 2.0))
     values = np.array(truth)
-    recalled = recall(values, Memory(kind), np.full(32, dt), np.arange(32) == 0)
+    recorded = Transient(dt * np.arange(32), values[:, None], np.zeros((32, 0)))
+    recalled = recall(recorded, values, Memory(kind))
     u = (recalled[1:-1, None] - memory.steady) / 3.0
     u[1:] = np.nan  # what is not the run's own would show
     free = model.simulate((values[1:2] - 2.0) / 4.0, u, dt)
@@ -119,7 +120,8 @@ def test_a_free_run_follows_its_own_memory_and_its_radius_is_that_of_the_recursi
     assert model.spectral_radius() == pytest.approx(math.sqrt(0.8))
     steps = np.where(np.arange(30) % 2, 0.2, 0.1)
     run = model.simulate((values[1:2] - 2.0) / 4.0, u, steps)[:, 0]
-    of_run = recall(4.0 * run + 2.0, Memory(kind), np.append(math.nan, steps), np.arange(31) == 0)
+    at = Transient(np.append(0.0, np.cumsum(steps)), run[:, None], np.zeros((31, 0)), max_gap=1.0)
+    of_run = recall(at, 4.0 * run + 2.0, Memory(kind))
     moved = steps * (model.A[0, 0] * run[:-1] + model.B[0, 0] * (of_run[:-1] - memory.steady) / 3.0)
     np.testing.assert_allclose(np.diff(run)[1:], moved[1:], rtol=1e-9, atol=1e-12)
 

@@ -44,8 +44,8 @@ from uncertain_lti.monitor.catch_up import MOST
 from uncertain_lti.monitor.intake import Sender
 from uncertain_lti.monitor.outputs import OUTPUTS, REASON, VIOLATION, NamedVector, VerdictMessages, names_of
 from uncertain_lti.monitor.session import Report, Session
-from uncertain_lti.recordings.table import TYPE
 from uncertain_lti.signals.field_path import FieldType, full_name
+from uncertain_lti.signals.values import TABLE
 
 _ARRAY = re.compile(r"(?P<element>[^\[\]]+)\[(?P<count>\d+)\]")
 _SEQUENCE = re.compile(r"sequence<(?P<element>[^,]+?)(?:,\s*(?P<bound>\d+))?>")
@@ -60,7 +60,7 @@ def message_class(type_name: str) -> Any:
     """Class of a message type such as `sensor_msgs/msg/JointState`."""
     parts = type_name.split("/")
     package, name = parts[0], parts[-1]
-    if type_name == TYPE:
+    if type_name == TABLE:
         raise SignalError("the model is of a table, which no publisher sends; fit one to recordings of topics")
     if not (len(parts) == 2 or (len(parts) == 3 and parts[1] == "msg")) or not (package and name.isidentifier()):
         raise SignalError(f"{type_name!r} is not a message type; one reads like sensor_msgs/msg/JointState")

@@ -147,9 +147,9 @@ _WRITTEN = "write NAME.yaml, which is used as it is if it is there already, NAME
 def start(options: argparse.Namespace) -> Result:
     """Propose signals, fit, report, and print what puts the model on the robot; the exit status of the report."""
     from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.recordings.table import of_table
     from uncertain_lti.reports.findings import NO, findings_text
     from uncertain_lti.reports.pages import page_target
+    from uncertain_lti.signals.values import of_table
 
     signals, model, page = (f"{options.output}{ending}" for ending in (".yaml", ".model.json", ".html"))
     if not os.path.basename(options.output):

@@ -42,6 +42,8 @@ LONGEST_DELAY = 10
 """Delays of a control that are tried, samples."""
 SURE_DELAY = 0.1
 """Share by which a delay leaves less unexplained, below which it must show in either half of the samples."""
+ALIGNED = 0.5
+"""Least cosine between what a control does to a state from either end of a step, where it is no controller's answer."""
 FOLLOWS = 0.15
 """Standard deviation around a smooth function, as a share, from which on it is none."""
 WHITE, OWN = 0.3, 0.5
@@ -76,6 +78,35 @@ def unexplained(gram: Array, cross: Array, total: Array) -> tuple[Array, NDArray
     turned = np.swapaxes(vectors * root[..., None, :], -1, -2) @ (cross * unit[..., :, None])
     left = np.maximum(total - np.einsum("...bt,...bt->...t", turned, turned), 1e-11 * total)
     return np.asarray(left), np.asarray(keep.sum(axis=-1))
+
+
+def size_of(values: Array) -> Array:
+    """Largest magnitude of each column (k,), to divide by."""
+    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300))
+
+
+def left(Z: Array, *of: Array) -> tuple[Array, ...]:
+    """What a least-squares fit on [1, Z] leaves of some columns, (N, k) each.
+
+    `Z` (N, j): regressors; Returns (N, k): one array for each that is given.
+    """
+    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size_of(Z)]))
+    return tuple(Y - Q @ (Q.T @ Y) for Y in of)
+
+
+def from_both_ends(X: Array, U: Array, V: Array, dX: Array, new: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    """Whether what is new in the controls at the arrival moves each state as from the departure on.
+
+    `X` (N, n), `U` (N, m): states and controls at the departure; `V` (N, k): controls at the arrival, those that are
+    `new` of the m; `dX` (N, n): changes of the states. Returns (n,), and (N, n) twice: what of the changes nothing
+    before the arrival tells, and the part of it that the controls at the arrival do.
+    """
+    move, fresh = left(np.hstack([X, U]), dX, V)
+    own, change = left(X, U, dX)
+    early = fresh @ np.linalg.lstsq(own, change, rcond=None)[0][new]
+    late = fresh @ np.linalg.lstsq(fresh, move, rcond=None)[0]
+    sizes = ((early**2).mean(axis=0) * (late**2).mean(axis=0)) ** 0.5
+    return np.asarray((early * late).mean(axis=0) >= ALIGNED * sizes), move, late
 
 
 def held_for(before: Array, after: Array) -> int:
@@ -113,18 +144,12 @@ def two_sensors(a: Array, b: Array) -> bool:
     Their difference is white then, and neither follows from the other and the rows before: a filtered copy would.
     """
     a, b = ((z - z.mean()) / z.std() for z in (a, b))
-    rest = _left_of(b, a)
+    (rest,) = left(a[:, None], b)
     past = [z[lag : len(z) - 2 + lag] for z in (a, b) for lag in (0, 1)]
-    own = min(_left_of(one[2:], other[2:], *past).std() for one, other in ((a, b), (b, a)))
+    own = min(left(np.column_stack([other[2:], *past]), one[2:])[0].std() for one, other in ((a, b), (b, a)))
     if not own > OWN * rest.std():
         return False
     return bool(abs(np.corrcoef(rest[1:], rest[:-1])[0, 1]) < WHITE)
-
-
-def _left_of(target: Array, *others: Array) -> Array:
-    """What least squares on some signals and a constant leaves of another."""
-    basis = np.column_stack([np.ones_like(target), *others])
-    return np.asarray(target - basis @ np.linalg.lstsq(basis, target, rcond=None)[0])
 
 
 def predicted(X: Array, U: Array, after: Array) -> Array:

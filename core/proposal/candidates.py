@@ -25,9 +25,11 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array, in_stretches
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import plural, shortlist
+from uncertain_lti.identification.evidence import left, size_of
 from uncertain_lti.recordings.recording import Recording, usual_step
-from uncertain_lti.recordings.table import TYPE, Table
+from uncertain_lti.recordings.table import Table
 from uncertain_lti.signals.field_path import FUNCTIONS, of_quaternion
+from uncertain_lti.signals.values import TABLE
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
@@ -232,20 +234,6 @@ def _without(x: Array, y: Array) -> Array:
     return np.asarray((rest**2).sum(axis=0))
 
 
-def size_of(values: Array) -> Array:
-    """Largest magnitude of each column (k,), to divide by."""
-    return np.asarray(np.maximum(np.abs(values).max(axis=0, initial=0.0), 1e-300))
-
-
-def left(Z: Array, *of: Array) -> tuple[Array, ...]:
-    """What a least-squares fit on [1, Z] leaves of some columns, (N, k) each.
-
-    `Z` (N, j): regressors; Returns (N, k): one array for each that is given.
-    """
-    Q, _ = np.linalg.qr(np.hstack([np.ones((len(Z), 1)), Z / size_of(Z)]))
-    return tuple(Y - Q @ (Q.T @ Y) for Y in of)
-
-
 ENOUGH, _STRETCH = 50_000, 500  # samples that tell what shows in what, in stretches of a long recording
 
 
@@ -277,25 +265,6 @@ def steps_of(states: Sequence[Candidate], controls: Sequence[Candidate], lags: S
         good &= np.isfinite(x[:-1]).all(axis=1) & np.isfinite(x[1:]).all(axis=1) & np.isfinite(u[:-1]).all(axis=1)
         found.append((x[:-1][good], u[:-1][good], np.diff(x, axis=0)[good]))
     return Steps(*map(np.concatenate, zip(*found, strict=True)))
-
-
-ALIGNED = 0.5
-"""Least cosine between what a control does to a state from either end of a step, where it is no controller's answer."""
-
-
-def from_both_ends(X: Array, U: Array, V: Array, dX: Array, new: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-    """Whether what is new in the controls at the arrival moves each state as from the departure on.
-
-    `X` (N, n), `U` (N, m): states and controls at the departure; `V` (N, k): controls at the arrival, those that are
-    `new` of the m; `dX` (N, n): changes of the states. Returns (n,), and (N, n) twice: what of the changes nothing
-    before the arrival tells, and the part of it that the controls at the arrival do.
-    """
-    move, fresh = left(np.hstack([X, U]), dX, V)
-    own, change = left(X, U, dX)
-    early = fresh @ np.linalg.lstsq(own, change, rcond=None)[0][new]
-    late = fresh @ np.linalg.lstsq(fresh, move, rcond=None)[0]
-    sizes = ((early**2).mean(axis=0) * (late**2).mean(axis=0)) ** 0.5
-    return np.asarray((early * late).mean(axis=0) >= ALIGNED * sizes), move, late
 
 
 def earlier(values: Array, samples: int) -> Array:
@@ -463,7 +432,7 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     warnings = []
     few = {name: counts for name, counts in columns.items() if len(counts) <= _LABELS}  # no angle of attack
     for name, counts in few.items():
-        for candidate in (c for s in sources if s.type == TYPE for c in s.candidates):
+        for candidate in (c for s in sources if s.type == TABLE for c in s.candidates):
             if candidate.kind == name:
                 candidate.reason = "a label by its name, and no signal of the machine"
         if len(counts) > 1:
@@ -488,7 +457,7 @@ def _is_code(candidate: Candidate) -> bool:
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls."""
     found, driven = [], any(s.role == "control" and s.free for s in sources)
-    for table in (s for s in sources if s.type == TYPE and s.role == "state"):
+    for table in (s for s in sources if s.type == TABLE and s.role == "state"):
         codes = [c for c in table.free if _is_code(c)]
         for candidate in codes * driven:  # else it may be the only control
             candidate.reason, candidate.ready = "a code by its name, and its numbers are no amounts", "control"
@@ -561,7 +530,7 @@ def _held_columns(table: Source) -> Source | None:
 
     What is measured by its name is none. They leave the table for a topic of their own, whose role is a guess.
     """
-    if table.type != TYPE:
+    if table.type != TABLE:
         return None
     changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
     told = {c for c in table.free for named in (_STATE, _APART, _TOLD) if named.search(c.path.lower())}

@@ -22,10 +22,12 @@ from uncertain_lti.identification.evidence import (
     FASTEST,
     LONGEST_DELAY,
     NOISE,
+    from_both_ends,
     functions,
     held_for,
     lags,
     predicted,
+    size_of,
     two_sensors,
 )
 from uncertain_lti.proposal.candidates import (
@@ -38,16 +40,14 @@ from uncertain_lti.proposal.candidates import (
     Source,
     Steps,
     explained,
-    from_both_ends,
     is_physical,
     most_shown,
-    size_of,
     steps_of,
 )
 from uncertain_lti.proposal.signals_file import set_own_scale
-from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.recordings.table_times import field_name
 from uncertain_lti.signals.field_path import FieldPath
+from uncertain_lti.signals.values import TABLE, of_table
 
 SHORT_DELAY = 3
 """Samples within which a control shows that keeps a state from being noise."""
@@ -264,7 +264,7 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     used = drop_copies(used)
     before = drop_functions(steps_of(pool, used), pool)
     pool, doubt = drop_noise(before, used)
-    noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TYPE]  # measured, in a table
+    noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TABLE]  # measured, in a table
     N = len(steps_of(pool, used).X)
     room = max(2, N // PER_UNKNOWN)
     used = _strongest(_driven(pool, used, 0), used, _Room(N, room // 2, "controls"))
@@ -440,7 +440,7 @@ _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)"
 def is_plant(sources: Sequence[Source]) -> bool:
     """Whether recordings are tables of a row per second or slower."""
     there = [s for s in sources if s.candidates]
-    return bool(there) and all(s.type == TYPE and s.rate <= FASTEST for s in there)
+    return bool(there) and all(s.type == TABLE and s.rate <= FASTEST for s in there)
 
 
 def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Candidate]]:

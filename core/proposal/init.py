@@ -62,12 +62,12 @@ from uncertain_lti.proposal.signals_file import (
 from uncertain_lti.proposal.tune import Remembered, choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
-from uncertain_lti.recordings.table import TYPE, Table
+from uncertain_lti.recordings.table import Table
 from uncertain_lti.recordings.table_times import called_time, may_be
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath, Memory
-from uncertain_lti.signals.values import TableLayout
+from uncertain_lti.signals.values import TABLE, TableLayout
 
 LONGEST_ARRAY = 35
 """Entries of an array that are looked at one by one, such as motors of a humanoid; a longer one is a matrix, a scan."""
@@ -113,7 +113,7 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     sources = []
     for topic, fact in facts.items():
         total = sum(_messages(bag, topic) for bag in bags)
-        if fact.info.type == TYPE:
+        if fact.info.type == TABLE:
             sources += _of_table(topic, total, {f: number == len(bags) for f, number in held[topic].items()})
             continue
         stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
@@ -203,7 +203,7 @@ def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Sou
     reason = f"{plural(rows, 'row')} only" if rows < FEWEST else "" if any(everywhere.values()) else _APART
     sources = []
     for role, fields in by_role.items():
-        sources.append(source := Source(topic, TYPE, role, False, None, reason=reason))
+        sources.append(source := Source(topic, TABLE, role, False, None, reason=reason))
         if not reason:
             source.candidates = _candidates(source, [f for f in fields if everywhere[f]])
             source.candidates += [Candidate(source, f, reason=_APART) for f in fields if not everywhere[f]]
@@ -264,7 +264,7 @@ def _sift(source: Source) -> None:
             c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
-    measured = source.type == TYPE and source.role != "control"  # a command stands at its least, and no sensor failed
+    measured = source.type == TABLE and source.role != "control"  # a command stands at its least, and no sensor failed
     shared = shared_codes(list(each.values())) if measured else set()
     for candidate in source.free:
         values = each[id(candidate)]
@@ -274,7 +274,7 @@ def _sift(source: Source) -> None:
             candidate.values = [np.where(np.isin(v, candidate.ignore), np.nan, v) for v in candidate.values]
         candidate.reason = _unfit(candidate, source)
     _wrapped(source)
-    if source.type == TYPE:
+    if source.type == TABLE:
         _leave_out_places(source)
     if all(c.reason for c in source.candidates):
         source.reason = "; ".join(f"{c.path} {c.reason}" for c in source.candidates[:3])
@@ -290,11 +290,11 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "never a number"
     in_a_row = sum(np.count_nonzero(np.isfinite(v[:-1]) & np.isfinite(v[1:])) for v in candidate.values)
     if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
-        what = f"rows only, so {_FILL}" if source.type == TYPE else "messages only"
+        what = f"rows only, so {_FILL}" if source.type == TABLE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
     if finite.min() == finite.max():
         return f"always {finite[0] + 0.0:.6g}"
-    if source.type != TYPE and np.ptp(finite) < DUST:
+    if source.type != TABLE and np.ptp(finite) < DUST:
         return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     counts = np.unique(finite, return_counts=True)[1]
     if (moved := len(finite) - int(counts.max())) < max(3, len(finite) // 500):
@@ -308,7 +308,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     name = "_".join(words_of(candidate.path))
     if _COMPUTER.search(name):
         return "of a computer, by its name, and no signal of the machine"
-    if source.type == TYPE and _PLACE.search(name):
+    if source.type == TABLE and _PLACE.search(name):
         return "a place on the map, and another run may be elsewhere"
     wheel = of_wheel(candidate)
     names = _CLOCK | _COUNTER if (finite == np.rint(finite)).all() and not wheel else _CLOCK
@@ -372,7 +372,7 @@ def _rate_of(place: Candidate, velocity: Candidate) -> bool:
 
 def _drop_computed(sources: Sequence[Source]) -> None:
     """Leave out what is computed from other columns: an average, or an error, which jumps with its set point."""
-    pool = [c for s in sources if s.type == TYPE for c in s.free if np.ptp(c.finite) > 0]
+    pool = [c for s in sources if s.type == TABLE for c in s.free if np.ptp(c.finite) > 0]
     named = [c for c in pool if not _COMPUTED.isdisjoint(words_of(c.path))]
     some = {c: np.concatenate(c.values)[:: 1 + len(c.values[0]) // 1000] / np.ptp(c.finite) for c in pool if named}
     for candidate in named:

@@ -23,10 +23,10 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.evidence import from_both_ends, left, size_of
 from uncertain_lti.identification.regimes import Knots
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.proposal.candidates import from_both_ends, left, size_of
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal import At
 from uncertain_lti.signals.values import HorizonRule

@@ -25,12 +25,11 @@ from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, clock_of, held, steps_of
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.recordings.table import TYPE, of_table
 from uncertain_lti.sampling.clock import coarse_ns, longest_pause
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.signals.values import CHOICES_TEXT, TableLayout
+from uncertain_lti.signals.values import CHOICES_TEXT, TABLE, TableLayout, of_table
 
 _PARTS = re.compile(r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+|\d+")  # letters of any alphabet
 
@@ -371,7 +370,7 @@ def _left_out(sources: Sequence[Source], chosen: set[Candidate]) -> list[str]:
             if candidate not in chosen and not candidate.ready:
                 groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
         of = {reason: f" {shortlist(paths, 6)}" for reason, paths in groups.items()}
-        if source.reason and set(groups) <= {source.reason} and source.type != TYPE:  # whose roles have columns
+        if source.reason and set(groups) <= {source.reason} and source.type != TABLE:  # whose roles have columns
             of = {source.reason: ""}
         lines += [f"#   {source.topic}{paths}: {' '.join(reason.split())}" for reason, paths in of.items()]
     return lines

@@ -26,11 +26,10 @@ from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.evidence import autocorrelation, late_controls
+from uncertain_lti.identification.evidence import autocorrelation, late_controls, size_of
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.envelope_monitor import EnvelopeMonitor
-from uncertain_lti.proposal.candidates import size_of
 from uncertain_lti.proposal.public_fit import fit
 from uncertain_lti.proposal.search import COUNTS, PAYS, Score, score_of, thinned
 from uncertain_lti.sampling.clock import longest_step

@@ -42,12 +42,7 @@ from uncertain_lti.recordings.table_times import (
 )
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
-from uncertain_lti.signals.values import TableLayout
-
-TOPIC = "/table"
-"""The topic of a table; those of the messages of a log are below it."""
-TYPE = "table"
-"""Its message type."""
+from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout
 
 _PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
@@ -63,11 +58,6 @@ _NAMES = re.compile(
 )
 _TOGETHER = 0.9  # of the times, that have a number of each signal
 _SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
-
-
-def of_table(topic: str) -> bool:
-    """Whether a topic is that of a table, or of a message in one."""
-    return f"{topic}/".startswith(f"{TOPIC}/")
 
 
 def is_table(path: Path) -> bool:
@@ -166,7 +156,7 @@ class Table(Recording):
         self.topics = {}
         for topic, rows in self._rows.items():
             first, last = (int(self.times[rows[0]]), int(self.times[rows[-1]])) if len(rows) else (None, None)
-            self.topics[topic] = TopicInfo(topic, TYPE, len(rows), kind, not reason, words, first, last)
+            self.topics[topic] = TopicInfo(topic, TABLE, len(rows), kind, not reason, words, first, last)
 
     def __reduce__(self) -> tuple[Any, ...]:
         """For another process, which reads the file again."""
@@ -182,7 +172,7 @@ class Table(Recording):
         def of(type_name: str) -> Mapping[str, FieldType]:
             if type_name == _QUATERNION:
                 return dict.fromkeys("xyzw", FieldType("number", "float64"))
-            if type_name != TYPE:
+            if type_name != TABLE:
                 raise SignalError(f"{type_name}: a table has no such type; check the type")
             return fields
 
@@ -413,7 +403,7 @@ def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[l
 
     Where no message has two numbers, signals were written as they changed, and hold until then: they are one table.
     """
-    one = {TOPIC: (list(columns), np.arange(number))}
+    one = {TABLE_TOPIC: (list(columns), np.arange(number))}
     names: dict[bytes, list[str]] = {}  # by where they have a number
     for name, column in columns.items():
         if column.dtype.kind not in "OM":
@@ -440,7 +430,7 @@ def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[l
     begun = [(commonprefix(group), group[0]) for group in fields]
     fields[int(np.argmax([len(of) for of in rows_of]))] += any_row
     topics = once((begin.rpartition("_")[0] or begin or first for begin, first in begun), "_")
-    return {f"{TOPIC}/{topic}": of for topic, of in zip(topics, zip(fields, rows_of, strict=True), strict=True)}
+    return {f"{TABLE_TOPIC}/{topic}": of for topic, of in zip(topics, zip(fields, rows_of, strict=True), strict=True)}
 
 
 def _goes_on(column: Column) -> bool:

@@ -21,11 +21,10 @@ from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.likeness import Learnt
-from uncertain_lti.recordings.table import of_table
 from uncertain_lti.sampling.clock import passed
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.values import CRITERIA
+from uncertain_lti.signals.values import CRITERIA, of_table
 
 MOST_SHOWN = 20
 """Signals whose elements, and discarded transitions that are printed."""

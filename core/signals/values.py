@@ -214,7 +214,15 @@ CHOICES_TEXT = " or ".join(", ".join(CHOICES).rsplit(", ", 1))
 UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "min": 60 * 10**9, "h": 3600 * 10**9, "d": 86400 * 10**9}
 """Units of time that a column of numbers can have, with their nanoseconds."""
 
+TABLE_TOPIC, TABLE = "/table", "table"
+"""The topic of a table, below which those of the messages of a log are, and its message type."""
+
 TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d"]
+
+
+def of_table(topic: str) -> bool:
+    """Whether a topic is that of a table, or of a message in one."""
+    return f"{topic}/".startswith(f"{TABLE_TOPIC}/")
 
 
 @dataclass(frozen=True, slots=True)
