@@ -82,14 +82,14 @@ class Table(Recording):
         self.path, self.parts, self.layout = path, (file,), layout
         self.size = file.stat().st_size
         self._warnings = [f"{file}: {note}" for note in [*raw.notes, *([words] if words else [])]]
-        signals = {name: raw.columns[name] for name in raw.columns if name not in (time, layout.runs)}
+        apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
+        signals = {name: column for name, column in raw.columns.items() if name not in apart}
         naming, value = _naming(signals, times)
         called = _NAMES.fullmatch(naming) and rows is None
         wide = _side_by_side(signals[naming], signals[value], times) if called else None
         if wide is not None:
             raw, times = RawTable({time: wide[1], **wide[0]}), wide[1]
             self._warnings.append(f"{file}: column '{naming}' names the signal of each number in '{value}'")
-        apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
         kept = np.arange(len(times)) if rows is None else rows
         known = times[kept] != NO_TIME
         if missing_time := int(np.count_nonzero(~known)):
@@ -448,9 +448,10 @@ def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[st
     numbers = [name for name, column in columns.items() if column.dtype.kind in "iuf" and column.ndim == 1]
     texts = [name for name, column in columns.items() if column.dtype.kind == "O"]
     for naming in sorted(texts, key=lambda name: not _NAMES.fullmatch(name)) if numbers else ():
-        names, of = np.unique(columns[naming].astype(str), return_inverse=True)
-        if not 2 <= len(names) <= len(of) // _ROWS_EACH or "" in names:
+        few = set(columns[naming].tolist())
+        if not 2 <= len(few) <= len(times) // _ROWS_EACH or "" in few:
             continue
+        of = np.unique(columns[naming].astype(str), return_inverse=True)[1]
         order = np.argsort(of, kind="stable")
         first = np.flatnonzero(np.diff(of[order], prepend=-1))
         least, most = (of_each.reduceat(times[order], first) for of_each in (np.minimum, np.maximum))
