@@ -537,9 +537,10 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
         count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
         units = f"{lasting(evidence.hours)} {shown} ({plural(panel.units, panel.what)})"
         shows = f"which shows at most {most:.7g} per hour with {CONFIDENCE:.0%} confidence"
+        shows += ", while the machine is run as in the recordings"
         if most > OFTEN and panel.asked is None:
             shows = "too little to say how rare they are"
-        found = [f"false alarms: {count or 'none'} in {units}, {shows}, while the machine is run as in the recordings"]
+        found = [f"false alarms: {count or 'none'} in {units}, {shows}"]
         if panel.what != "block":
             alarming = f"{panel.alarming or 'none'} of {plural(panel.units, panel.what)}"
             further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
