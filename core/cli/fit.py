@@ -110,11 +110,11 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
         try:
             updated = model.update(transients, step)
         except UnprovenError:
-            earlier = _earlier(options, model)
-            updated = model.update([*earlier, *transients], step) if earlier else model
-            new = updated.fit_summary["transients"] - model.fit_summary["transients"]
-            if not 0 < new <= len(transients):  # they are not there, or are read in another way now
+            if not (earlier := _earlier(options, model)):
                 raise
+            updated = model.update([*earlier, *transients], step)
+            if updated.fit_summary["transients"] > model.fit_summary["transients"] + len(transients):
+                raise  # some are read in another way now, and were taken for new ones
             needed = f"what {options.update} keeps does not prove the optimum of all recordings"
             options.progress.note(f"{needed}: {plural(len(earlier), 'earlier one')} read again")
     if model.signatures:

@@ -84,9 +84,9 @@ class Table(Recording):
         self._warnings = [f"{file}: {note}" for note in [*raw.notes, *([words] if words else [])]]
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
         signals = {name: column for name, column in raw.columns.items() if name not in apart}
-        naming, value = _naming(signals, times)
+        naming, value, of_each = _naming(signals, times)
         called = _NAMES.fullmatch(naming) and rows is None
-        wide = _side_by_side(signals[naming], signals[value], times) if called else None
+        wide = _side_by_side(of_each, signals[value], times) if called else None
         if wide is not None:
             raw, times = RawTable({time: wide[1], **wide[0]}), wide[1]
             self._warnings.append(f"{file}: column '{naming}' names the signal of each number in '{value}'")
@@ -381,21 +381,27 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
         keys = np.asarray([repr(value).removesuffix(".0") for value in column.tolist()])
         if raw.exact is not None and len(column) and bool((np.abs(column) >= _INEXACT).any()):
             keys = np.asarray(raw.exact(of))
-    names, first, rows = np.unique(keys, return_index=True, return_inverse=True)
-    if len(names) > min(_MOST_RUNS, max(10, len(column) // 2)):
-        values = f"{len(names)} values in {len(column)} rows"
+    of_each = _rows_of_each(keys)
+    if len(of_each) > min(_MOST_RUNS, max(10, len(column) // 2)):
+        values = f"{len(of_each)} values in {len(column)} rows"
         raise BagError(f"{file}: column '{layout.runs}' has {values}, so it names no runs; choose another")
-    of_each = np.split(np.argsort(rows, kind="stable"), np.cumsum(np.bincount(rows, minlength=len(names)))[:-1])
     found: dict[str, NDArray[np.intp]] = {}
-    for i in np.argsort(first, kind="stable").tolist():
-        name, own = str(names[i]).translate(_IN_A_NAME), of_each[i]
+    for key, own in of_each.items():
+        name = key.translate(_IN_A_NAME)
         if name in _NO_RUN:
             raw.notes.append(f"{plural(len(own), 'row')} without a run left out")
         elif name in found:
-            raise BagError(f"{file}: runs '{names[i]}' and '{name}' would have one name; rename one of them")
+            raise BagError(f"{file}: runs '{key}' and '{name}' would have one name; rename one of them")
         else:
             found[name] = own
     return found
+
+
+def _rows_of_each(keys: Column) -> dict[str, NDArray[np.intp]]:
+    """Rows of each text (N,), in order of their first rows."""
+    names, first, of = np.unique(keys, return_index=True, return_inverse=True)
+    rows = np.split(np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=len(names)))[:-1])
+    return {str(names[i]): rows[i] for i in np.argsort(first, kind="stable").tolist()}
 
 
 def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
@@ -439,43 +445,41 @@ def _goes_on(column: Column) -> bool:
     return int(np.count_nonzero(same)) >= 0.9 * len(same)
 
 
-def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[str, str]:
+def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[str, str, dict[str, NDArray[np.intp]]]:
     """The column that names the signal of each row's one number, as historians and logs of a bus write it, and that.
 
-    Few names change from row to row, or the time begins anew with each, where the column is called so. Nothing for
-    other tables, whose rows have several numbers or none.
+    And the rows of each name. Few names change from row to row, or the time begins anew with each, where the column is
+    called so. Nothing for other tables, whose rows have several numbers or none.
     """
     numbers = [name for name, column in columns.items() if column.dtype.kind in "iuf" and column.ndim == 1]
     texts = [name for name, column in columns.items() if column.dtype.kind == "O"]
     for naming in sorted(texts, key=lambda name: not _NAMES.fullmatch(name)) if numbers else ():
-        few = set(columns[naming].tolist())
+        cells = columns[naming]
+        few = set(cells.tolist())
         if not 2 <= len(few) <= len(times) // _ROWS_EACH or "" in few:
             continue
-        of = np.unique(columns[naming].astype(str), return_inverse=True)[1]
-        order = np.argsort(of, kind="stable")
-        first = np.flatnonzero(np.diff(of[order], prepend=-1))
+        rows = _rows_of_each(cells.astype(str))
+        order = np.concatenate([*rows.values()])
+        first = np.cumsum([0, *map(len, rows.values())])[:-1]
         least, most = (of_each.reduceat(times[order], first) for of_each in (np.minimum, np.maximum))
         anew = most.min() > least.max() and _NAMES.fullmatch(naming)
-        if 2 * np.count_nonzero(np.diff(of)) > len(of) or anew:
+        if 2 * np.count_nonzero(cells[1:] != cells[:-1]) > len(cells) or anew:
             of_rows = {name: columns[name][order] for name in numbers}
             moving = [n for n, c in of_rows.items() if (np.fmax.reduceat(c, first) > np.fmin.reduceat(c, first)).any()]
             if len(moving) == 1:  # others, such as an identifier, are the same in all rows of a name
-                return naming, moving[0]
-    return "", ""
+                return naming, moving[0], rows
+    return "", "", {}
 
 
 def _side_by_side(
-    names: Column, values: Column, times: NDArray[np.int64]
+    of_each: Mapping[str, NDArray[np.intp]], values: Column, times: NDArray[np.int64]
 ) -> tuple[dict[str, Column], NDArray[np.int64]] | None:
     """A column for each name, and the times; nothing where the names do not come together, or one after the other.
 
     Of rows of one name and time the first counts.
     """
-    known = np.flatnonzero(times != NO_TIME)[::-1]
-    stamps = np.unique(times[known])
-    every, of_row = np.unique(names[known].astype(str), return_inverse=True)
-    each = np.split(known[np.argsort(of_row, kind="stable")], np.cumsum(np.bincount(of_row))[:-1])
-    rows = dict(sorted(zip(every.tolist(), each, strict=True), key=lambda one: one[1][-1]))
+    rows = {name: of[times[of] != NO_TIME] for name, of in of_each.items()}
+    stamps = np.unique(times[times != NO_TIME])
     count = min(map(len, rows.values()))
     if count < _TOGETHER * len(stamps) and all(len(of) == count for of in rows.values()):
         rounds = np.sort(times[np.array([*rows.values()])], axis=1)
@@ -484,7 +488,7 @@ def _side_by_side(
             return {name: values[of[np.argsort(times[of])]] for name, of in rows.items()}, stamps
     columns = {name: np.full(len(stamps), math.nan) for name in rows}
     for name, of in rows.items():
-        columns[name][np.searchsorted(stamps, times[of])] = values[of]
+        columns[name][np.searchsorted(stamps, times[of[::-1]])] = values[of[::-1]]
     together = min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER
     return (columns, stamps) if together else None
 

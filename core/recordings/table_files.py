@@ -248,10 +248,9 @@ def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str
             odd += 1
             first = first or cell
     if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
-        with_units = [QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING]
-        units = {match["unit"] if match else "" for match in with_units}
-        unit = units.pop() if len(units) == 1 < len({*plain}) else ""
-        if not unit:
+        unit = match["unit"] if (match := QUANTITY.fullmatch(first)) else ""
+        written = (QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING)
+        if not unit or len({*plain}) < 2 or not all(match and match["unit"] == unit for match in written):
             return np.array(plain, dtype=object), ""
         numbers, note = _column([cell.removesuffix(unit) for cell in plain], commas, delimiter)
         return numbers, " and ".join(filter(None, [note, f"'{unit}' taken off each number"]))

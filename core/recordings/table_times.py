@@ -247,8 +247,10 @@ def _of_stamp(table: RawTable) -> str:
     """
     numbers = {name: c for name, c in table.columns.items() if c.ndim == 1 and c.dtype.kind in "iuf" and len(c) > 2}
     for (sec, whole), (nanosec, rest) in pairwise(numbers.items()):
+        if not _since_1970(float(whole[0])):
+            continue
         both = np.array([whole, rest], dtype=np.float64)
-        if not _since_1970(both[0, 0]) or (both != np.rint(both)).any() or not 0 <= both[1].min() < both[1].max() < 1e9:
+        if (both != np.rint(both)).any() or not 0 <= both[1].min() < both[1].max() < 1e9:
             continue
         next_second = np.diff(both[0]) == 1
         if both[1].max() > 5e8 and next_second.any() and np.mean(np.diff(both[1])[next_second] < 0) > 0.9:

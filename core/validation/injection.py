@@ -92,9 +92,11 @@ def faulty(windows: Windows, kind: str, i: int, size: Array, noise: Array, model
         x[:, windows.onset :, i] = _reading(windows, kind, windows.x[:, :, i], size, noise)
     else:
         x = _response(windows, kind, i, size, model)
+    if not (of_states := _of_states(model)):
+        return x, windows.u
     n = model.n
     u, moved, dt = windows.u.copy(), np.nan_to_num(x - windows.x), np.diff(windows.t, axis=1)
-    for r in _of_states(model):
+    for r in of_states:
         for k in range(windows.onset, x.shape[1]):
             u[:, k, r.position - n] += _recall(r, moved[:, :, r.of], k, dt)
     return x, u
