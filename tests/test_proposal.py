@@ -32,7 +32,7 @@ from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.identification.evidence import functions
 from uncertain_lti.proposal import init
 from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column, steps_of
-from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose
+from uncertain_lti.proposal.choosing import _may_move_with, _move_together, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
@@ -777,7 +777,7 @@ def test_what_is_looked_for_at_once_leaves_out_nothing(seed, missing):
     X[rng.random(X.shape) < 0.1 * missing] = rng.choice([np.nan, np.inf])
     table = Source("/table", "table", "state", False, None)
     pool = [Candidate(table, f"c{j}", [column[:50], column[50:]]) for j, column in enumerate(X.T)]
-    pairs = [(a, b) for a, b in combinations(pool, 2) if _moves_with(b, a)]
+    pairs = [(a, b) for a, b in combinations(pool, 2) if _move_together(*(np.concatenate(c.values) for c in (b, a)))]
     assert {(id(a), id(b)) for a, b in pairs} <= _may_move_with(pool)
 
 
@@ -863,22 +863,44 @@ def test_whatever_is_recorded_gets_a_file_or_a_sentence(tmp_path_factory, data):
 # --- copies and noise ---------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "copy"),
-    [
-        ("/plant/pressure", lambda x, rng: -57.3 * x + 4.0),
-        ("/aaa/sensor", lambda x, rng: 101325.0 + 9810.0 * x + 5.0 * rng.normal()),
-        ("/plant/pressure", lambda x, rng: np.exp(x / 3.0)),
-        ("/aaa/sensor", lambda x, rng: x + 0.02 * rng.normal()),
-    ],
-    ids=["another unit", "another sensor", "a function", "a worse sensor"],
-)
-def test_a_function_of_a_state_in_another_topic_is_no_second_state(tmp_path, copy, name):
-    rng = np.random.default_rng(1)
-    proposal = proposed(tmp_path, driven(extra=beside(name, lambda x, u: copy(x, rng))))[1]
+@pytest.mark.parametrize("copy", [lambda x: -57.3 * x + 4.0, lambda x: np.exp(x / 3.0)], ids=["unit", "function"])
+def test_a_function_of_a_state_in_another_topic_is_no_second_state(tmp_path, copy):
+    messages, name = driven(), "/plant/pressure"
+    sent = [(m.log_time, struct.unpack("<d", m.data[-8:])[0]) for m in messages if m.topic == "/plant/state"]
+    proposal = proposed(tmp_path, messages + [f64(name, t, copy(x)) for t, x in sent])[1]
     assert len(proposal.states) == 1, proposal.text
     (left,) = {"/plant/state", name} - {proposal.states[0].topic}
     assert f"{left} data: says what {proposal.states[0].topic} data says already" in proposal.text
+
+
+def test_two_sensors_in_topics_of_their_own_are_both_states(tmp_path):
+    rng = np.random.default_rng(1)
+    pressure = beside("/aaa/sensor", lambda x, u: 101325.0 + 9810.0 * x + 10.0 * rng.normal())
+    proposal = proposed(tmp_path, driven(count=2000, extra=pressure))[1]
+    assert {c.topic for c in proposal.states} == {"/plant/state", "/aaa/sensor"}, proposal.text
+
+
+@pytest.mark.parametrize(("second", "both"), [("/turn_cmd", True), ("/idle_cmd", False)])
+def test_a_slower_topic_in_which_alone_a_command_shows_gives_states_and_the_clock(tmp_path, second, both):
+    """Of a robot with an IMU of 100 Hz beside odometry of 50, only the yaw rate was judged, and no speed."""
+    rng = np.random.default_rng(0)
+    messages, speed, turn, u = [], 0.0, 0.0, np.zeros(2)
+    for k in range(8000):
+        t = 10**18 + 10 * k * MS
+        if k % 40 == 0:
+            u = rng.normal(size=2)
+        messages += [f64("/imu", t, turn + 1e-3 * rng.normal())]
+        if k % 2 == 0:
+            messages += [f64("/odom", t, speed + 1e-3 * rng.normal())]
+            messages += [f64("/drive_cmd", t, u[0]), f64(second, t, u[1])]
+        speed += 0.01 * (3.0 * u[0] - 2.0 * speed)
+        turn += 0.01 * (3.0 * u[1 if both else 0] - 2.0 * turn)
+    path, proposal = proposed(tmp_path, messages)
+    states = {"/imu", "/odom"} if both else {"/imu"}
+    assert {c.topic for c in proposal.states} == states, proposal.text
+    assert f"clock: {'/odom' if both else '/imu'}" in proposal.text
+    assert ("/odom: 50 messages a second, and 100 of /imu" in proposal.text) is not both
+    fitted([path], proposal)
 
 
 def test_noise_is_no_state(tmp_path):

@@ -57,7 +57,7 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     """Drop candidates that are functions of another one, whatever their topics: copies, other units, squares.
 
     Such a function leaves next to nothing of a candidate, or nothing but noise. Of two that are functions of each
-    other, the one in which the controls show clearly more stays, else the first. Two sensors read at one instant both
+    other, the one in which the controls show clearly more stays, else the first. Two sensors of one quantity both
     stay, where each has noise of its own: a fault of one, or what comes between them, such as a slipping wheel, shows
     in their difference alone.
     """
@@ -66,8 +66,8 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     kept: list[int] = []
     function = functions(steps.X)
     for i, j in np.argwhere(function).tolist():
-        twins = _alike(pool[i], pool[j]) or pool[i].topic == pool[j].topic and two_sensors(*steps.X[:, [i, j]].T)
-        function[i, j] = not twins or _moves_with(pool[j], pool[i], exact=True)
+        twins = _alike(pool[i], pool[j]) or two_sensors(*steps.X[:, [i, j]].T)
+        function[i, j] = not twins or _move_together(steps.X[:, j], steps.X[:, i], exact=True)
 
     def drop(i: int, source: int) -> None:
         of = pool[source]
@@ -166,7 +166,9 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
     may = _may_move_with(pool)
     for candidate in pool:
         near = (c for c in kept if (id(c), id(candidate)) in may)
-        if twin := next((c for c in near if _moves_with(candidate, c, exact or _alike(candidate, c))), None):
+        mine = np.concatenate(candidate.values)
+        same = (c for c in near if _move_together(mine, np.concatenate(c.values), exact or _alike(candidate, c)))
+        if twin := next(same, None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
@@ -174,7 +176,7 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
 
 
 def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
-    """Pairs of which `_moves_with` may hold, each the one before the other: all correlations of a topic at once."""
+    """Pairs of which `_move_together` may hold, each the one before the other: all correlations of a topic at once."""
     may: set[tuple[int, int]] = set()
     of_topic: dict[tuple[str, int], list[Candidate]] = {}
     for candidate in pool:
@@ -208,8 +210,7 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     return one.topic == other.topic and of_table(one.topic) and len(names) == 1 and given
 
 
-def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
-    a, b = np.concatenate(one.values), np.concatenate(other.values)
+def _move_together(a: Array, b: Array, exact: bool = False) -> bool:
     both = np.isfinite(a) & np.isfinite(b)
     a, b = a[both], b[both]
     if len(a) <= 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
@@ -223,6 +224,8 @@ def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
 
 ALIKE = 0.8
 """Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
+SLOWER = 10.0
+"""Times the rate of a topic that of the fastest is at most, where both give states of one model."""
 STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
@@ -247,10 +250,11 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
     shown = [s for s in states if shows[s.topic] > SHOWS] or list(states)
     fastest = max(s.rate for s in shown)
+    slowest = _slowest(shown, controls, fastest)
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
     for source in (s for s in states if s is not main):
-        at_its_rate = ALIKE * fastest <= source.rate <= fastest / ALIKE
+        at_its_rate = ALIKE * slowest <= source.rate <= fastest / ALIKE
         if source in shown and at_its_rate:
             pool += source.free
             continue
@@ -284,6 +288,18 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
     return keep, doubt
+
+
+def _slowest(states: Sequence[Source], controls: Sequence[Source], fastest: float) -> float:
+    """Rate of the slowest topic of states, 1/s: one in which a control shows that shows in no faster topic."""
+    used, told = [c for s in controls for c in s.free], np.zeros(1)
+    slowest, near = fastest, [s for s in states if s.rate >= fastest / SLOWER]
+    for source in sorted(near, key=lambda s: -s.rate) if min(s.rate for s in near) < ALIKE * fastest else ():
+        shown = _driven(source.free, used)[1:].max(axis=1, initial=0.0)
+        if ((shown > SHOWS) & (told <= SHOWS)).any():
+            slowest = source.rate
+        told = np.maximum(told, shown)
+    return slowest
 
 
 def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
