@@ -63,6 +63,7 @@ from rosbags.rosbag2 import Writer as Rosbag2Writer
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
+from uncertain_lti.recordings.message_reader import header_stamp_ns
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import FieldPath, FieldType
 
@@ -771,6 +772,8 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
     late = "float64 y\nstd_msgs/Header header\n"
     topics = [Topic("/usable", kind), Topic("/zero", kind), Topic("/mixed", kind), Topic("/none"), Topic("/once")]
     topics += [Topic("/big", kind), Topic("/late", "x/msg/Late", schema=late), Topic("/never", kind)]
+    timestamped = "uint64 timestamp\nfloat32 x\n"
+    topics += [Topic(name, "px4_msgs/msg/Odd", schema=timestamped) for name in ("/px4", "/booting")]
     messages = []
     for i in range(11):
         t = (100 + i) * SECOND // 10 + (2 * SECOND if i == 10 else 0)
@@ -779,14 +782,21 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
         messages += [Message("/big", t, stamped(t, little_endian=False))]
         behind = b"\0\1\0\0" + struct.pack("<diII", 1.0, 5, 7, 1) + b"\0"
         messages += [Message("/late", t, behind)]
+        for topic, offset in (("/px4", 3 * SECOND), ("/booting", t)):  # us; 0 before the clock is known
+            messages.append(Message(topic, t, b"\0\1\0\0" + struct.pack("<Qf", (t - offset) // 1000, 1.0)))
     messages.append(Message("/once", 0, float64(0)))
-    found = {item.info.topic: item for item in read(write(topics, messages), tmp_path).facts()}
+    bag = read(write(topics, messages), tmp_path)
+    found = {item.info.topic: item for item in bag.facts()}
+    for raw in bag.raw_messages(["/usable", "/px4", "/late"]):  # as where a message must be decoded
+        definition = raw.channel.definition
+        assert header_stamp_ns(definition.decode(raw.data)) == definition.stamp_ns(raw.data) is not None
     stamps = {topic: item.stamps for topic, item in found.items()}
     assert stamps == {
         "/usable": "usable", "/zero": "zero", "/mixed": "mixed", "/none": "none", "/once": "none", "/big": "usable",
-        "/late": "usable", "/never": "none",
+        "/late": "usable", "/never": "none", "/px4": "usable", "/booting": "zero",
     }  # fmt: skip
     assert found["/usable"].stamp_offset == pytest.approx(7) and found["/big"].stamp_offset == 0
+    assert found["/px4"].stamp_offset == pytest.approx(3, abs=1e-6) and "timestamp" in found["/px4"].fields
     assert found["/none"].rate == pytest.approx(10) and found["/none"].largest_gap == pytest.approx(2.1)
     assert found["/once"].rate is None and found["/once"].largest_gap is None
     assert found["/never"].info.count == 0 and found["/never"].fields == ()

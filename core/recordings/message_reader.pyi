@@ -2,7 +2,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from uncertain_lti.base.arrays import Array, Integers
-from uncertain_lti.signals.field_path import FieldPath, TypeFields
+from uncertain_lti.signals.field_path import FieldPath, FieldType, TypeFields
 
 CODES: Mapping[str, str]
 """Type -> its code in struct and in numpy."""
@@ -40,4 +40,5 @@ class MessageReader:
     ) -> None: ...
     def read(self, data: bytes) -> tuple[int | None, Sequence[float]]: ...
 
+def is_timestamped(type_name: str, fields: Mapping[str, FieldType]) -> bool: ...
 def header_stamp_ns(message: Any) -> int | None: ...

@@ -49,13 +49,20 @@ NO_STAMP = -1
 _SHAPED_ODDLY = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
 
 
+def is_timestamped(type_name, fields):
+    """Whether messages of a type, with these fields, have a stamp in us of their own, as all of PX4."""
+    kind = fields.get("timestamp") if type_name.startswith("px4_msgs") else None
+    return kind is not None and kind.type_name == "uint64" and kind.array is None
+
+
 def header_stamp_ns(message):
     """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
-    if stamp is None:
-        return None
-    time = stamp.sec * 1_000_000_000 + stamp.nanosec
-    return time or None
+    if stamp is not None:
+        return stamp.sec * 1_000_000_000 + stamp.nanosec or None
+    if getattr(message, "__msgtype__", type(message).__module__).startswith("px4_msgs"):
+        return 1000 * int(getattr(message, "timestamp", 0)) or None
+    return None
 
 
 cdef union _Number:
@@ -137,7 +144,8 @@ cdef class Plan:
     cdef list codes, parts, every, functions
     cdef readonly bint able
     cdef bint named, met
-    cdef Py_ssize_t seconds, nanoseconds
+    cdef Py_ssize_t seconds, nanoseconds  # slots of a stamp, and ns of what is in the first
+    cdef int64_t unit
     cdef const uint8_t* data
     cdef Py_ssize_t at, size, reserved
     cdef bint big, untrue
@@ -158,6 +166,7 @@ cdef class Plan:
         self.top = self.node(FieldType("message", type_name), wants + self.stamp(type_name, len(paths)))
         stamp = self.parts[len(paths)]
         self.seconds, self.nanoseconds = stamp.get(0, -1), stamp.get(1, -1)
+        self.unit = 1_000_000_000 if self.nanoseconds >= 0 else 1000
         for parts, function in zip(self.parts, self.functions):
             if function is not None and any(self.codes[slot] in "qQ" for slot in parts.values()):
                 self.able = False  # a function of whole numbers takes them without rounding
@@ -169,6 +178,8 @@ cdef class Plan:
 
     def stamp(self, type_name, number):
         """What is wanted for the header stamp."""
+        if is_timestamped(type_name, self.fields_of(type_name)):
+            return [((("attribute", "timestamp"),), number, 0)]
         steps, kind = [], FieldType("message", type_name)
         for name in ("header", "stamp"):
             kind = self.fields_of(kind.type_name).get(name)
@@ -463,8 +474,12 @@ cdef class Plan:
                 values.append(self.computed(number, self.functions[number], self.row, np.asarray(self.place), data))
         stamp = None
         if self.seconds >= 0:
-            stamp = <int64_t>self.slots[self.seconds] * 1_000_000_000 + <int64_t>self.slots[self.nanoseconds] or None
+            stamp = self.stamp_of(self.slots) or None
         return what, (stamp, values)
+
+    cdef int64_t stamp_of(self, const double* slots) noexcept:
+        cdef int64_t rest = <int64_t>slots[self.nanoseconds] if self.nanoseconds >= 0 else 0
+        return <int64_t>slots[self.seconds] * self.unit + rest
 
     def read_all(self, buffer, int64_t[::1] begin, int64_t[::1] end, double[:, :] values, int64_t[::1] stamps):
         """Messages buffer[begin:end]; fills in a row of values and a stamp (`NO_STAMP` if none) of each.
@@ -485,7 +500,7 @@ cdef class Plan:
                 self.places = &place[i, 0]
             states[i] = self.walk(&data[begin[i]], end[i] - begin[i]) if end[i] > begin[i] else OTHER
             if self.seconds >= 0:
-                stamps[i] = <int64_t>row[i, self.seconds] * 1_000_000_000 + <int64_t>row[i, self.nanoseconds] or -1
+                stamps[i] = self.stamp_of(&row[i, 0]) or -1
             else:
                 stamps[i] = -1
         target = np.asarray(values)

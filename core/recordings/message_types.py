@@ -32,7 +32,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
+from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan, is_timestamped
 from uncertain_lti.recordings.unreadable import one_line
 from uncertain_lti.signals.field_path import FieldType, full_name
 
@@ -114,8 +114,11 @@ class Definition:
 
     @functools.cached_property
     def has_header(self) -> bool:
-        """Whether the type has a field `header` with a time stamp."""
-        header = self.fields(self.type_name).get("header")
+        """Whether the type has a field `header` with a time stamp, or a stamp of its own (`is_timestamped`)."""
+        fields = self.fields(self.type_name)
+        if is_timestamped(self.type_name, fields):
+            return True
+        header = fields.get("header")
         if header is None or header.kind != "message" or header.array is not None:
             return False
         stamp = self.fields(header.type_name).get("stamp")
