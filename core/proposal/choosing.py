@@ -243,14 +243,19 @@ class _Room:
         self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
 
 
-def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "") -> tuple[list[Candidate], str]:
-    """States of the model, and a sentence where they look like none; reasons go to what is left out."""
+def choose(
+    states: Sequence[Source], controls: Sequence[Source], like: str = "", asked: bool = False
+) -> tuple[list[Candidate], str]:
+    """States of the model, and a sentence where they look like none; reasons go to what is left out.
+
+    `asked`: a person named the topics of the states, which are of one model then whatever their rates.
+    """
     for source in states:
         prefer_rates(source)
     shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
     shown = [s for s in states if shows[s.topic] > SHOWS] or list(states)
     fastest = max(s.rate for s in shown)
-    slowest = _slowest(shown, controls, fastest)
+    slowest = min(s.rate for s in shown) if asked else _slowest(shown, controls, fastest)
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
     for source in (s for s in states if s is not main):

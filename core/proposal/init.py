@@ -508,7 +508,7 @@ def propose(
             raise BagError(f"{nothing}; give recordings of one machine, with the same topics and columns")
         named = "name the topics of its states in `uncertain-lti init --states`"
         raise BagError(f"{nothing}; record the machine at work, and longer, or {named}")
-    chosen, doubt = choose(measured, commands, like)
+    chosen, doubt = choose(measured, commands, like, bool(states))
     doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
     if like and {c.element for c in [*chosen, *used]} != {like}:
