@@ -229,6 +229,23 @@ def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
 
 
+@pytest.mark.parametrize("topic", ["/vehicle/steering_report", "/vehicle/throttle_report", "/vehicle/status"])
+def test_what_reports_is_measured(topic):
+    assert role_by_name(topic, "car_msgs/msg/Report") == "state"
+
+
+def test_a_gear_of_a_message_is_no_state(tmp_path):
+    rng, messages = np.random.default_rng(0), []
+    u = np.repeat(rng.normal(size=(100, 1)), 20, axis=0)
+    for k, speed in enumerate((10 + answers(rng, u, pole=0.95)[:, 0]).tolist()):
+        status = struct.pack("<4si4xd", bytes([0, 1, 0, 0]), int(speed > 10) + int(speed > 11), speed)
+        messages += [f64("/cmd", at(k) - MS, float(u[k, 0])), Message("/vehicle/status", at(k), status)]
+    status = Topic("/vehicle/status", "car/msg/Status", schema="int32 gear\nfloat64 speed")
+    proposal = propose([write([Topic("/cmd"), status], messages).save(tmp_path / "car.mcap")])
+    assert [c.path for c in proposal.states] == ["speed"], proposal.text
+    assert "gear" in proposal.text and "a code by its name" in proposal.text
+
+
 def test_a_magnetometer_and_a_frame_are_measured_though_their_type_says_little():
     for topic, kind in (("/ardrone/mag", "Vector3Stamped"), ("/b", "MagneticField"), ("tf", "TransformStamped")):
         assert role_by_name(topic, f"geometry_msgs/msg/{kind}") == "state"
