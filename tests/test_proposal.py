@@ -710,6 +710,31 @@ def test_two_sensors_of_one_row_are_both_states_and_what_is_computed_from_one_is
     assert [c.path for c in proposal.controls] == ["rate_cmd"]
 
 
+def test_wheels_of_one_axle_are_all_states(tmp_path):
+    """They move together but for what each sensor adds, and a wheel whose sensor was wrong had no verdict."""
+    rng, names = np.random.default_rng(0), ["front", "rear", "copy"]
+    u = np.repeat(rng.normal(size=(200, 1)), 20, axis=0)
+    speed, messages = 50 + 10 * answers(rng, u, pole=0.97)[:, 0], []
+    for k, value in enumerate(speed.tolist()):
+        front, rear = (value + 0.04 * rng.normal(size=2)).tolist()
+        messages.append(f64("/cmd", at(k) - MS, float(u[k, 0])))
+        messages.append(Message("/joint_states", at(k), joint_state(at(k), [front, rear, 2.0 * front], names), at(k)))
+    _, proposal = proposed(tmp_path, messages, {"/joint_states": JOINT})
+    assert [c.path for c in proposal.states] == ["position[front]", "position[rear]"], proposal.text
+    assert "position[copy]: moves with position[front]" in proposal.text
+
+
+def test_of_a_plant_every_thermometer_is_judged_though_they_agree_to_the_last_digit(tmp_path):
+    """Of four in a battery the first was judged alone, and no drift of another one was seen."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=(100, 1)), 20, axis=0)
+    heat = 30 + 5 * answers(rng, u, 0.01, 0.98)[:, 0]
+    columns = {f"temp_{i}": (heat + 0.02 * rng.normal(size=2000)).round(1) for i in (1, 2)}
+    columns |= {"temp_3": columns["temp_1"], "current_cmd": u[:, 0]}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 60.0 * np.arange(2000))])
+    assert [c.path for c in proposal.states] == ["temp_1", "temp_2"] and "temp_3: moves with temp_1" in proposal.text
+
+
 @pytest.mark.parametrize("step", [0.02, 60.0])
 def test_a_computed_average_is_no_state(tmp_path, step):
     """It would see a fault of itself alone, to the last digit, where a real one moves what it is computed from, too."""

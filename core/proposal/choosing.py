@@ -160,7 +160,7 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
     may = _may_move_with(pool)
     for candidate in pool:
         near = (c for c in kept if (id(c), id(candidate)) in may)
-        if twin := next((c for c in near if _moves_with(candidate, c, exact or _alike(candidate, c))), None):
+        if twin := next((c for c in near if _moves_with(candidate, c, exact or _each_its_own(candidate, c))), None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
@@ -202,16 +202,28 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     return one.topic == other.topic and of_table(one.topic) and len(names) == 1 and given
 
 
-def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
+def _each_its_own(one: Candidate, other: Candidate) -> bool:
+    """Whether two numbers of a topic are of parts that do the same, or each has a sensor with noise of its own."""
+    a, b = _together(one, other)
+    moving = len(a) >= FEWEST and min(np.ptp(a), np.ptp(b)) > 0
+    return _alike(one, other) or bool(moving and two_sensors(a, b))
+
+
+def _together(one: Candidate, other: Candidate) -> tuple[Array, Array]:
     a, b = np.concatenate(one.values), np.concatenate(other.values)
     both = np.isfinite(a) & np.isfinite(b)
-    a, b = a[both], b[both]
+    return a[both], b[both]
+
+
+def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
+    a, b = _together(one, other)
     if len(a) <= 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return False
     if not exact:
         return bool(abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
     slope, offset = np.polyfit(b, a, 1)
     last_digits = np.diff(np.unique(a)).min() + abs(slope) * np.diff(np.unique(b)).min()
+    last_digits *= not (_alike(one, other) and abs(slope - 1.0) < 0.05)  # rounded copies in one unit would be equal
     return bool(np.abs(a - slope * b - offset).max() <= last_digits + 1e-9 * np.ptp(a))
 
 
