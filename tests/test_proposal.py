@@ -532,6 +532,21 @@ def test_stamps_that_cannot_be_used_give_way_to_times_of_arrival(tmp_path, stamp
     assert fitted(paths, proposal).fit_summary["transitions"] > 300 * len(paths)
 
 
+@pytest.mark.parametrize("noise", [0.1, 0.0])
+def test_a_slower_sensor_is_a_state_where_the_faster_one_loses_little_at_its_instants(tmp_path, noise):
+    """Of a vehicle what its gyro gives was watched alone, as it is the fastest, and at 100 Hz was mostly noise."""
+    rng, messages, speed, turn, u = np.random.default_rng(0), [], 0.0, 0.0, 0.0
+    for k in range(4000):  # 100 Hz, and the speed at 25 Hz
+        u = float(rng.normal()) if k % 60 == 0 else u
+        speed, turn = 0.98 * speed + 0.02 * u, 0.97 * turn + 0.03 * u + 0.01 * float(rng.normal())
+        rate = f64("/imu/rate", at(k) // 2, turn + noise * float(rng.normal()))
+        messages += [f64("/cmd", at(k) // 2 - MS, u)] * (k % 2 == 0) + [rate]
+        messages += [f64("/wheels/speed", at(k) // 2 + 1000, speed + 0.01 * float(rng.normal()))] * (k % 4 == 0)
+    _, proposal = proposed(tmp_path, messages)
+    names, clock = (["rate", "speed"], "/wheels/speed") if noise else (["rate"], "/imu/rate")
+    assert [c.name for c in proposal.states] == names and f"\nclock: {clock}\n" in proposal.text, proposal.text
+
+
 def test_the_rate_that_is_told_is_that_of_the_times_that_count(tmp_path):
     """A simulation at a quarter of the real time was said to have 6.8 samples a second, and 29 were fitted."""
     states = [m for m in stamped(driven(), lambda log: 10**9 + (log - 10**9) // 4) if m.topic == "/plant/state"]

@@ -229,6 +229,11 @@ def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
 
 ALIKE = 0.8
 """Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
+SLOWER = 10.0
+"""Times the rate of a topic that of the fastest is at most, where both give states of one model."""
+BLURRED = 2.0
+"""Times the variance that one sample leaves unknown of the next at their own rate that is left at a slower one, from
+which on the numbers of a topic move in between."""
 STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
@@ -253,10 +258,11 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
     shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
     shown = [s for s in states if shows[s.topic] > SHOWS] or list(states)
     fastest = max(s.rate for s in shown)
+    slowest = _slowest(shown, [c for s in controls for c in s.free])
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
     for source in (s for s in states if s is not main):
-        at_its_rate = ALIKE * fastest <= source.rate <= fastest / ALIKE
+        at_its_rate = ALIKE * slowest <= source.rate <= fastest / ALIKE
         if source in shown and at_its_rate:
             pool += source.free
             continue
@@ -290,6 +296,43 @@ def choose(states: Sequence[Source], controls: Sequence[Source], like: str = "")
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
     return keep, doubt
+
+
+def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
+    """Rate of the slowest topic that tells what no faster one does, and at whose instants these lose little, 1/s."""
+    first, *others = sorted(states, key=lambda s: -s.rate)
+    faster, slowest = [first], first.rate
+    for source in others:
+        if source.rate < first.rate / SLOWER:
+            break
+        if source.rate < ALIKE * slowest and _tells_more(source, faster, used):
+            if not all(_known_at(source, other, used) for other in faster):
+                break
+            slowest = source.rate
+        faster.append(source)
+    return slowest
+
+
+def _tells_more(source: Source, faster: Sequence[Source], used: Sequence[Candidate]) -> bool:
+    """Whether some number of a topic, which is more than noise, is no function of one of faster topics."""
+    others = [c for s in faster for c in s.free]
+    steps, n = steps_of([*others, *source.free], used), len(others)
+    if len(steps.X) < FEWEST:
+        return False
+    own = ~functions(steps.X)[:n, n:].any(axis=0)
+    return bool((own & (predicted(steps.X, steps.U, steps.X + steps.dX)[n:] >= NOISE)).any())
+
+
+def _known_at(slower: Source, source: Source, used: Sequence[Candidate]) -> bool:
+    """Whether the numbers of a topic that are more than noise are known as well from one instant of a slower one."""
+    n, shares = len(source.free), []
+    for beside in ([], slower.free[:1]):
+        steps = steps_of([*source.free, *beside], used)
+        if len(steps.X) < FEWEST:
+            return False
+        shares.append(predicted(steps.X[:, :n], steps.U, (steps.X + steps.dX)[:, :n]))
+    own, slow = (share[shares[0] >= NOISE] for share in shares)
+    return bool(((slow >= NOISE) & (1.0 - slow <= BLURRED * (1.0 - own))).all())
 
 
 def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
