@@ -32,7 +32,7 @@ from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.identification.evidence import functions
 from uncertain_lti.proposal import init
 from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column, steps_of
-from uncertain_lti.proposal.choosing import _may_move_with, _move_together, choose
+from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
@@ -227,6 +227,23 @@ def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_
 )  # fmt: skip
 def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
+
+
+@pytest.mark.parametrize("topic", ["/vehicle/steering_report", "/vehicle/throttle_report", "/vehicle/status"])
+def test_what_reports_is_measured(topic):
+    assert role_by_name(topic, "car_msgs/msg/Report") == "state"
+
+
+def test_a_gear_of_a_message_is_no_state(tmp_path):
+    rng, messages = np.random.default_rng(0), []
+    u = np.repeat(rng.normal(size=(100, 1)), 20, axis=0)
+    for k, speed in enumerate((10 + answers(rng, u, pole=0.95)[:, 0]).tolist()):
+        status = struct.pack("<4si4xd", bytes([0, 1, 0, 0]), int(speed > 10) + int(speed > 11), speed)
+        messages += [f64("/cmd", at(k) - MS, float(u[k, 0])), Message("/vehicle/status", at(k), status)]
+    status = Topic("/vehicle/status", "car/msg/Status", schema="int32 gear\nfloat64 speed")
+    proposal = propose([write([Topic("/cmd"), status], messages).save(tmp_path / "car.mcap")])
+    assert [c.path for c in proposal.states] == ["speed"], proposal.text
+    assert "gear" in proposal.text and "a code by its name" in proposal.text
 
 
 def test_a_magnetometer_and_a_frame_are_measured_though_their_type_says_little():
@@ -515,6 +532,21 @@ def test_stamps_that_cannot_be_used_give_way_to_times_of_arrival(tmp_path, stamp
     assert fitted(paths, proposal).fit_summary["transitions"] > 300 * len(paths)
 
 
+@pytest.mark.parametrize("noise", [0.1, 0.0])
+def test_a_slower_sensor_is_a_state_where_the_faster_one_loses_little_at_its_instants(tmp_path, noise):
+    """Of a vehicle what its gyro gives was watched alone, as it is the fastest, and at 100 Hz was mostly noise."""
+    rng, messages, speed, turn, u = np.random.default_rng(0), [], 0.0, 0.0, 0.0
+    for k in range(4000):  # 100 Hz, and the speed at 25 Hz
+        u = float(rng.normal()) if k % 60 == 0 else u
+        speed, turn = 0.98 * speed + 0.02 * u, 0.97 * turn + 0.03 * u + 0.01 * float(rng.normal())
+        rate = f64("/imu/rate", at(k) // 2, turn + noise * float(rng.normal()))
+        messages += [f64("/cmd", at(k) // 2 - MS, u)] * (k % 2 == 0) + [rate]
+        messages += [f64("/wheels/speed", at(k) // 2 + 1000, speed + 0.01 * float(rng.normal()))] * (k % 4 == 0)
+    _, proposal = proposed(tmp_path, messages)
+    names, clock = (["rate", "speed"], "/wheels/speed") if noise else (["rate"], "/imu/rate")
+    assert [c.name for c in proposal.states] == names and f"\nclock: {clock}\n" in proposal.text, proposal.text
+
+
 def test_the_rate_that_is_told_is_that_of_the_times_that_count(tmp_path):
     """A simulation at a quarter of the real time was said to have 6.8 samples a second, and 29 were fitted."""
     states = [m for m in stamped(driven(), lambda log: 10**9 + (log - 10**9) // 4) if m.topic == "/plant/state"]
@@ -693,6 +725,31 @@ def test_two_sensors_of_one_row_are_both_states_and_what_is_computed_from_one_is
     assert [c.path for c in proposal.controls] == ["rate_cmd"]
 
 
+def test_wheels_of_one_axle_are_all_states(tmp_path):
+    """They move together but for what each sensor adds, and a wheel whose sensor was wrong had no verdict."""
+    rng, names = np.random.default_rng(0), ["front", "rear", "copy"]
+    u = np.repeat(rng.normal(size=(200, 1)), 20, axis=0)
+    speed, messages = 50 + 10 * answers(rng, u, pole=0.97)[:, 0], []
+    for k, value in enumerate(speed.tolist()):
+        front, rear = (value + 0.04 * rng.normal(size=2)).tolist()
+        messages.append(f64("/cmd", at(k) - MS, float(u[k, 0])))
+        messages.append(Message("/joint_states", at(k), joint_state(at(k), [front, rear, 2.0 * front], names), at(k)))
+    _, proposal = proposed(tmp_path, messages, {"/joint_states": JOINT})
+    assert [c.path for c in proposal.states] == ["position[front]", "position[rear]"], proposal.text
+    assert "position[copy]: moves with position[front]" in proposal.text
+
+
+def test_of_a_plant_every_thermometer_is_judged_though_they_agree_to_the_last_digit(tmp_path):
+    """Of four in a battery the first was judged alone, and no drift of another one was seen."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=(100, 1)), 20, axis=0)
+    heat = 30 + 5 * answers(rng, u, 0.01, 0.98)[:, 0]
+    columns = {f"temp_{i}": (heat + 0.02 * rng.normal(size=2000)).round(1) for i in (1, 2)}
+    columns |= {"temp_3": columns["temp_1"], "current_cmd": u[:, 0]}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 60.0 * np.arange(2000))])
+    assert [c.path for c in proposal.states] == ["temp_1", "temp_2"] and "temp_3: moves with temp_1" in proposal.text
+
+
 @pytest.mark.parametrize("step", [0.02, 60.0])
 def test_a_computed_average_is_no_state(tmp_path, step):
     """It would see a fault of itself alone, to the last digit, where a real one moves what it is computed from, too."""
@@ -777,7 +834,7 @@ def test_what_is_looked_for_at_once_leaves_out_nothing(seed, missing):
     X[rng.random(X.shape) < 0.1 * missing] = rng.choice([np.nan, np.inf])
     table = Source("/table", "table", "state", False, None)
     pool = [Candidate(table, f"c{j}", [column[:50], column[50:]]) for j, column in enumerate(X.T)]
-    pairs = [(a, b) for a, b in combinations(pool, 2) if _move_together(*(np.concatenate(c.values) for c in (b, a)))]
+    pairs = [(a, b) for a, b in combinations(pool, 2) if _moves_with(b, a)]
     assert {(id(a), id(b)) for a, b in pairs} <= _may_move_with(pool)
 
 

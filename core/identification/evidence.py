@@ -49,6 +49,8 @@ FOLLOWS = 0.15
 WHITE, OWN = 0.3, 0.5
 """Correlation from sample to sample up to which a difference of two signals is noise, and the share of it that each of
 two sensors has of its own."""
+ROUNDED = 1e-6
+"""Standard deviation of the difference of two signals, as a share, up to which it is rounding."""
 _ENOUGH, _STRETCH = 5_000_000, 128  # elements of the regressors from which on stretches of samples do
 _STRETCHES = 10  # of the samples, dealt out to the halves in turn
 _CLIP = 5.0
@@ -147,7 +149,7 @@ def two_sensors(a: Array, b: Array) -> bool:
     (rest,) = left(a[:, None], b)
     past = [z[lag : len(z) - 2 + lag] for z in (a, b) for lag in (0, 1)]
     own = min(left(np.column_stack([other[2:], *past]), one[2:])[0].std() for one, other in ((a, b), (b, a)))
-    if not own > OWN * rest.std():
+    if not own > max(OWN * rest.std(), ROUNDED):
         return False
     return bool(abs(np.corrcoef(rest[1:], rest[:-1])[0, 1]) < WHITE)
 

@@ -331,7 +331,7 @@ _STATE = re.compile(
     r"depth|pressure|temperature|power|attitude|estimat|log|loc$|response|data$|(^|_)mag(net|_|$)|compass|transform)"
 )
 _FORCE, _ESC = re.compile(r"thrust.*_(g|gf|kgf?|k?n|lbf?)$"), re.compile(r"throttle|pwm|(^|_)esc(_|$)")  # on a stand
-_ANSWER = re.compile(r"(state|states|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
+_ANSWER = re.compile(r"(state|states|status|report|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 _TOLD = re.compile(
     r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|alt(itude)?|heading|height|humidity|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
@@ -445,8 +445,11 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     return warnings
 
 
-_CODE = re.compile(r"(^|_)(mode|status|state|flag|gear)(_?\d+)?$")
-"""Name of a column that, with whole numbers up to `_LABELS` of them, says what a machine was switched to."""
+_CODE = re.compile(r"(^|[_.])(mode|status|state|flag|gear)(_?\d+)?$")
+"""Name of a number that, with whole numbers up to `_LABELS` of them, says what a machine was switched to."""
+
+
+_NO_AMOUNTS = "a code by its name, and its numbers are no amounts"
 
 
 def _is_code(candidate: Candidate) -> bool:
@@ -455,12 +458,14 @@ def _is_code(candidate: Candidate) -> bool:
 
 
 def take_switches(sources: Sequence[Source]) -> list[Source]:
-    """Columns of tables that are switched, which leave the measurements and may be controls."""
+    """Columns of tables that are switched, which leave the measurements and may be controls; codes are no states."""
     found, driven = [], any(s.role == "control" and s.free for s in sources)
+    for candidate in (c for s in sources if s.type != TABLE and s.role in ("state", "") for c in s.free if _is_code(c)):
+        candidate.reason, candidate.ready = _NO_AMOUNTS, "control"
     for table in (s for s in sources if s.type == TABLE and s.role == "state"):
         codes = [c for c in table.free if _is_code(c)]
         for candidate in codes * driven:  # else it may be the only control
-            candidate.reason, candidate.ready = "a code by its name, and its numbers are no amounts", "control"
+            candidate.reason, candidate.ready = _NO_AMOUNTS, "control"
         if turned := codes * (not driven) + [c for c in table.candidates if c.reason == TWO_VALUES and not c.flickers]:
             found.append(table.parted(turned, "switch"))
         for candidate in turned:

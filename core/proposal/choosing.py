@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Choosing: states and controls, as many as the recordings carry; of process data, all that is measured."""
+"""Choosing: states and controls, as many as the recordings carry."""
 
 from __future__ import annotations
 
@@ -19,12 +19,10 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.evidence import (
-    FASTEST,
     LONGEST_DELAY,
     NOISE,
     from_both_ends,
     functions,
-    held_for,
     lags,
     predicted,
     size_of,
@@ -35,7 +33,6 @@ from uncertain_lti.proposal.candidates import (
     FEWEST,
     OF_QUATERNION,
     SHOWS,
-    TWO_VALUES,
     Candidate,
     Source,
     Steps,
@@ -44,9 +41,6 @@ from uncertain_lti.proposal.candidates import (
     most_shown,
     steps_of,
 )
-from uncertain_lti.proposal.signals_file import set_own_scale
-from uncertain_lti.recordings.table_times import field_name
-from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.values import TABLE, of_table
 
 SHORT_DELAY = 3
@@ -67,7 +61,8 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     function = functions(steps.X)
     for i, j in np.argwhere(function).tolist():
         twins = _alike(pool[i], pool[j]) or two_sensors(*steps.X[:, [i, j]].T)
-        function[i, j] = not twins or _move_together(steps.X[:, j], steps.X[:, i], exact=True)
+        copy = pool[i].topic == pool[j].topic and _moves_with(pool[j], pool[i], exact=True)
+        function[i, j] = copy or not twins
 
     def drop(i: int, source: int) -> None:
         of = pool[source]
@@ -166,9 +161,7 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
     may = _may_move_with(pool)
     for candidate in pool:
         near = (c for c in kept if (id(c), id(candidate)) in may)
-        mine = np.concatenate(candidate.values)
-        same = (c for c in near if _move_together(mine, np.concatenate(c.values), exact or _alike(candidate, c)))
-        if twin := next(same, None):
+        if twin := next((c for c in near if _moves_with(candidate, c, exact or _each_its_own(candidate, c))), None):
             candidate.reason = f"moves with {twin.path}"
         else:
             kept.append(candidate)
@@ -176,7 +169,7 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
 
 
 def _may_move_with(pool: Sequence[Candidate]) -> set[tuple[int, int]]:
-    """Pairs of which `_move_together` may hold, each the one before the other: all correlations of a topic at once."""
+    """Pairs of which `_moves_with` may hold, each the one before the other: all correlations of a topic at once."""
     may: set[tuple[int, int]] = set()
     of_topic: dict[tuple[str, int], list[Candidate]] = {}
     for candidate in pool:
@@ -210,15 +203,28 @@ def _alike(one: Candidate, other: Candidate) -> bool:
     return one.topic == other.topic and of_table(one.topic) and len(names) == 1 and given
 
 
-def _move_together(a: Array, b: Array, exact: bool = False) -> bool:
+def _each_its_own(one: Candidate, other: Candidate) -> bool:
+    """Whether two numbers of a topic are of parts that do the same, or each has a sensor with noise of its own."""
+    a, b = _together(one, other)
+    moving = len(a) >= FEWEST and min(np.ptp(a), np.ptp(b)) > 0
+    return _alike(one, other) or bool(moving and two_sensors(a, b))
+
+
+def _together(one: Candidate, other: Candidate) -> tuple[Array, Array]:
+    a, b = np.concatenate(one.values), np.concatenate(other.values)
     both = np.isfinite(a) & np.isfinite(b)
-    a, b = a[both], b[both]
+    return a[both], b[both]
+
+
+def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
+    a, b = _together(one, other)
     if len(a) <= 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return False
     if not exact:
         return bool(abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
     slope, offset = np.polyfit(b, a, 1)
     last_digits = np.diff(np.unique(a)).min() + abs(slope) * np.diff(np.unique(b)).min()
+    last_digits *= not (_alike(one, other) and abs(slope - 1.0) < 0.05)  # rounded copies in one unit would be equal
     return bool(np.abs(a - slope * b - offset).max() <= last_digits + 1e-9 * np.ptp(a))
 
 
@@ -226,6 +232,9 @@ ALIKE = 0.8
 """Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
 SLOWER = 10.0
 """Times the rate of a topic that of the fastest is at most, where both give states of one model."""
+BLURRED = 2.0
+"""Times the variance that one sample leaves unknown of the next at their own rate that is left at a slower one, from
+which on the numbers of a topic move in between."""
 STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
@@ -255,7 +264,8 @@ def choose(
     shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
     shown = [s for s in states if shows[s.topic] > SHOWS] or list(states)
     fastest = max(s.rate for s in shown)
-    slowest = min(s.rate for s in shown) if asked else _slowest(shown, controls, fastest)
+    used = [c for s in controls for c in s.free]
+    slowest = min(s.rate for s in shown) if asked else _slowest(shown, used)
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)
     for source in (s for s in states if s is not main):
@@ -269,7 +279,7 @@ def choose(
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
-    pool, used = _one_element(drop_copies(pool), [c for s in controls for c in s.free], like)
+    pool, used = _one_element(drop_copies(pool), used, like)
     used = drop_copies(used)
     before = drop_functions(steps_of(pool, used), pool)
     pool, doubt = drop_noise(before, used)
@@ -295,16 +305,41 @@ def choose(
     return keep, doubt
 
 
-def _slowest(states: Sequence[Source], controls: Sequence[Source], fastest: float) -> float:
-    """Rate of the slowest topic of states, 1/s: one in which a control shows that shows in no faster topic."""
-    used, told = [c for s in controls for c in s.free], np.zeros(1)
-    slowest, near = fastest, [s for s in states if s.rate >= fastest / SLOWER]
-    for source in sorted(near, key=lambda s: -s.rate) if min(s.rate for s in near) < ALIKE * fastest else ():
-        shown = _driven(source.free, used)[1:].max(axis=1, initial=0.0)
-        if ((shown > SHOWS) & (told <= SHOWS)).any():
+def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
+    """Rate of the slowest topic that tells what no faster one does, and at whose instants these lose little, 1/s."""
+    first, *others = sorted(states, key=lambda s: -s.rate)
+    faster, slowest = [first], first.rate
+    for source in others:
+        if source.rate < first.rate / SLOWER:
+            break
+        if source.rate < ALIKE * slowest and _tells_more(source, faster, used):
+            if not all(_known_at(source, other, used) for other in faster):
+                break
             slowest = source.rate
-        told = np.maximum(told, shown)
+        faster.append(source)
     return slowest
+
+
+def _tells_more(source: Source, faster: Sequence[Source], used: Sequence[Candidate]) -> bool:
+    """Whether some number of a topic, which is more than noise, is no function of one of faster topics."""
+    others = [c for s in faster for c in s.free]
+    steps, n = steps_of([*others, *source.free], used), len(others)
+    if len(steps.X) < FEWEST:
+        return False
+    own = ~functions(steps.X)[:n, n:].any(axis=0)
+    return bool((own & (predicted(steps.X, steps.U, steps.X + steps.dX)[n:] >= NOISE)).any())
+
+
+def _known_at(slower: Source, source: Source, used: Sequence[Candidate]) -> bool:
+    """Whether the numbers of a topic that are more than noise are known as well from one instant of a slower one."""
+    n, shares = len(source.free), []
+    for beside in ([], slower.free[:1]):
+        steps = steps_of([*source.free, *beside], used)
+        if len(steps.X) < FEWEST:
+            return False
+        shares.append(predicted(steps.X[:, :n], steps.U, (steps.X + steps.dX)[:, :n]))
+    own, slow = (share[shares[0] >= NOISE] for share in shares)
+    return bool(((slow >= NOISE) & (1.0 - slow <= BLURRED * (1.0 - own))).all())
 
 
 def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
@@ -437,166 +472,3 @@ def _delay(states: Sequence[Candidate], used: Sequence[Candidate]) -> None:
             return
         first = max(found, key=lambda j: found[j][1])
         used[first].delay += found[first][0]
-
-
-MOST_VALUES = 8
-"""Values of a command that is switched, at most."""
-TOLD = 0.9
-"""Share of a measurement that the controls of the same row tell from which on it answers within a row."""
-LASTS = 0.5
-"""Share of what they do not tell that the row before tells, from which on it has a memory of its own."""
-RARE = 0.05
-"""Share of the rows in which a set point changes, up to which nothing before tells of its changes."""
-_BY_NAME = "set by a controller or a person, by its name; "
-HELD = 0.8
-"""Share of an analyser's changes that come after the same number of rows, two or more."""
-GATED = 0.99
-"""Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
-_WEATHER = re.compile(r"(^|_)(outdoor|outside|ambient|wea(ther|bus_|sta_))(?!.*(coil|damper|fan|flow|pump|unit|valve))")
-_READ = re.compile(r"temperature|humidity|pressure|voltage")
-"""What is measured by its name, also where a sensor gives whole numbers and few of them."""
-_TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
-
-
-def is_plant(sources: Sequence[Source]) -> bool:
-    """Whether recordings are tables of a row per second or slower."""
-    there = [s for s in sources if s.candidates]
-    return bool(there) and all(s.type == TABLE and s.rate <= FASTEST for s in there)
-
-
-def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Candidate]]:
-    """States and controls, each with `why`; reasons go to what is left out.
-
-    What is measured is a state, also where it is mostly noise from row to row: its level is judged. What is switched,
-    set, or flows only while something is switched on is a control.
-    """
-    every = [c for s in sources for c in s.candidates if c.values]
-    for candidate in every:
-        if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason):  # what hardly moves is a signal, too
-            candidate.reason = ""
-    drop_copies([c for c in every if not c.reason and np.ptp(c.finite) > 0], exact=True)
-    free = [c for c in every if not c.reason]
-    called = {c for s in sources if s.role in ("control", "reference") for c in s.candidates}
-    controls = [c for c in free if _is_set(c, c in called)]
-    switches = [c for c in controls if c.why.startswith("switched")]
-    for candidate in free:
-        on = next((s for s in switches if _gated(candidate, s)), None) if candidate not in controls else None
-        if on is not None:
-            candidate.why = f"0 whenever {on.path} is off"
-            controls.append(candidate)
-    stem = {c: re.sub(r"\d+", "*", c.path) for c in free}  # of `F_PU1` and `F_PU2`, and not of one unit's
-    stems = [stem[c] for c in controls if not c.why.startswith("always")]
-    alike = [c for c in free if c not in controls and stems.count(stem[c]) > 1]
-    for candidate in alike if len(controls) + len(alike) < len(free) else ():  # they go together, unless none is left
-        candidate.why = f"one of the {stem[candidate]}, of which the others are controls"
-        controls.append(candidate)
-    controls += _set_or_analysed([c for c in free if c not in controls])
-    known = [c for c in controls if not c.judged]
-    for candidate in free:
-        if candidate not in controls and not candidate.reason and (share := _told(candidate, known)) >= TOLD:
-            candidate.reason = f"answers within a row: the controls of the same row tell {share:.0%} of it"
-            candidate.ready = "state"
-    for candidate in (c for c in controls if c.judged):
-        now, after = _in_turn(candidate)
-        if (moves := np.mean(now != after)) <= RARE or held_for(now, after):
-            candidate.judged = False
-            candidate.why = f"{_BY_NAME}not judged, as it changes in {moves:.1%} of the rows only"
-    states = [c for c in free if c not in controls and not c.reason]
-    for candidate in states:
-        told = _known(candidate)
-        candidate.why = f"one row tells {told:.0%} of the next" if told > 0.5 else "mostly noise from row to row"
-    for source in sources:
-        source.reason = ""
-    for candidate in free:
-        set_own_scale(candidate)
-        candidate.name, candidate.scale = field_name(FieldPath(candidate.path).angle), candidate.scale or 1.0
-        candidate.steady = 0.0  # what returns to its median would alarm on every change of load
-    return states, [c for c in free if c in controls]
-
-
-def _is_set(candidate: Candidate, called: bool) -> bool:
-    """Whether a column is a control by its values or its name, or is `called` one; says why."""
-    values = np.unique(candidate.finite)
-    few = MOST_VALUES if (values == np.rint(values)).all() else 2
-    by_name = called or _TURNED.search(candidate.path.removesuffix("_mV").lower())  # no manipulated variable
-    if len(values) == 1:
-        candidate.why = (
-            f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"
-        )
-    elif len(values) <= (few if by_name or not _READ.search(candidate.path.lower()) else 2) and not candidate.flickers:
-        candidate.why = f"switched between {', '.join(f'{v + 0.0:.6g}' for v in values)}"
-    elif _WEATHER.search(candidate.path.lower()):
-        candidate.why = "the weather, by its name, which is no fault of the machine"
-    elif by_name:
-        candidate.why, candidate.judged = f"{_BY_NAME}judged as well", True
-    else:
-        return False
-    return True
-
-
-def _gated(candidate: Candidate, switch: Candidate) -> bool:
-    """Whether a column is 0 when a switch is at its least value, and nearly only then."""
-    for values, on in zip(candidate.values, switch.values, strict=True):
-        off = on == np.nanmin(np.concatenate(switch.values))
-        if np.mean((values == 0) == off) < GATED or np.count_nonzero(values[off] == 0) < FEWEST:
-            return False
-    return True
-
-
-def _held_for(candidate: Candidate) -> int:
-    """Rows for which nearly every value is held; 0 where it is not."""
-    gaps = np.concatenate([np.diff(np.flatnonzero(np.diff(v) != 0)) for v in candidate.values])
-    if len(gaps) < FEWEST:
-        return 0
-    counts = np.bincount(gaps)
-    rows = int(np.argmax(counts))
-    return rows if rows > 1 and counts[rows] >= HELD * len(gaps) else 0
-
-
-def _set_or_analysed(measured: Sequence[Candidate]) -> list[Candidate]:
-    """Of columns that hold each value for some rows those that are set; the others, which an analyser holds, go.
-
-    A set value shows in the next rows of what is measured, of which none tells before what it will be. Columns that
-    hold as long are of one analyser, unless most of them are set: a controller acts on some of what an analyser says.
-    """
-    held = {c: rows for c in measured if (rows := _held_for(c))}
-    rest, found = [c for c in measured if c not in held and np.ptp(c.finite) > 0], []
-    for rows in dict.fromkeys(held.values()) if rest else ():
-        group = [c for c in held if held[c] == rows]
-        leads = steps_of(rest, group).effects()[1:].max(axis=1, initial=0.0) > SHOWS
-        for j, candidate in enumerate(group):
-            before = steps_of([candidate], rest)
-            set_at = before.dX[:, 0] != 0
-            leads[j] &= Steps(before.X[set_at], before.U[set_at], before.dX[set_at]).effects()[0, 0] <= SHOWS
-        found += group if 2 * leads.sum() > len(group) else []
-    for candidate, rows in held.items():
-        candidate.why = f"set, for {rows} rows each: the others follow it"
-        if candidate not in found:
-            candidate.reason, candidate.ready = f"an analyser: holds each value for {rows} rows", "state"
-    return found
-
-
-def _told(candidate: Candidate, controls: Sequence[Candidate]) -> float:
-    """Share of the variance that a linear function of the controls of the same row tells; 0 if the rest lasts."""
-    columns = np.column_stack([np.concatenate(c.values) for c in [candidate, *controls]])
-    columns = columns[np.isfinite(columns).all(axis=1)]
-    y, U = columns[:, 0], np.column_stack([columns[:, 1:], np.ones(len(columns))])
-    if len(y) < FEWEST * U.shape[1] or y.var() == 0:
-        return 0.0
-    rest = y - U @ np.linalg.lstsq(U, y, rcond=None)[0]
-    lasts = rest.std() > 1e-9 * y.std() and float(np.corrcoef(rest[1:], rest[:-1])[0, 1]) ** 2 >= LASTS
-    return 0.0 if lasts else 1.0 - float(rest.var() / y.var())
-
-
-def _known(candidate: Candidate) -> float:
-    """Share of the variance of the next row that one row tells."""
-    now, after = _in_turn(candidate)
-    if len(now) < 3 or np.ptp(now) == 0 or np.ptp(after) == 0:
-        return 0.0
-    return float(np.corrcoef(now, after)[0, 1]) ** 2
-
-
-def _in_turn(candidate: Candidate) -> Array:
-    """Numbers of rows, and of the next ones (2, N), where both have one."""
-    pairs = np.hstack([np.stack([v[:-1], v[1:]]) for v in candidate.values])
-    return np.asarray(pairs[:, np.isfinite(pairs).all(axis=0)])

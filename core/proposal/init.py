@@ -45,7 +45,8 @@ from uncertain_lti.proposal.candidates import (
     set_aside_labels,
     take_switches,
 )
-from uncertain_lti.proposal.choosing import choose, is_plant, plant_signals
+from uncertain_lti.proposal.choosing import choose
+from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
     columns_of,
     endless,
