@@ -27,8 +27,7 @@ from uncertain_lti.plants.leibov import leibov2006, transient
 from uncertain_lti.reports.model_text import detectable_blocks, detectable_data
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 from uncertain_lti.validation import detectable as module
-from uncertain_lti.validation.detectable import FEWEST, detectable, typical_within
-from uncertain_lti.validation.injection import KINDS, Windows, faulty
+from uncertain_lti.validation.detectable import FEWEST, KINDS, Windows, detectable, faulty, typical_within
 from uncertain_lti.validation.intervals import quantile_share_interval, share_interval
 from uncertain_lti.validation.left_out import validate
 

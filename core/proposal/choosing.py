@@ -306,14 +306,17 @@ def choose(
 
 
 def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
-    """Rate of the slowest topic that tells what no faster one does, and at whose instants these lose little, 1/s."""
+    """Rate of the slowest topic that tells what no faster one does, 1/s.
+
+    At its instants these lose little, or a control shows in it that shows in none of them.
+    """
     first, *others = sorted(states, key=lambda s: -s.rate)
     faster, slowest = [first], first.rate
     for source in others:
         if source.rate < first.rate / SLOWER:
             break
         if source.rate < ALIKE * slowest and _tells_more(source, faster, used):
-            if not all(_known_at(source, other, used) for other in faster):
+            if not all(_known_at(source, other, used) for other in faster) and not _driven_more(source, faster, used):
                 break
             slowest = source.rate
         faster.append(source)
@@ -340,6 +343,12 @@ def _known_at(slower: Source, source: Source, used: Sequence[Candidate]) -> bool
         shares.append(predicted(steps.X[:, :n], steps.U, (steps.X + steps.dX)[:, :n]))
     own, slow = (share[shares[0] >= NOISE] for share in shares)
     return bool(((slow >= NOISE) & (1.0 - slow <= BLURRED * (1.0 - own))).all())
+
+
+def _driven_more(source: Source, faster: Sequence[Source], used: Sequence[Candidate]) -> bool:
+    """Whether some control shows in a topic that shows in no faster one."""
+    there, *elsewhere = (_driven(s.free, used)[1:].max(axis=1, initial=0.0) > SHOWS for s in (source, *faster))
+    return bool((there & ~np.any(elsewhere, axis=0)).any())
 
 
 def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
