@@ -223,10 +223,38 @@ def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_
     [
         ("/controller/forward_kinematics", ""), ("/arm_controller/state", "state"), ("/motor_controls", "control"),
         ("/thruster/cmd/left", "control"), ("/controller/cmd_out", "control"), ("/u_speed", "control"),
+        ("/commands/motor/speed", "control"), ("/lbr/command/joint_position", "control"),
+        ("/cmd_full_state", "control"), ("/commands/motor/state", "state"), ("/cmd_vel_feedback", "state"),
+        ("/motor/duty", "control"),
+        ("/mavros/rc/out", "control"), ("/mavros/rc/in", "reference"), ("/mavros/setpoint_raw/attitude", "reference"),
+        ("/engine/rpm", "state"), ("/wheel_vels", "state"), ("/tank/level", "state"), ("/elevator/position", "state"),
     ],
 )  # fmt: skip
 def test_a_controller_publishes_all_kinds(topic, role):
     assert role_by_name(topic, "std_msgs/msg/Float64") == role
+
+
+def test_what_a_message_says_of_a_controller_is_no_state(tmp_path):
+    """Of the state of a controller all was: what it follows, its errors, and what it puts out."""
+    paths, schema = [], "".join(f"float64 {name}\n" for name in ("reference", "feedback", "error", "output"))
+    for seed in range(2):
+        rng = np.random.default_rng(seed)
+        messages, x, goal, total = [], 0.0, 0.0, 0.0
+        for k in range(800):
+            goal = float(rng.normal()) if k % 60 == 0 else goal
+            y = x + 1e-3 * rng.normal()
+            total += 0.02 * (goal - y)
+            u = 2.0 * (goal - y) + total
+            numbers = struct.pack("<4d", goal, y, goal - y, u)
+            messages += [Message("/loop/pid_state", at(k), b"\0\1\0\0" + numbers), f64("/position", at(k) + MS, y)]
+            x += 0.02 * (-2.0 * x + 3.0 * u)
+        topics = [Topic("/loop/pid_state", "x_msgs/msg/Loop", schema=schema), Topic("/position")]
+        paths.append(write(topics, messages).save(tmp_path / f"{seed}.mcap"))
+    proposal = propose(paths)
+    assert signals_of(proposal) == ([("/loop/pid_state", "feedback")], [("/loop/pid_state", "output")]), proposal.text
+    assert "/loop/pid_state error: a controller's error" in proposal.text
+    assert "/position: says what /loop/pid_state feedback says already" in proposal.text.replace(" data", "")
+    fitted(paths, proposal)
 
 
 @pytest.mark.parametrize("topic", ["/vehicle/steering_report", "/vehicle/throttle_report", "/vehicle/status"])

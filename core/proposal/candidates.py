@@ -152,6 +152,7 @@ class Source:
     def parted(self, some: Collection[Candidate], role: str) -> Source:
         """Some of its numbers, which leave it for a topic of their own."""
         found = replace(self, candidates=[c for c in self.candidates if c in some], role=role, reason="")
+        found.arrival, found.stamp = [*self.arrival], [*self.stamp]
         self.candidates = [c for c in self.candidates if c not in some]
         for candidate in found.candidates:
             candidate.source = found
@@ -333,13 +334,16 @@ _STATE = re.compile(
 _FORCE, _ESC = re.compile(r"thrust.*_(g|gf|kgf?|k?n|lbf?)$"), re.compile(r"throttle|pwm|(^|_)esc(_|$)")  # on a stand
 _ANSWER = re.compile(r"(state|states|status|report|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
+_FOLLOWED = re.compile(r"setpoint[^/]*/|/rc/(in|override)$")  # topics below a folder, and what a pilot's sticks say
+_SENT = re.compile(
+    r"(^|/)(commands?|cmds?)/|(^|/)cmd_(?!.*(feedback|response|actual|report|status|odom))[^/]*$|/rc/out$|"
+    r"(^|[/_])(duty|ailerons?|elevons?|elevators?|rudders?)(_angle)?$"
+)
+_MEASURED = re.compile(r"(^|_)(rpm|altimeter|level|vels?|flow|current|voltage|temp|tacho\w*)(_|$)")
 _TOLD = re.compile(
     r"^err|error|(^|_)(acc(eleration)?(_?[xyz])?|adc\d*|alt(itude)?|heading|height|humidity|soc|volt(age)?|current|efficiency|vibration|pos|flags)(_|$)"
 )
 """Likewise, of what is measured or reckoned, in the names of columns."""
-
-FEWEST_SET, MOST_SET = 3, 0.2
-"""A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
 
 _PHYSICAL = re.compile(
     r"^(imu|jointstate|odometry|twist|pose|wrench|accel|vector3|quaternion|transformstamped|ackermann)"
@@ -368,6 +372,10 @@ def role_by_name(topic: str, type_name: str) -> str:
     kind = type_name.rpartition("/")[2].lower()
     if not is_physical(type_name) and any(_APART.search(text) for text in (last, name)):
         return "apart"
+    if _FOLLOWED.search(name):
+        return "reference"
+    if _SENT.search(name) and (last.startswith("cmd_") or not _ANSWER.search(last)):
+        return "control"
     for text in (last, name, kind):
         if _ANSWER.search(text):
             return "state"
@@ -376,9 +384,37 @@ def role_by_name(topic: str, type_name: str) -> str:
         bare_twist = text == last and (text.startswith("u_") or (kind == "twist" and text.endswith("vel")))  # of a base
         if bare_twist or (_ABOVE if text == name != last else _COMMAND).search(text):
             return "control"
-        if _STATE.search(text):
+        if _STATE.search(text) or _MEASURED.search(text):
             return "state"
     return ""
+
+
+_FIELDS = {
+    "reference": re.compile(
+        r"(desired|set_?point|target|goal|ref(erence)?)(_.*)?$|.*_(desired|setpoint|target|ref|des)$"
+    ),
+    "control": re.compile(r"(command(ed)?|cmd|output)(_.*)?$|.*_(command(ed)?|cmd)$"),
+    "error": re.compile(r"(error|err)(_.*)?$|.*_(error|err)$"),
+}
+"""Parts of a field's path by which it is no measurement, beside others that are."""
+
+
+def part_by_role(source: Source) -> list[Source]:
+    """What of a topic's numbers is no measurement leaves it: what a controller follows, and what it puts out."""
+    words = {c: re.findall(r"[^\W\d]\w*", re.sub(r"\[[^\]]*\]", "", c.path)) for c in source.free}
+    every = {word for some in words.values() for word in some}
+    found: dict[str, list[Candidate]] = {role: [] for role in _FIELDS}
+    for candidate, some in words.items():
+        desired = any(w.endswith("_d") and w[:-2] in every for w in some)
+        role = next((r for r, name in _FIELDS.items() if any(map(name.match, some))), "reference" if desired else "")
+        if role:
+            found[role].append(candidate)
+    errors = found.pop("error")
+    if not any(found.values()) or len(words) == len(errors) + sum(map(len, found.values())):
+        return []
+    for candidate in errors:
+        candidate.reason = "a controller's error, and what it follows is beside it"
+    return [source.parted(some, role) for role, some in found.items() if some]
 
 
 _BODY = {"u", "v"}, {"w", "p", "q", "r"}
@@ -414,6 +450,11 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
 
 TWO_VALUES = "takes two values only"
 """Why a measurement is no state; in a table it may be a switch."""
+
+
+def is_measured(name: str) -> bool:
+    """Whether a column says by its name that it is measured, or reckoned, and no command."""
+    return any(named.search(name.lower()) for named in (_STATE, _APART, _TOLD))
 
 
 def is_label(name: str) -> bool:
@@ -528,52 +569,3 @@ def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str
 def _plain(path: str) -> str:
     """A field path without what a pattern would take for a choice of letters."""
     return path.replace("[", "(").replace("]", ")")
-
-
-def _held_columns(table: Source) -> Source | None:
-    """Columns of a table that are held, and set now and then, if they show in the next step of the others.
-
-    What is measured by its name is none. They leave the table for a topic of their own, whose role is a guess.
-    """
-    if table.type != TABLE:
-        return None
-    changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
-    told = {c for c in table.free for named in (_STATE, _APART, _TOLD) if named.search(c.path.lower())}
-    held = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows) and c not in told]
-    rest = [c for c in table.free if c not in held]
-    shows = held and rest and most_shown(rest, held) > SHOWS
-    return table.parted(held, "guess") if shows else None
-
-
-def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
-    """Which topics are controls, and which may be the state."""
-    moving = [s for s in sources if s.free]
-    controls = [s for s in moving if s.role == "control"]
-    references = [s for s in moving if s.role == "reference"]
-    if not controls:
-        controls, references = references, []
-    for source in references:
-        source.reason = "a reference for some controller, and there is a command"
-    states = [s for s in moving if s.role == "state"]
-    unknown = unnamed = [s for s in moving if s.role == ""]
-    if controls and states and unknown and not any(explained(s, controls) > SHOWS for s in states):
-        states += [s for s in unknown if explained(s, controls) > SHOWS]
-        unknown = [s for s in unknown if s not in states]
-    if not states:
-        states, unknown = unknown, []
-    if not states and len(controls) > 1:  # commands everywhere by their names: the one that the others explain best
-        best = max(controls, key=lambda s: explained(s, [c for c in controls if c is not s]))
-        controls, states = [c for c in controls if c is not best], [best]
-    if not controls and not any(s.role == "control" for s in sources) and len(states) + len(unknown) > 1:
-        maybe = (s for s in unnamed if len(states) > 1 or s not in states)  # what is measured by its name is no command
-        effects = {s: max((explained(o, [s]) for o in states if o is not s), default=0.0) for s in maybe}
-        if effects and max(effects.values()) > SHOWS:
-            by_effect = max(effects, key=effects.__getitem__)
-            by_effect.role = "guess"
-            controls, states = [by_effect], [s for s in states if s is not by_effect]
-            unknown = [s for s in unknown if s is not by_effect]
-    if not controls:
-        controls = [held for source in states if (held := _held_columns(source)) is not None]
-    for source in unknown:
-        source.reason = "neither state nor control by its name or type"
-    return controls, states

@@ -37,6 +37,7 @@ from uncertain_lti.proposal.candidates import (
     Source,
     Steps,
     explained,
+    is_measured,
     is_physical,
     most_shown,
     steps_of,
@@ -250,6 +251,59 @@ class _Room:
         self.most = min(max(1, carried), most)
         many = f"others show more, and at most {most} {what} are tried together; exchange one if this matters"
         self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
+
+
+FEWEST_SET, MOST_SET = 3, 0.2
+"""A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
+
+
+def _held_columns(table: Source) -> Source | None:
+    """Columns of a table that are held, and set now and then, if they show in the next step of the others.
+
+    What is measured by its name is none. They leave the table for a topic of their own, whose role is a guess.
+    """
+    if table.type != TABLE:
+        return None
+    changed = {c: np.concatenate([np.diff(v) != 0 for v in c.values]) for c in table.free}
+    rarely = [c for c, rows in changed.items() if FEWEST_SET <= rows.sum() <= MOST_SET * len(rows)]
+    held = [c for c in rarely if not is_measured(c.path)]
+    rest = [c for c in table.free if c not in held]
+    shows = held and rest and most_shown(rest, held) > SHOWS
+    return table.parted(held, "guess") if shows else None
+
+
+def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
+    """Which topics are controls, and which may be the state."""
+    moving = [s for s in sources if s.free]
+    controls = [s for s in moving if s.role == "control"]
+    references = [s for s in moving if s.role == "reference"]
+    if not controls:
+        controls, references = references, []
+    for source in references:
+        source.reason = "a reference for some controller, and there is a command"
+    states = [s for s in moving if s.role == "state"]
+    unknown = unnamed = [s for s in moving if s.role == ""]
+    if controls and states and unknown and not any(explained(s, controls) > SHOWS for s in states):
+        states += [s for s in unknown if explained(s, controls) > SHOWS]
+        unknown = [s for s in unknown if s not in states]
+    if not states:
+        states, unknown = unknown, []
+    if not states and len(controls) > 1:  # commands everywhere by their names: the one that the others explain best
+        best = max(controls, key=lambda s: explained(s, [c for c in controls if c is not s]))
+        controls, states = [c for c in controls if c is not best], [best]
+    if not controls and not any(s.role == "control" for s in sources) and len(states) + len(unknown) > 1:
+        maybe = (s for s in unnamed if len(states) > 1 or s not in states)  # what is measured by its name is no command
+        effects = {s: max((explained(o, [s]) for o in states if o is not s), default=0.0) for s in maybe}
+        if effects and max(effects.values()) > SHOWS:
+            by_effect = max(effects, key=effects.__getitem__)
+            by_effect.role = "guess"
+            controls, states = [by_effect], [s for s in states if s is not by_effect]
+            unknown = [s for s in unknown if s is not by_effect]
+    if not controls:
+        controls = [held for source in states if (held := _held_columns(source)) is not None]
+    for source in unknown:
+        source.reason = "neither state nor control by its name or type"
+    return controls, states
 
 
 def choose(

@@ -34,18 +34,18 @@ from uncertain_lti.proposal.candidates import (
     Candidate,
     Source,
     ask_for,
-    assign_roles,
     at_rest,
     bare,
     clock_of,
     earlier,
     is_label,
+    part_by_role,
     role_by_name,
     role_of_column,
     set_aside_labels,
     take_switches,
 )
-from uncertain_lti.proposal.choosing import choose
+from uncertain_lti.proposal.choosing import assign_roles, choose
 from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
     columns_of,
@@ -134,6 +134,8 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
             source.candidates = _candidates(source, fact.fields)
             if not source.candidates:
                 source.reason = "no number in it"
+            elif role in ("state", ""):
+                sources += part_by_role(source)
     _limit(bags, sources)
     for bag in bags:
         _read(bag, [s for s in sources if s.candidates], progress)
