@@ -13,8 +13,8 @@
     ./run python benchmarks/fuzz.py --kinds structures --count 2000
     ./run python benchmarks/fuzz.py --count 1 --seed 4711      # one case again
 
-A case fails when anything but an error meant for a person comes out of it, when it takes over 5 s of processor time or
-a minute, when it asks for over 1 GiB of memory, or when its reading is wrong. A reading is wrong when the readers
+A case fails when anything but an error meant for a person comes out of it, when it takes over 10 s of processor time or
+hangs, when it asks for over 1 GiB of memory, or when its reading is wrong. A reading is wrong when the readers
 disagree (by message and by arrays, or layout and middleware), when a chunk whose checksum holds gives a message that
 was never written, or when an annotated copy holds other messages than were read, or another library cannot walk it.
 Files are damaged after they are written; structures are made to hurt (`tests/hostile_writer.py`): lengths that reach
@@ -60,7 +60,7 @@ from hostile_writer import hostile_file  # noqa: E402
 from perturbed import CASES, difference  # noqa: E402
 
 LIMIT_CPU_S = 10.0  # of processor time: a hang, also on a processor half as fast
-LIMIT_S = 60.0
+LIMIT_S = 600.0  # of time: only what waits for ever takes so long, however busy the machine is
 LIMIT_MEMORY = 1 << 30
 BATCH = 250
 JOINT_STATE, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"

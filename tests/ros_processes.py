@@ -30,7 +30,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from processes import LASTING, own_domain
+from processes import LASTING, adopt_orphans, own_domain
 from rcl_interfaces.srv import SetParametersAtomically
 from rclpy.context import Context
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
@@ -88,6 +88,7 @@ def until(condition: Callable[[], Any], what: str, patience: float = PATIENCE) -
 @cache
 def _server() -> subprocess.Popen[str]:
     """A process that has imported what nodes and commands need, which takes a second, and forks each of them."""
+    adopt_orphans()
     command = [sys.executable, "-u", "-c", _SERVER]
     server = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     LASTING.add(server.pid)

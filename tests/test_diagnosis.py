@@ -209,6 +209,14 @@ def test_delay_is_found_and_setting_it_mends_the_fit(lag, noise):
     assert (mended < plain).all()
 
 
+def test_noise_predicts_nothing_on_average_however_many_regressors_there_are():
+    rng = np.random.default_rng(0)
+    X, U, after = (rng.normal(size=(200, 40, k)) for k in (8, 2, 5))
+    shares = np.array([evidence.predicted(*drawn) for drawn in zip(X, U, after, strict=True)])
+    assert abs(shares.mean()) < 0.015 and shares.min() < 0.0  # 0.256 by chance if nothing is taken off
+    np.testing.assert_allclose(evidence.predicted(X[0], U[0], X[0] @ np.ones((8, 1)) + U[0] @ np.ones((2, 1))), 1.0)
+
+
 def test_a_delay_that_explains_next_to_nothing_of_many_states_is_not_named():
     """Of twelve states one follows the control late: sure of enough samples, and 0 % of what is unexplained."""
     rng, count, told = np.random.default_rng(3), 3000, {}

@@ -319,6 +319,8 @@ def test_boxes_hold_what_their_transitions_have(each: int, limited: bool) -> Non
         assert np.array_equal(low[:, b], moved[:, inside].min(axis=1))
         assert np.array_equal(high[:, b], moved[:, inside].max(axis=1))
         assert np.array_equal(room[:, b], np.vstack(left)[:, inside].min(axis=1))
+    given = (model.tables, z, dt, after, None, widest, numbers, boxes - 1)
+    refuses(ValueError, "the boxes do not fit the transitions", arithmetic.boxes_of, *given)
 
 
 def test_what_a_tile_is_filled_up_with_counts_nowhere_and_on_a_bound_is_not_outside() -> None:

@@ -239,6 +239,16 @@ def test_memory_stays_flat_and_every_sample_is_accounted_for() -> None:
     assert "live is offline" in done.stdout and ", 0 alarms" not in done.stdout
 
 
+@pytest.mark.slow
+def test_streams_whose_control_stamps_lag_are_judged_as_offline() -> None:
+    """`benchmarks/lags.py` in short."""
+    command = [sys.executable, str(ROOT / "benchmarks" / "lags.py"), "--streams", "1", "--steps", "100", "--lags", "2"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1200)
+    said = done.stdout.splitlines()
+    assert done.returncode == 0 and "compared statistics" in said[-1], done.stdout + done.stderr
+    assert not any(line.startswith("seed ") for line in said), "verdicts differ, or are withheld"
+
+
 # --- the alarm ----------------------------------------------------------------------------------------------
 
 

@@ -197,6 +197,15 @@ def test_a_signal_held_at_its_end_stop_is_no_steady_state(limit: float) -> None:
     assert words.endswith("still samples (every signal within 5% of its range), not the 304 with s0 at an end stop")
 
 
+@pytest.mark.parametrize(("begins", "other"), [(-0.9, 1.2), (1.2, -0.9)])
+def test_of_two_end_stops_the_one_at_which_a_recording_begins_is_steady(begins: float, other: float) -> None:
+    """A joint rests at one of its stops; at the other one it is held, and for longer."""
+    there = np.linspace(begins, other, 60)[:, None]
+    values = np.vstack([rest(begins, 40), there, rest(other, 300), there[::-1], rest(begins, 40)])
+    steady, _, words = resolve_auto(signals(AUTO), [values])
+    assert steady == [begins] and words.endswith("with s0 at an end stop") and "give `steady`" not in words
+
+
 def test_a_noisy_signal_beside_one_at_its_end_stop_does_not_hide_it() -> None:
     joint = driven(1.2, held=300, rests=40)
     other = 5.0 + 0.01 * np.sin(np.arange(len(joint)) * 1.7)[:, None]

@@ -605,6 +605,14 @@ def test_recordings_far_from_one_another_give_a_panel_that_promises_no_rate():
     assert alarm["promises"][-1].endswith("the recordings cannot show that; record more")
 
 
+def test_where_nothing_repeats_the_simplest_way_to_fit_is_kept():
+    """By its thresholds an additive term would be taken, and each comes from one recording."""
+    taken = monitor_fit.choose_monitored(
+        apart(0), [{"criterion": "qp", "additive": terms} for terms in ("none", "noise")]
+    )
+    assert taken.model.fit_summary["additive"] == "none"
+
+
 def test_recordings_of_rates_far_apart_are_said_to_be_that():
     runs = [plant(seed) for seed in range(2)]
     slower = Transient(3 * runs[1].t, runs[1].x, runs[1].u, name="slower")

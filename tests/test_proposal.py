@@ -1716,8 +1716,10 @@ def test_the_clock_of_another_device_is_no_state(tmp_path, step):
     assert "gnss_posTime, time_of_day: grows as a clock" in proposal.text
 
 
-@pytest.mark.parametrize(("code", "shared"), [(-200.0, True), (-50.0, False), (-200.5, False), (1000.0, False)])
-def test_a_number_below_all_others_of_several_columns_stands_for_no_value(code, shared, tmp_path):
+@pytest.mark.parametrize(
+    ("code", "shared"), [(-200.0, True), (9999.0, True), (-50.0, False), (-200.5, False), (1000.0, False)]
+)
+def test_a_number_far_from_all_others_of_several_columns_stands_for_no_value(code, shared, tmp_path):
     """-200 of thirteen sensors made each of them go from -200 to its values."""
     rng = np.random.default_rng(3)
     walks = np.cumsum(rng.normal(size=(400, 4)), axis=0) * (0.2, 0.5, 20.0, 9.0) + (20.0, 50.0, 700.0, 400.0)

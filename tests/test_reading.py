@@ -498,6 +498,19 @@ def test_a_model_of_arrays_names_no_topics(tmp_path: Path) -> None:
     refuses(SignalError, "the model was fitted to arrays and names no topics", read_as_fitted, path, model.signals)
 
 
+@pytest.mark.parametrize(("length", "quiet", "told"), [(10, 1, False), (10, 2, True), (60, 3, False), (60, 4, True)])
+def test_a_clock_topic_that_stops_before_the_recording_does_is_said(
+    length: int, quiet: int, told: bool, tmp_path: Path
+) -> None:
+    """By over a second, and over 5 % of the recording."""
+    sent = [("/x", k * 1000 * MS, float64(k)) for k in range(length - quiet + 1)]
+    sent += [("/u", k * 1000 * MS, float64(k)) for k in range(length + 1)]
+    path = save(tmp_path, {"/x": FLOAT64, "/u": FLOAT64}, sent)
+    (run,) = read_transients(path, SignalMap((Signal("x", "/x", "data"),), (Signal("u", "/u", "data"),)))
+    said = [note for note in run.notes if f"the last message of /x comes {quiet} s before the recording ends" in note]
+    assert len(said) == told
+
+
 def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path: Path) -> None:
     """A model that goes by stamps, and a recording without; or whose clock never speaks."""
     stamped = [("/x", k * MS, joint_state((k + 1) * MS, [k])) for k in range(9)]

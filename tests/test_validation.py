@@ -384,6 +384,7 @@ def test_groups_that_are_likely_are_named_if_none_were_given(runs, hours, words)
         told = validate(shifted, additive="noise", groups="hours=2")
         assert [p.group for p in told.parts] == ["2023-11-14T22:13:20Z"] * 3 + ["2023-11-15T22:13:20Z"] * 3
         assert not any("session" in n for n in told.to_dict()["notes"])
+        assert not any("session" in n for n in validate(shifted, additive="noise", blocks=2).to_dict()["notes"])
 
 
 # --- what is promised holds: fresh plants, fresh recordings, many times ---

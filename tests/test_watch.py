@@ -14,6 +14,7 @@ import re
 import shutil
 import socket
 import subprocess
+import time
 import urllib.error
 import urllib.request
 from typing import Any
@@ -118,7 +119,7 @@ def test_the_page_draws_what_the_monitor_said(world, tmp_path):
 
 
 def test_numbers_that_come_before_the_flags_of_their_sample_are_drawn(world):
-    address = address_of(world.command("watch", "--port", "0"))
+    address = address_of(world.command("watch", "--port", "0", "--seconds", "3600"))
     flags, numbers_ = (world.publisher(JointState, f"/envelope_monitor/{name}") for name in ("flags", "statistics"))
     world.subscribed(flags, numbers_)
 
@@ -133,10 +134,16 @@ def test_numbers_that_come_before_the_flags_of_their_sample_are_drawn(world):
     say(flags, 2, "speed", 0.0)
     until(lambda: "2 samples," in drawn(address)["note"], "the next sample")
     np.testing.assert_array_equal(numbers(drawn(address)["top"][0]["values"]["least"]), [0.25, 0.5])
-    for k in range(9, 15):
+    for k in range(900, 1500, 100):
         say(flags, k, "speed", 0.0)
-    say(flags, 5, "speed", 0.0)  # a recording that is played again
-    until(lambda: "1 sample," in drawn(address)["note"], "what came since")
+    until(lambda: "8 samples," in drawn(address)["note"], "all of them")
+    time.sleep(2.1)
+    assert "SILENT" not in drawn(address)["title"]  # a sample comes every 100 s
+    for k in (500, 600, 700):  # a recording that is played again
+        say(flags, k, "speed", 0.0)
+    until(lambda: "3 samples," in drawn(address)["note"], "what came since")
+    say(flags, 500, "speed", 0.0)  # and again
+    until(lambda: "1 sample," in drawn(address)["note"], "what came since that")
 
 
 def test_a_name_that_no_node_has_and_a_port_that_is_taken_are_refused(tmp_path, monkeypatch, capfd):

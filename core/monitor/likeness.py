@@ -140,7 +140,7 @@ class Pattern:
 
         What a control remembers of a state is no actuator.
         """
-        moment, half = self._own, self._half / max(self._inside, 1)
+        moment, half = self._own, self._half
         whole = float(np.trace(moment))
         remembered = {r.position - model.n for r in model.signals.recalled if r.of < model.n}
         if not (self._inside >= LEAST and whole > 0.0 and (half > 0.0).all() and np.isfinite(half).all()):

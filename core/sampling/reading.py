@@ -168,7 +168,7 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
     m, bag = len(signals.controls), stream.bag
     cut: dict[str, Any] = {"signals": signals, "max_gap": signals.max_gap, "min_step": signals.min_step}
     read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts}
-    notes = (*bag.warnings, *lags_in_words(stream, signals), *_silence(bag, signals.clock or ""))
+    notes = (*bag.warnings, *lags_in_words(stream, signals), *_silence(stream, signals))
     transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], name=os.fspath(bag.path), notes=notes, **cut, **read)
     return transient, Decisions(*decisions)
 
@@ -195,14 +195,15 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
     return said
 
 
-def _silence(bag: Recording, clock: str) -> Iterator[str]:
+def _silence(stream: Stream, signals: SignalMap) -> Iterator[str]:
     """Says that the clock topic stops long before the recording does."""
-    ends = [(info.first, info.last) for info in bag.topics.values() if info.first is not None and info.last is not None]
-    first, last = min(first for first, _ in ends), max(last for _, last in ends)
-    quiet = last - (bag.topics[clock].last or last)
+    ends = [(info.first, info.last) for info in stream.bag.topics.values()]  # by an index, those of their chunks
+    first, last = min(t for t, _ in ends if t is not None), max(t for _, t in ends if t is not None)
+    own = stream.arrival[stream.topic == signals.topics.index(signals.clock or "")]
+    quiet = last - int(own.max(initial=first))
     if quiet > max(10**9, (last - first) // 20):
-        stops = f"the last message of {clock} comes {quiet * 1e-9:.3g} s before the recording ends"
-        yield f"{bag.path}: {stops}, and nothing is judged after it; has the sensor or its driver stopped?"
+        stops = f"the last message of {signals.clock} comes {quiet * 1e-9:.3g} s before the recording ends"
+        yield f"{stream.bag.path}: {stops}, and nothing is judged after it; has the sensor or its driver stopped?"
 
 
 def read_transients(
