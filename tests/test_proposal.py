@@ -236,7 +236,7 @@ def test_a_controller_publishes_all_kinds(topic, role):
 
 def test_what_a_message_says_of_a_controller_is_no_state(tmp_path):
     """Of the state of a controller all was: what it follows, its errors, and what it puts out."""
-    paths, schema = [], "".join(f"float64 {name}\n" for name in ("reference", "feedback", "error", "output"))
+    paths, schema = [], "".join(f"float64 {name}\n" for name in ("reference", "feedback", "error", "p_term", "output"))
     for seed in range(2):
         rng = np.random.default_rng(seed)
         messages, x, goal, total = [], 0.0, 0.0, 0.0
@@ -245,14 +245,14 @@ def test_what_a_message_says_of_a_controller_is_no_state(tmp_path):
             y = x + 1e-3 * rng.normal()
             total += 0.02 * (goal - y)
             u = 2.0 * (goal - y) + total
-            numbers = struct.pack("<4d", goal, y, goal - y, u)
+            numbers = struct.pack("<5d", goal, y, goal - y, 2.0 * (goal - y), u)
             messages += [Message("/loop/pid_state", at(k), b"\0\1\0\0" + numbers), f64("/position", at(k) + MS, y)]
             x += 0.02 * (-2.0 * x + 3.0 * u)
         topics = [Topic("/loop/pid_state", "x_msgs/msg/Loop", schema=schema), Topic("/position")]
         paths.append(write(topics, messages).save(tmp_path / f"{seed}.mcap"))
     proposal = propose(paths)
     assert signals_of(proposal) == ([("/loop/pid_state", "feedback")], [("/loop/pid_state", "output")]), proposal.text
-    assert "/loop/pid_state error: a controller's error" in proposal.text
+    assert "/loop/pid_state error, p_term: a controller's error" in proposal.text
     assert "/position: says what /loop/pid_state feedback says already" in proposal.text.replace(" data", "")
     fitted(paths, proposal)
 

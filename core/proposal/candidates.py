@@ -393,8 +393,8 @@ _FIELDS = {
     "reference": re.compile(
         r"(desired|set_?point|target|goal|ref(erence)?)(_.*)?$|.*_(desired|setpoint|target|ref|des)$"
     ),
-    "control": re.compile(r"(command(ed)?|cmd|output)(_.*)?$|.*_(command(ed)?|cmd)$"),
-    "error": re.compile(r"(error|err)(_.*)?$|.*_(error|err)$"),
+    "control": re.compile(r"(command(ed)?|cmd|output)(_.*)?$|controls?$|.*_(command(ed)?|cmd)$"),
+    "error": re.compile(r"(error|err)(_.*)?$|.*_(error|err)$|[pid]_term$"),
 }
 """Parts of a field's path by which it is no measurement, beside others that are."""
 
@@ -410,10 +410,10 @@ def part_by_role(source: Source) -> list[Source]:
         if role:
             found[role].append(candidate)
     errors = found.pop("error")
-    if not any(found.values()) or len(words) == len(errors) + sum(map(len, found.values())):
+    if sum(map(len, found.values())) in (0, len(words)):  # a topic of nothing else is told by its name
         return []
     for candidate in errors:
-        candidate.reason = "a controller's error, and what it follows is beside it"
+        candidate.reason = "a controller's error, or part of its answer to it"
     return [source.parted(some, role) for role, some in found.items() if some]
 
 
