@@ -1129,13 +1129,13 @@ def test_an_axis_that_is_mostly_noise_stays_with_its_body(tmp_path):
     assert [c.path for c in propose([path]).states] == ["wx", "wy", "wz"]
 
 
-@pytest.mark.parametrize(("rows", "proposed"), [(8_000, 8), (13_000, 12)])
-def test_a_thousand_transitions_of_each_carry_more_signals_than_eight(tmp_path, rows, proposed):
+@pytest.mark.parametrize(("rows", "proposed"), [(8_000, 12), (17_000, 16)])
+def test_a_thousand_transitions_of_each_carry_more_signals_than_twelve(tmp_path, rows, proposed):
     """As of a legged robot: with a third of its joints neither watched nor known, hardly a fault is seen."""
     rng = np.random.default_rng(6)
-    commands = np.repeat(rng.normal(size=(rows // 20, 12)), 20, axis=0)
+    commands = np.repeat(rng.normal(size=(rows // 20, 16)), 20, axis=0)
     joints = answers(rng, commands, pole=0.9)
-    columns = {f"q{j}": joints[:, j] for j in range(12)} | {f"cmd_{j}": commands[:, j] for j in range(12)}
+    columns = {f"q{j}": joints[:, j] for j in range(16)} | {f"cmd_{j}": commands[:, j] for j in range(16)}
     found = propose([table_of(tmp_path / "a.csv", columns, fmt="%.6g")])
     assert len(found.controls) == proposed and len(found.states) == proposed
 
@@ -1154,15 +1154,16 @@ def test_of_a_long_recording_stretches_from_everywhere_are_looked_at():
 def test_motors_are_taken_or_left_as_one_with_the_true_reason(tmp_path):
     rng = np.random.default_rng(5)
     commands = np.repeat(rng.normal(size=(300, 4)), 20, axis=0)
-    motors = answers(rng, commands, pole=0.9)
+    motors, heat = answers(rng, commands, pole=0.9), answers(rng, commands, pole=0.98)
     others = np.column_stack([answers(rng, commands[:, :3]), answers(rng, commands[:, 1:], pole=0.97)])
     columns = dict(zip(["wx", "wy", "wz", "vx", "vy", "vz"], others.T, strict=True))
     columns |= {f"rpm_{i}": motors[:, i] for i in range(4)} | {f"cmd_{i}": commands[:, i] for i in range(4)}
+    columns |= {f"temp_{i}": heat[:, i] for i in range(4)}
     proposal = propose([table_of(tmp_path / "a.csv", columns)])
     states = {c.path for c in proposal.states}
-    families = [{"wx", "wy", "wz"}, {"vx", "vy", "vz"}, {f"rpm_{i}" for i in range(4)}]
-    assert all(family <= states or not family & states for family in families) and len(states) >= 6
-    assert "at most 8 states are tried together" in proposal.text and "too short" not in proposal.text
+    families = [{"wx", "wy", "wz"}, {"vx", "vy", "vz"}, {f"rpm_{i}" for i in range(4)}, {f"temp_{i}" for i in range(4)}]
+    assert all(family <= states or not family & states for family in families) and len(states) >= 10
+    assert "at most 12 states are tried together" in proposal.text and "too short" not in proposal.text
 
 
 def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):

@@ -240,7 +240,7 @@ STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
 """Transitions per signal below which further signals are only listed."""
-MOST, EACH = 8, 1000  # states, and controls; or as many as there are so many transitions for each
+MOST, EACH = 12, 1000  # states, and controls; or as many as there are so many transitions for each
 
 
 class _Room:
