@@ -365,3 +365,30 @@ def changes(values, k):
                 still[q] |= rows[chosen[q] + 1, i] == rows[chosen[q], i]
                 most[i] = change if change > most[i] else most[i]
     return same, largest
+
+
+def stretches(const double[:, :] values, const double[:] limit, Py_ssize_t least):
+    """Disjoint stretches [start, stop) of at least so many rows (N, k), from the left, none of whose columns varies by
+    more than its limit.
+    """
+    cdef Py_ssize_t start = 0, stop, j, count = values.shape[0], k = values.shape[1]
+    cdef double[::1] low = np.empty(k), high = np.empty(k)
+    cdef double value
+    if limit.shape[0] != k:
+        raise ValueError("each column needs a limit")
+    found = []
+    while start < count:
+        low[:], high[:], stop, j = values[start], values[start], start, k
+        while j == k and stop < count:
+            for j in range(k):
+                value = values[stop, j]
+                low[j] = value if value < low[j] else low[j]
+                high[j] = value if value > high[j] else high[j]
+                if not (high[j] - low[j] <= limit[j]) or value != value:  # no number ends it
+                    break
+            else:
+                j, stop = k, stop + 1
+        if stop - start >= least:
+            found.append((start, stop))
+        start = max(stop, start + 1)
+    return found

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.kernel.arithmetic import stretches
 from uncertain_lti.signals.signal_map import Signal
 
 CODE_APART, CODE_OTHERS, CODE_LEAST, CODE_SIZE, MOST_CODES = 300.0, 10, 900.0, 1e9, 4
@@ -95,26 +96,7 @@ def still_stretches(values: Array, span: Array, band: float = STILL_BAND) -> lis
 
     `values` (samples, signals): recorded units; `span` (signals,): range of each signal over all recordings.
     """
-    stretches = []
-    start, stop, count = 0, 0, len(values)
-    limit = band * span
-    while start < count:
-        low, high, stop = values[start].copy(), values[start].copy(), start
-        while stop < count:
-            block = values[stop : stop + 256]
-            lows = np.minimum.accumulate(np.vstack([low, block]))[1:]
-            highs = np.maximum.accumulate(np.vstack([high, block]))[1:]
-            still = ((highs - lows) <= limit).all(axis=1)  # NaN compares false
-            good = len(block) if still.all() else int(np.argmin(still))
-            if good:
-                low, high = lows[good - 1], highs[good - 1]
-            stop += good
-            if good < len(block):
-                break
-        if stop - start >= STILL_SAMPLES:
-            stretches.append((start, stop))
-        start = max(stop, start + 1)
-    return stretches
+    return stretches(values, band * span, STILL_SAMPLES)
 
 
 def end_stops(recordings: Sequence[Array]) -> list[list[float]]:
