@@ -328,11 +328,24 @@ def run(options: argparse.Namespace) -> int:
     result: Result = options.run(options)
     if getattr(options, "json", False):
         if result.data is not None:
-            json.dump(result.data, sys.stdout, allow_nan=False, indent=1)
+            sys.stdout.writelines(_json_lines(result.data, 4))
             sys.stdout.write("\n")
     elif result.text:
         print(result.text)
     return int(result.status)
+
+
+def _json_lines(data: Any, depth: int, new: str = "\n") -> Iterator[str]:
+    """Text of data in lines; what is so deep in takes one, such as a sample, as the compiled encoder writes it."""
+    if not (depth and data and isinstance(data, dict | list | tuple)):
+        yield json.dumps(data, allow_nan=False)
+        return
+    named = isinstance(data, dict)
+    items = data.items() if isinstance(data, dict) else [("", inner) for inner in data]
+    for number, (name, inner) in enumerate(items):
+        yield (("{" if named else "[") if number == 0 else ",") + f"{new} " + named * f"{json.dumps(str(name))}: "
+        yield from _json_lines(inner, depth - 1, f"{new} ")
+    yield new + ("}" if named else "]")
 
 
 def _print_summary(options: argparse.Namespace, text: str) -> None:
