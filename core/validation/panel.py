@@ -62,6 +62,8 @@ FEW = 30
 """Windows of the left-out data below which the states share how far peaks go."""
 CONFIDENCE = 0.9
 """Of the limit of the false-alarm rate, one-sided, and of the largest size in one more recording or group."""
+_LOW = 1.0
+"""False alarms per hour that anyone takes for few."""
 OFTEN = 60
 """Of that limit, per hour, above which it says nothing: alarms chatter, and few recordings leave all open."""
 ALIKE = 0.95
@@ -546,7 +548,7 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
             further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
             further = f"expect {further} of further ones"
             if panel.alarming and panel.asked is None:
-                low = float(f"{0.1 * most:.1g}")  # one above the limit lowers the thresholds
+                low = float(f"{min(0.1 * most, _LOW):.1g}")  # one above the limit lowers the thresholds
                 further += f"; to have fewer, ask for a low rate (--false-alarms {low:g})"
             found.append(f"at thresholds of the others alone {alarming} would alarm: {further}")
     else:
