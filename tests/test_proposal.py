@@ -988,6 +988,22 @@ def test_a_slower_topic_in_which_alone_a_command_shows_gives_states_and_the_cloc
     fitted([path], proposal)
 
 
+def test_a_slow_topic_with_a_command_of_its_own_does_not_slow_down_what_moves_in_between(tmp_path):
+    """An arm of 100 Hz was judged at the 11 Hz of a heater, where only jumps 4 to 10 times as large are seen."""
+    rng = np.random.default_rng(0)
+    messages, speed, heat, u, power = [], 0.0, 20.0, 0.0, 0.0
+    for k in range(6000):
+        t = 10**18 + 10 * k * MS
+        u, power = (float(rng.normal()) if k % 60 == 0 else u), (float(rng.random()) if k % 800 == 0 else power)
+        messages += [f64("/arm_cmd", t, u)] * (k % 2 == 0) + [f64("/heater_cmd", t, power)] * (k % 20 == 0)
+        messages += [f64("/arm/velocity", t, speed + 1e-2 * rng.normal())]
+        messages += [f64("/heater/temperature", t, heat + 0.02 * rng.normal())] * (k % 9 == 0)
+        speed += 0.01 * 12.0 * (u - speed)
+        heat += 0.003 * (20.0 + 20.0 * power - heat)
+    _, proposal = proposed(tmp_path, messages)
+    assert [c.topic for c in proposal.states] == ["/arm/velocity"] and "\nclock: /arm/velocity\n" in proposal.text
+
+
 def test_noise_is_no_state(tmp_path):
     rng = np.random.default_rng(2)
     noise = beside("/plant/temperature", lambda x, u: 20.0 + 0.1 * rng.normal() + 0.02 * u)

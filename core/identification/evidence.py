@@ -122,12 +122,16 @@ def held_for(before: Array, after: Array) -> int:
     return round(period) if period >= 2 and even and len(np.unique(after[instants])) > 0.5 * len(instants) else 0
 
 
-def functions(X: Array) -> NDArray[np.bool_]:
-    """Whether [i, j] j is a smooth function of i, at the same instants or one sample off, but for noise; X (N, n)."""
-    found = np.zeros((X.shape[1], X.shape[1]), dtype=bool)
-    moving = np.flatnonzero(np.ptp(X[1:-1], axis=0) > 0)
-    values = X[:, moving]
-    for i, (now, after) in product(moving.tolist(), ((0, 0), (1, 0), (0, 1))):
+def functions(X: Array, Y: Array | None = None) -> NDArray[np.bool_]:
+    """Whether [i, j] j of Y is a smooth function of i of X, at the same instants or one sample off, but for noise.
+
+    `X` (N, n); `Y` (N, k): default X; Returns (n, k).
+    """
+    Y = X if Y is None else Y
+    found = np.zeros((X.shape[1], Y.shape[1]), dtype=bool)
+    known, moving = (np.flatnonzero(np.ptp(Z[1:-1], axis=0) > 0) for Z in (X, Y))
+    values = Y[:, moving]
+    for i, (now, after) in product(known.tolist(), ((0, 0), (1, 0), (0, 1))):
         a, b = X[now : len(X) - after, i], values[after : len(X) - now]
         a = (a - a.mean()) / a.std()
         basis = np.column_stack([np.ones_like(a), a, a**2, a**3])

@@ -236,6 +236,9 @@ SLOWER = 10.0
 BLURRED = 2.0
 """Times the variance that one sample leaves unknown of the next at their own rate that is left at a slower one, from
 which on the numbers of a topic move in between."""
+LOST = 0.01
+"""Share of the variance that one sample may leave unknown of the next for the sake of a control that shows in a slower
+topic alone."""
 STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
 PER_UNKNOWN = 20
@@ -362,7 +365,7 @@ def choose(
 def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
     """Rate of the slowest topic that tells what no faster one does, 1/s.
 
-    At its instants these lose little, or a control shows in it that shows in none of them.
+    At its instants these lose little, or not much where a control shows in it that shows in none of them.
     """
     first, *others = sorted(states, key=lambda s: -s.rate)
     faster, slowest = [first], first.rate
@@ -370,8 +373,10 @@ def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
         if source.rate < first.rate / SLOWER:
             break
         if source.rate < ALIKE * slowest and _tells_more(source, faster, used):
-            if not all(_known_at(source, other, used) for other in faster) and not _driven_more(source, faster, used):
-                break
+            if not all(_known_at(source, other, used) for other in faster):
+                nearly = all(_known_at(source, other, used, LOST) for other in faster)
+                if not (nearly and _driven_more(source, faster, used)):
+                    break
             slowest = source.rate
         faster.append(source)
     return slowest
@@ -383,12 +388,19 @@ def _tells_more(source: Source, faster: Sequence[Source], used: Sequence[Candida
     steps, n = steps_of([*others, *source.free], used), len(others)
     if len(steps.X) < FEWEST:
         return False
-    own = ~functions(steps.X)[:n, n:].any(axis=0)
-    return bool((own & (predicted(steps.X, steps.U, steps.X + steps.dX)[n:] >= NOISE)).any())
+    own = steps.X[:, n:][:, predicted(steps.X, steps.U, (steps.X + steps.dX)[:, n:]) >= NOISE]
+    for j in range(n):
+        if not own.size:
+            break
+        own = own[:, ~functions(steps.X[:, [j]], own)[0]]
+    return own.size > 0
 
 
-def _known_at(slower: Source, source: Source, used: Sequence[Candidate]) -> bool:
-    """Whether the numbers of a topic that are more than noise are known as well from one instant of a slower one."""
+def _known_at(slower: Source, source: Source, used: Sequence[Candidate], most: float = 0.0) -> bool:
+    """Whether the numbers of a topic that are more than noise are known as well from one instant of a slower one.
+
+    `most`: share of their variance that may be unknown then, however little it is at their own.
+    """
     n, shares = len(source.free), []
     for beside in ([], slower.free[:1]):
         steps = steps_of([*source.free, *beside], used)
@@ -396,7 +408,7 @@ def _known_at(slower: Source, source: Source, used: Sequence[Candidate]) -> bool
             return False
         shares.append(predicted(steps.X[:, :n], steps.U, (steps.X + steps.dX)[:, :n]))
     own, slow = (share[shares[0] >= NOISE] for share in shares)
-    return bool(((slow >= NOISE) & (1.0 - slow <= BLURRED * (1.0 - own))).all())
+    return bool(((slow >= NOISE) & (1.0 - slow <= np.maximum(BLURRED * (1.0 - own), most))).all())
 
 
 def _driven_more(source: Source, faster: Sequence[Source], used: Sequence[Candidate]) -> bool:
