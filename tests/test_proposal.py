@@ -225,7 +225,7 @@ def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_
         ("/thruster/cmd/left", "control"), ("/controller/cmd_out", "control"), ("/u_speed", "control"),
         ("/commands/motor/speed", "control"), ("/lbr/command/joint_position", "control"),
         ("/cmd_full_state", "control"), ("/commands/motor/state", "state"), ("/cmd_vel_feedback", "state"),
-        ("/motor/duty", "control"),
+        ("/motor/duty", "control"), ("/set_rpm", "control"), ("/set_current", "control"), ("/set_state", "state"),
         ("/mavros/rc/out", "control"), ("/mavros/rc/in", "reference"), ("/mavros/setpoint_raw/attitude", "reference"),
         ("/engine/rpm", "state"), ("/wheel_vels", "state"), ("/tank/level", "state"), ("/elevator/position", "state"),
     ],
@@ -255,6 +255,22 @@ def test_what_a_message_says_of_a_controller_is_no_state(tmp_path):
     assert "/loop/pid_state error, p_term: a controller's error" in proposal.text
     assert "/position: says what /loop/pid_state feedback says already" in proposal.text.replace(" data", "")
     fitted(paths, proposal)
+
+
+def test_the_current_that_a_motor_driver_puts_out_is_measured(tmp_path):
+    """It was a control, as what a controller puts out, and a motor with two thirds of its torque was not seen."""
+    schema, rng = "float64 target_rpm\nfloat64 output_current\nfloat64 rpm\n", np.random.default_rng(0)
+    messages, current, rpm, target = [], 0.0, 0.0, 0.0
+    for k in range(2000):
+        target = float(rng.uniform(0, 1000)) if k % 60 == 0 else target
+        numbers = struct.pack("<3d", target, current + 0.2 * rng.normal(), rpm + 2.0 * rng.normal())
+        messages.append(Message("/motor/status", at(k), b"\0\1\0\0" + numbers))
+        current += 0.02 * 10.0 * (0.02 * (target - rpm) + 0.1 * target - current)
+        rpm += 0.02 * 6.0 * (10.0 * current - rpm)
+    topic = Topic("/motor/status", "x_msgs/msg/Motor", schema=schema)
+    proposal = propose([write([topic], messages).save(tmp_path / "motor.mcap")])
+    expected = ([("/motor/status", name) for name in ("output_current", "rpm")], [("/motor/status", "target_rpm")])
+    assert signals_of(proposal) == expected, proposal.text
 
 
 @pytest.mark.parametrize("topic", ["/vehicle/steering_report", "/vehicle/throttle_report", "/vehicle/status"])

@@ -336,7 +336,7 @@ _ANSWER = re.compile(r"(state|states|status|report|feedback|response|actual|odom
 _APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
 _FOLLOWED = re.compile(r"setpoint[^/]*/|/rc/(in|override)$")  # topics below a folder, and what a pilot's sticks say
 _SENT = re.compile(
-    r"(^|/)(commands?|cmds?)/|(^|/)cmd_(?!.*(feedback|response|actual|report|status|odom))[^/]*$|/rc/out$|"
+    r"(^|/)(commands?|cmds?)/|(^|/)(cmd|set)_(?!.*(feedback|response|actual|report|status|odom))[^/]*$|/rc/out$|"
     r"(^|[/_])(duty|ailerons?|elevons?|elevators?|rudders?)(_angle)?$"
 )
 _MEASURED = re.compile(r"(^|_)(rpm|altimeter|level|vels?|flow|current|voltage|temp|tacho\w*)(_|$)")
@@ -393,7 +393,7 @@ _FIELDS = {
     "reference": re.compile(
         r"(desired|set_?point|target|goal|ref(erence)?)(_.*)?$|.*_(desired|setpoint|target|ref|des)$"
     ),
-    "control": re.compile(r"(command(ed)?|cmd|output)(_.*)?$|controls?$|.*_(command(ed)?|cmd)$"),
+    "control": re.compile(r"(command(ed)?|cmd)(_.*)?$|(output|controls?)$|.*_(command(ed)?|cmd)$"),
     "error": re.compile(r"(error|err)(_.*)?$|.*_(error|err)$|[pid]_term$"),
 }
 """Parts of a field's path by which it is no measurement, beside others that are."""
