@@ -254,6 +254,7 @@ def test_what_a_message_says_of_a_controller_is_no_state(tmp_path):
     assert signals_of(proposal) == ([("/loop/pid_state", "feedback")], [("/loop/pid_state", "output")]), proposal.text
     assert "/loop/pid_state error, p_term: a controller's error" in proposal.text
     assert "/position: says what /loop/pid_state feedback says already" in proposal.text.replace(" data", "")
+    assert signals_of(propose(paths, states=["/loop/pid_state"])) == signals_of(proposal)
     fitted(paths, proposal)
 
 

@@ -545,6 +545,8 @@ def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str
             elif fields:
                 why = f"; a field is asked for with its topic, {' or '.join(fields[:3])}"
             raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
+        if role == "state" and not field:  # of topics, what is measured by its name, if anything is
+            found = [c for c in found if c.source.role not in ("control", "reference")] or found
         met[role].update(found)
     fewer, more = sorted(met, key=lambda role: len(met[role]))
     met[more] -= met[fewer]
