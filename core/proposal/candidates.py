@@ -151,8 +151,8 @@ class Source:
 
     def parted(self, some: Collection[Candidate], role: str) -> Source:
         """Some of its numbers, which leave it for a topic of their own."""
-        found = replace(self, candidates=[c for c in self.candidates if c in some], role=role, reason="")
-        found.arrival, found.stamp = [*self.arrival], [*self.stamp]
+        mine, arrival, stamp = [c for c in self.candidates if c in some], [*self.arrival], [*self.stamp]
+        found = replace(self, candidates=mine, role=role, reason="", arrival=arrival, stamp=stamp)
         self.candidates = [c for c in self.candidates if c not in some]
         for candidate in found.candidates:
             candidate.source = found
@@ -390,23 +390,22 @@ def role_by_name(topic: str, type_name: str) -> str:
 
 
 _FIELDS = {
-    "reference": re.compile(
-        r"(desired|set_?point|target|goal|ref(erence)?)(_.*)?$|.*_(desired|setpoint|target|ref|des)$"
-    ),
-    "control": re.compile(r"(command(ed)?|cmd)(_.*)?$|(output|controls?)$|.*_(command(ed)?|cmd)$"),
-    "error": re.compile(r"(error|err)(_.*)?$|.*_(error|err)$|[pid]_term$"),
+    "reference": _REFERENCE,
+    "control": re.compile(r"^(command(ed)?|cmd)(_|$)|^(output|controls?)$|_(command(ed)?|cmd)$"),
+    "error": re.compile(r"(^|_)err(or)?$|^err(or)?_|^[pid]_term$"),
 }
 """Parts of a field's path by which it is no measurement, beside others that are."""
 
 
 def part_by_role(source: Source) -> list[Source]:
     """What of a topic's numbers is no measurement leaves it: what a controller follows, and what it puts out."""
-    words = {c: re.findall(r"[^\W\d]\w*", re.sub(r"\[[^\]]*\]", "", c.path)) for c in source.free}
+    plain = {c: re.sub(r"\[[^\]]*\]", "", c.path).replace("set_point", "setpoint") for c in source.free}
+    words = {c: re.findall(r"[^\W\d]\w*", path) for c, path in plain.items()}
     every = {word for some in words.values() for word in some}
     found: dict[str, list[Candidate]] = {role: [] for role in _FIELDS}
     for candidate, some in words.items():
         desired = any(w.endswith("_d") and w[:-2] in every for w in some)
-        role = next((r for r, name in _FIELDS.items() if any(map(name.match, some))), "reference" if desired else "")
+        role = next((r for r, name in _FIELDS.items() if any(map(name.search, some))), "reference" if desired else "")
         if role:
             found[role].append(candidate)
     errors = found.pop("error")

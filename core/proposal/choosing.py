@@ -60,10 +60,10 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
         return pool
     kept: list[int] = []
     function = functions(steps.X)
+    np.fill_diagonal(function, False)
     for i, j in np.argwhere(function).tolist():
-        twins = _alike(pool[i], pool[j]) or two_sensors(*steps.X[:, [i, j]].T)
-        copy = pool[i].topic == pool[j].topic and _moves_with(pool[j], pool[i], exact=True)
-        function[i, j] = copy or not twins
+        if _alike(pool[i], pool[j]) or two_sensors(*steps.X[:, [i, j]].T):
+            function[i, j] = pool[i].topic == pool[j].topic and _moves_with(pool[j], pool[i], exact=True)
 
     def drop(i: int, source: int) -> None:
         of = pool[source]

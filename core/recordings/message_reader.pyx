@@ -56,7 +56,7 @@ def is_timestamped(type_name, fields):
 
 
 def header_stamp_ns(message):
-    """Header stamp of a message (rosbags or rclpy) in ns; None where it has no header or the stamp is zero."""
+    """Header stamp, or PX4's own, of a message (rosbags or rclpy) in ns; None where there is none, or it is zero."""
     stamp = getattr(getattr(message, "header", None), "stamp", None)
     if stamp is not None:
         return stamp.sec * 1_000_000_000 + stamp.nanosec or None
