@@ -20,6 +20,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti import fit as fit_public
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
@@ -111,6 +112,28 @@ def test_levels_of_two_that_no_row_has_both_are_no_combination() -> None:
     assert outside(model, slow) > 0.4
     again = model.update([arms(3, [(a, a) for a in ways])])
     assert outside(again, apart) < 0.05
+
+
+def test_where_no_recording_repeats_the_combinations_of_another_ranges_alone_count() -> None:
+    """A healthy arm that goes to other poses each time was outside in all it did, and its quiet said nothing."""
+
+    def joints(seed: int, poses: int) -> Transient:
+        drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, poses, 2))
+        ends = np.tile([[1.0, 1.0], [-1.0, -1.0]], (3, 1, 1))  # all go as far
+        poses_of = [np.repeat([*ends[j], *drawn[j]], 5, axis=0) for j in range(3)]  # rests in each
+        parts = [arms(seed + 50 * j, [*map(tuple, each)]) for j, each in enumerate(poses_of)]
+        return parts[0].replace(x=np.hstack([p.x for p in parts]), u=np.hstack([p.u for p in parts]), signals=None,
+            state_names=[*"abcdef"], control_names=[*"ghijkl"])  # fmt: skip
+
+    runs = [joints(seed, 10) for seed in range(4)]
+    plain, model = fit(runs, additive="noise"), fit_public(runs, "lp", additive="noise")
+    assert plain.domain.measure is not None and model.domain.measure is None
+    assert outside(plain, joints(9, 10)) > 0.5 and outside(model, joints(9, 10)) == 0.0
+    far = runs[0].replace(x=1.5 * runs[0].x, u=1.5 * runs[0].u)
+    assert outside(model, far) > 0.1
+    assert UncertainLTI.from_dict(json.loads(json.dumps(model.to_dict()))).domain.measure is None
+    many = fit_public([joints(seed, 150) for seed in range(4)], "lp", additive="noise")
+    assert many.domain.measure is not None  # enough of them to tell
 
 
 def test_a_place_on_which_nothing_depends_has_no_range_to_leave(tmp_path) -> None:

@@ -36,6 +36,9 @@ FOLDS = 5
 """Fits without a part of the recordings, groups or, of a single recording, blocks, for an alarm or any other choice."""
 LIMIT, _MOST = 4e9, 2e7
 """Elements of all left-out problems together up to which parts are left out: some minutes; utilisations kept."""
+NEW = 0.5
+"""Share of a typical left-out stretch at combinations of signals that the rest lacks, from which on these are no news:
+of many signals hardly any two recordings share them, and the thresholds are learnt there."""
 STATES = 20
 """States of a machine too large to be left out, about, on which ways to fit are compared, if it has twice as many."""
 _SHOWN, _COMPARED = 1_000_000, 200_000  # transitions that a panel is learnt from, and ways to fit are compared on
@@ -130,8 +133,12 @@ def _seen(model: UncertainLTI, transients: Sequence[Transient], most: float) -> 
 
 
 def _armed(validation: Validation, fitted: Sequence[Part], rate: float | None) -> tuple[UncertainLTI, Panel]:
-    panel = learn(validation, fitted, rate)
-    return validation.model.replace(alarm=panel.rules, residuals=panel.residuals), panel
+    """The model with the panel, and with ranges alone for a domain where new combinations are the rule."""
+    panel, model = learn(validation, fitted, rate), validation.model
+    alike = [part for part in validation.parts if part.judged and part.name not in panel.unlike]
+    new = float(np.median([part.outside_domain / part.judged for part in alike])) if alike else 0.0
+    domain = replace(model.domain, measure=None if new > NEW else model.domain.measure)
+    return model.replace(alarm=panel.rules, residuals=panel.residuals, domain=domain), panel
 
 
 def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], **options: Any) -> Monitored:
