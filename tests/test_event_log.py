@@ -167,6 +167,24 @@ def test_a_jump_larger_than_any_of_the_fit_is_logged_and_reported_with_its_limit
     assert "; a jumped by " in rig.session.reasons.text
 
 
+@pytest.mark.parametrize(("left_out", "far", "level"), [((), 8, WARN), ((0.1, 0.4), 8, OK), ((0.9,), 20, WARN)])
+def test_being_outside_the_domain_is_a_warning_where_more_is_than_was_left_out(
+    left_out: tuple[float, ...], far: int, level: int
+) -> None:
+    rig = Rig.at_work()
+    domain = replace(rig.model.domain, u_min=np.full(rig.model.m, -1.0), u_max=np.full(rig.model.m, 1.0))
+    parts = [{"verdicts": 100, "outside_domain": 100 * share} for share in left_out]
+    rig.model = rig.model.replace(domain=domain, validation={"part": parts} if parts else None)
+    rig.watch(rig.model, Rule())
+    rig.send(10)
+    assert rig.session.report(rig.now, TIMEOUT)[0].level == OK
+    rig.send(13)
+    rig.u[:] = 5.0
+    rig.send(far)
+    report = rig.session.report(rig.now, TIMEOUT)[0]
+    assert report.level == level and "outside the fitted domain in " in report.message
+
+
 def test_diagnostics_say_how_near_each_statistic_is_to_its_threshold() -> None:
     rig = Rig(alarm=(AlarmRule(2, 5), StatisticRule("energy", 5 * STEP, (0.5, 4.0))))
     rig.send(10, off=0.5)

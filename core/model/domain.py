@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 import reprlib
 from base64 import b64decode, b64encode
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.text import apart, plural, shortlist
+from uncertain_lti.base.text import apart, list_of, numbers_of, plural, shortlist
 from uncertain_lti.kernel.arithmetic import outside_domain, pair_count
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.terms import is_whole, object_of
@@ -180,7 +180,18 @@ class Domain:
         return np.asarray(outside_domain(columns, self.least, self.greatest, occupied)).reshape(lead)
 
 
+UNVOUCHED, STRANGE = 0.2, 0.5
+"""Share of the verdicts outside the fitted domain from which on their quiet says nothing, unless what was left out of a
+fit had as many; there, or in alarm from early on, from which on the machine may be another, whatever was left out."""
 _PAIRS_IN, _NAMED = 2000, 3  # samples whose combinations are looked at, and signals or pairs of them that are named
+
+
+def vouched(model: Any) -> float:
+    """Share of the verdicts that may be outside the fitted domain: the alarm was learnt on what was left out."""
+    parts = [part for part in list_of((model.validation or {}).get("part")) if isinstance(part, Mapping)]
+    counts = [numbers_of([part.get("outside_domain"), part.get("verdicts")], 2) for part in parts]
+    shares = [outside / judged for outside, judged in filter(None, counts) if judged > 0]
+    return float(min(max([UNVOUCHED, *shares]), STRANGE))
 
 
 def outside_in_words(model: Any, z: Array) -> str:

@@ -22,6 +22,7 @@ from typing import Any
 
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT
+from uncertain_lti.model.domain import vouched
 from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import Days, conditions_in_words
@@ -64,6 +65,7 @@ class Session(Stream):
     def __init__(self, model: UncertainLTI, *args: Any, **kwargs: Any) -> None:
         super().__init__(model, *args, **kwargs)
         self.days = Days(model)
+        self._vouched = vouched(model)
         self._steady: dict[str, tuple[float, float, int]] = {}  # of topics: heard, longest pause before, pauses
         self._at_verdict = Counter(self.sampler.counters), Counter(self.unreadable)
 
@@ -87,7 +89,9 @@ class Session(Stream):
         if outside := period.outside - period.unknown:
             where = period.last_outside and self.model.why_outside(period.last_outside.before)
             text = f"outside the fitted domain in {outside} of {period.verdicts} verdicts"
-            complaints.append(f"{text}: {where}" if where else text)
+            (complaints if outside > self._vouched * period.verdicts else calm).append(
+                f"{text}: {where}" if where else text
+            )
         for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
             if count := period.statuses[status]:
                 why = why_not(status, self.model)

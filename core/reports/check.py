@@ -28,10 +28,8 @@ from uncertain_lti.base.text import (
     Table,
     beyond,
     lasting,
-    list_of,
     named,
     number,
-    numbers_of,
     plural,
     share,
     shortened,
@@ -39,7 +37,7 @@ from uncertain_lti.base.text import (
     text_of,
     times,
 )
-from uncertain_lti.model.domain import jump_words, jumps, outside_in_words
+from uncertain_lti.model.domain import STRANGE, jump_words, jumps, outside_in_words, vouched
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -52,9 +50,6 @@ from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import unused
 from uncertain_lti.sampling.transient import Transient, Transitions
 
-UNVOUCHED, STRANGE = 0.2, 0.5
-"""Share of the verdicts outside the fitted domain from which on their quiet says nothing, unless what was left out of a
-fit had as many; there, or in alarm from early on, from which on the machine may be another, whatever was left out."""
 JUDGED = 0.5
 """Share of the steps that must have a verdict for their quiet to say something."""
 MOVES = 0.1
@@ -331,7 +326,7 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
     if not (verdicts.armed & verdicts.judged).any():
         remedy = "give others, or check a recording in which the machine is in use"
         return f"the alarm was armed at no verdict: --enable did not hold, or --grace was not over; {remedy}"
-    if (outside := data["outside_domain_share"]) > _vouched(model):
+    if (outside := data["outside_domain_share"]) > vouched(model):
         ask = "is this the same machine, in the same units? " if outside > STRANGE else ""
         why = "; ".join(filter(None, [data["beyond"], *data["unknown"]]))
         beyond_fit = f"{outside:.2%} of the verdicts are outside the fitted domain"
@@ -352,14 +347,6 @@ def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) 
         up = f"the alarm is up for {alarmed.mean():.0%} of it, from early on"
         return f"{up}: the fault was there before, or {other}"
     return ""
-
-
-def _vouched(model: UncertainLTI) -> float:
-    """Share of the verdicts that may be outside the fitted domain: the alarm was learnt on what was left out."""
-    parts = [part for part in list_of((model.validation or {}).get("part")) if isinstance(part, Mapping)]
-    counts = [numbers_of([part.get("outside_domain"), part.get("verdicts")], 2) for part in parts]
-    shares = [outside / judged for outside, judged in filter(None, counts) if judged > 0]
-    return float(min(max([UNVOUCHED, *shares]), STRANGE))
 
 
 def _inside(bad: int, count: int) -> float | None:

@@ -32,11 +32,12 @@ from uncertain_lti.base.text import (
 )
 from uncertain_lti.identification.diagnosis import CONSTANT
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
+from uncertain_lti.model.domain import UNVOUCHED
 from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.check import UNVOUCHED, check_data, instant_text, raised_by
+from uncertain_lti.reports.check import check_data, instant_text, raised_by
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
