@@ -1112,6 +1112,16 @@ def test_every_signals_file_that_is_written_can_be_read(tmp_path, monkeypatch, m
         assert len(signals.states) == max(1, len(alike)), text
 
 
+def test_signals_of_two_robots_are_named_by_what_tells_their_topics_apart(tmp_path):
+    robots = [
+        driven((f"/fleet/{name}/speed", f"/fleet/{name}/cmd"), seed=seed) for seed, name in enumerate(("R1", "R2"))
+    ]
+    proposal = propose([save(tmp_path / "run.mcap", [*robots[0], *robots[1]], {})])
+    signals = SignalMap.from_dict(yaml.safe_load(proposal.text))
+    assert [s.name for s in signals.states] == ["r1_speed", "r2_speed"]
+    assert [s.name for s in signals.controls] == ["r1_cmd", "r2_cmd"]
+
+
 def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
     other = driven(("/other/state", "/other/cmd"), seed=3)
     path = save(tmp_path / "run.mcap", [*driven(), *other], {})

@@ -16,7 +16,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, count
+from itertools import chain, count, zip_longest
 from types import MappingProxyType
 
 import numpy as np
@@ -59,8 +59,11 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
     elements = {c.element for c in states} - {""}
     for group, suffix in ((states, "state"), (controls, "command")):
         kinds = {c.kind for c in group}
-        for candidate in group:
-            name = "_".join(_words(candidate, len(kinds) > 1))
+        plain = {c: "_".join(_words(c, len(kinds) > 1)) for c in group}
+        for candidate, name in plain.items():
+            others = (c for c in group if plain[c] == name and (candidate.ready or not c.ready))  # or in a comment
+            alike = [other.topic for other in others]
+            name = "_".join([*_apart(candidate.topic, alike), name])
             if name in taken or (suffix == "command" and candidate.element in elements):
                 name = f"{name}_{suffix}"
             numbered = (f"{name}_{number}" for number in count(2))
@@ -82,6 +85,13 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
         of_topic = array if of_table(candidate.topic) else candidate.topic.rstrip("/").rpartition("/")[2]
         words = [*words_of(of_topic), *words]
     return words or ["signal"]
+
+
+def _apart(topic: str, alike: Sequence[str]) -> list[str]:
+    """What tells a topic from others, such as `robot1` of `/robot1/odom` from `/robot2/odom`."""
+    each = [other.strip("/").split("/") for other in alike]
+    first = next((i for i, of in enumerate(zip_longest(*each)) if len(set(of)) > 1), len(topic))
+    return topic.strip("/").lower().split("/")[first : first + 1]
 
 
 def words_of(text: str) -> list[str]:
