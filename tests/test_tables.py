@@ -555,6 +555,8 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         *(("a.csv", b"time,x\n%b,1\n" % day, "after 2261") for day in (b"3026-11-22", b"1500-01-01")),
         ("a.xlsx", b"PK\x03\x04nothing", "a spreadsheet; save its sheet as .csv"),
         ("a.ulg", b"ULog\x01\x12\x35", "a log of PX4; write its messages as .csv"),
+        ("a.h5", b"\x89HDF\r\n\x1a\n" + bytes(9), "an HDF5 file; write its signals of one time as columns of a .csv"),
+        ("a.mf4", b"MDF     4.10    ", r"a measurement of CAN and the like \(MDF\); write its signals"),
         ("1.BIN", b"\xa3\x95\x80\x80", "a log of ArduPilot; write its messages as .csv"),
         ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "is damaged or no .mat file|holds no column"),
@@ -1151,6 +1153,31 @@ def test_a_matrix_whose_first_line_grows_has_its_time_there(tall, tmp_path):
     assert bag.facts()[0].fields == ("data[0..1]",) and bag.facts()[0].rate == pytest.approx(500.0)
     np.savez(tmp_path / "b.npz", data=lines[1:])
     refuses(BagError, "no column is called time", open_recording, tmp_path / "b.npz")
+
+
+@pytest.mark.parametrize("beside", [{}, {"t": 0.5 * np.arange(50)}])
+def test_the_time_is_in_a_matrix_where_no_vector_beside_it_is_one(beside, tmp_path):
+    """Of a motor, beside what was computed from it and the parameters, the file could not be read."""
+    lines = np.vstack([0.002 * np.arange(50), np.sin(np.arange(50)), np.cos(np.arange(50))])
+    others = {"gain": np.array([1.0, 2.0, 3.0]), "torque": np.sin(0.3 * np.arange(50))}
+    np.savez(tmp_path / "a.npz", **others, data=lines.T, **beside)
+    bag = open_recording(tmp_path / "a.npz")
+    assert bag.facts()[0].rate == pytest.approx(2.0 if beside else 500.0)
+    assert set(bag.facts()[0].fields) == {"torque", "data[0..2]" if beside else "data[0..1]"}
+
+
+def test_how_long_something_has_lasted_is_no_time_where_many_rows_share_it(tmp_path):
+    """Of a car at 1 Hz, `Time since codes cleared` in min made 60 rows a second."""
+    rows = [f"{k},{424 + k // 60},{k % 7}" for k in range(300)]
+    words = "'Time since codes cleared' says how long something has lasted, and no other is called time"
+    refuses(BagError, words, read_csv, tmp_path, "index,Time since codes cleared,x", rows)
+    bag = read_csv(tmp_path, "time_since_boot_ms,x", (f"{20 * k},{k % 7}" for k in range(90)))
+    assert set(np.diff(bag.times).tolist()) == {20 * 10**6}
+
+
+def test_a_step_beside_the_columns_is_named_for_rows_without_a_time(tmp_path):
+    rows = [f"{k % 7},{k % 5},{4 if k == 0 else ''}" for k in range(60)]
+    refuses(BagError, "'Ts' is the same in all rows.*`--table step=4` ", read_csv, tmp_path, "u,y,Ts", rows)
 
 
 def test_times_since_1970_are_found_without_a_name_though_some_step_back(tmp_path):

@@ -536,6 +536,15 @@ def _is_text(array: NDArray[Any]) -> bool:
 
 def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, list[str]]) -> RawTable:
     """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
+    said = []
+    matrices = [name for name, column in found.items() if column.ndim == 2]
+    if len(matrices) == 1:
+        matrix = found[name := matrices[0]]
+        first, *rest = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
+        beside = [other for other, column in found.items() if other != name and len(column) == len(first)]
+        if rest and _rises(first) and not any("time" in n.lower() or _rises(found[n]) for n in beside):
+            said = [f"the first line of '{name}' is taken for the time, as it grows"]  # as Simulink writes to a file
+            found = {"time": first, **found, name: np.column_stack(rest)}
     vectors = [name for name, column in found.items() if column.ndim == 1]
     lengths = Counter({len(column): 0 for column in found.values()})
     for column in found.values():
@@ -543,12 +552,6 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, lis
     if not lengths:
         there = "; ".join(_by_reason(notes)[:3]) or "nothing"
         raise BagError(f"{path}: holds no column of numbers ({there}); save time and signals as vectors of one length")
-    if not vectors and len(found) == 1:
-        ((name, matrix),) = found.items()
-        first, *rest = matrix if matrix.shape[0] < matrix.shape[1] else matrix.T
-        if rest and (np.diff(first) > 0).all():  # as Simulink writes to a file
-            said = f"the first line of '{name}' is taken for the time, as it grows"
-            return RawTable({"time": first, name: np.column_stack(rest)}, [*_by_reason(notes), said])
     length = max(lengths, key=lambda number: (lengths[number], number))
     kept: dict[str, Column] = {}
     for name, column in found.items():
@@ -558,7 +561,12 @@ def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, lis
             kept[name] = column.T
         else:
             notes.setdefault(f"not of {length} entries as the others", []).append(f"{name} ({len(column)})")
-    return RawTable(kept, _by_reason(notes))
+    return RawTable(kept, _by_reason(notes) + said)
+
+
+def _rises(column: Column) -> bool:
+    """Whether it may be a time: text and instants, or numbers that grow."""
+    return column.dtype.kind not in "iuf" or bool((np.diff(column) > 0).all())
 
 
 def _by_reason(notes: Mapping[str, Sequence[str]]) -> list[str]:

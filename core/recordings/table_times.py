@@ -34,6 +34,8 @@ _NAMES = (
     r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
     r"temps|tempo", r"elapsed|up_?time", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
+_LASTS = re.compile(r"time_(since|until|till|to|run|running|on|off|in|left|remaining|with(out)?)(_.*)?")
+_LONGEST_STEP = 3600  # s that a number beside the columns may say, as `Ts` of a benchmark
 _OF_WHAT, _GROWS = re.compile(r"\w+_time"), "it is taken for the time, as it grows from row to row"
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
@@ -145,14 +147,14 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
     still = [name for name in called if _stands_still(table.columns[name])]
     called = [name for name in called if name not in still and not _of_a_minute(name, table.columns[name])]
+    lasting = [name for name in called if _LASTS.fullmatch(_bare(name)) and _held(table.columns[name])]
+    called = [name for name in called if name not in lasting]
     if likely := [name for name in called if may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
         taken = called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0]
         taken = _clock_beside(table, taken) or taken
-        times = table.columns[taken]
-        held = 2 * np.count_nonzero(times[1:] == times[:-1]) > len(times)  # of a sensor slower than the rows
         finer = (n for n in plain if (called_time(n) or _OF_WHAT.fullmatch(_bare(n))) and _grows(table.columns[n]))
-        column = next(finer, "") if held else ""
+        column = next(finer, "") if _held(table.columns[taken]) else ""
         return (column, f"{_GROWS}, and '{taken}' does not") if column else (taken, "")
     dated = [name for name in names if table.columns[name].dtype.kind in "MO" and may_be(table.columns[name])]
     if len(dated) == 1 or (len(dated) == 2 and dated[0] == names[0]):
@@ -165,14 +167,17 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
         if _grows(table.columns[name]) and (says or (np.diff(table.columns[name]) != 1).any()):
             return name, _GROWS  # and are no numbers of rows, as `step` or the first column of a data frame
     none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
+    none = f"column {lasting[0]!r} says how long something has lasted, and no other" if lasting else none
+    same = [float(table.columns[name][0]) for name in still if table.columns[name].dtype.kind in "iuf"]
+    step = next((f"{value:g}" for value in same if 0 < value <= _LONGEST_STEP), "0.01")
     texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
     if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
         none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
     none = "; ".join([*table.notes, none])
     raise BagError(
         f"{path}: {none} is called time or looks like it; rename the one that is, or name it, `--table time=COLUMN`; "
-        "for rows at one step without a time say how many s it has, `--table step=0.01` (in a signals file "
-        f"`table: {{step: 0.01}}`); columns there: {shortlist(names, 50)}"
+        f"for rows at one step without a time say how many s it has, `--table step={step}` (in a signals file "
+        f"`table: {{step: {step}}}`); columns there: {shortlist(names, 50)}"
     )
 
 
@@ -203,6 +208,11 @@ def _bare(name: str) -> str:
 def called_time(name: str) -> bool:
     """Whether a column is a time by its name."""
     return any(re.fullmatch(pattern, _bare(name)) for pattern in _NAMES)
+
+
+def _held(column: Column) -> bool:
+    """Whether most rows have the value of the row before, as of a sensor slower than the rows."""
+    return 2 * int(np.count_nonzero(column[1:] == column[:-1])) > len(column)
 
 
 def _grows(column: Column) -> bool:

@@ -31,6 +31,8 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 
 
 _SENTENCE = 300  # letters
+_MEASUREMENTS = {b"\x89HDF": "an HDF5 file", b"MDF ": "a measurement of CAN and the like (MDF)", b"TDSm": "a TDMS file"}
+"""Containers of other tools, by their first four bytes."""
 
 
 def not_mcap(path: Path, head: bytes) -> BagError:
@@ -52,8 +54,10 @@ def not_mcap(path: Path, head: bytes) -> BagError:
             (head.startswith(b"version https://git-lfs"),
              "a Git LFS pointer, not the recording itself; fetch it with `git lfs pull` in its repository"),
             (suffix in (".xlsx", ".xls", ".ods"), "a spreadsheet; save its sheet as .csv"),
-            (head.startswith(b"ULog"), f"a log of PX4; {csv} `ulog2csv`"),
+            (head.startswith(b"ULog"), f"a log of PX4; {csv} `ulog2csv`, of times in us: `--table unit=us`"),
             (head.startswith(b"\xa3\x95"), f"a log of ArduPilot; {csv} `mavlogdump.py --format csv --types ATT`"),
+            (head.startswith(tuple(_MEASUREMENTS)),
+             f"{_MEASUREMENTS.get(head[:4])}; write its signals of one time as columns of a .csv file"),
             (head.startswith((b"\x04\x22\x4d\x18", b"\x1f\x8b", b"BZh", b"\xfd7zXZ", b"PK\x03\x04")),
              "compressed as a whole file or an archive; unpack it first"),
             (head.startswith(MAGIC[:5]),
