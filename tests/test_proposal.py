@@ -58,8 +58,8 @@ def beside(topic, value):
     return lambda k, x, u: [f64(topic, at(k), value(x, u))]
 
 
-def pose(topic, t_ns, yaw):
-    point = message("geometry_msgs/msg/Point", x=0.0, y=1.0, z=0.0)
+def pose(topic, t_ns, yaw, place=(0.0, 1.0)):
+    point = message("geometry_msgs/msg/Point", x=float(place[0]), y=float(place[1]), z=0.0)
     turned = message("geometry_msgs/msg/Quaternion", **vars(quaternion(0.0, 0.0, yaw)))
     body = message("geometry_msgs/msg/Pose", position=point, orientation=turned)
     return Message(topic, t_ns, cdr(POSE, header=header(t_ns), pose=body), t_ns)
@@ -1548,6 +1548,19 @@ def test_nothing_depends_on_where_a_vehicle_heads_for(tmp_path, name, command, d
     proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
     assert [c.path for c in proposal.states] == [f"unwrap({name}, 360)", "turn"], proposal.text
     assert ("structure:" in proposal.text) != depends, proposal.text
+
+
+@pytest.mark.parametrize("turn", [0.3, 3.0])
+def test_nothing_depends_on_where_a_vehicle_is(tmp_path, turn):
+    """Another drive of it goes elsewhere, and was in alarm; what stays in line may be held at its place."""
+    rng, place, messages = np.random.default_rng(3), np.array([369e3, 328e4]), []
+    heads = turn * np.sin(0.02 * np.arange(900))
+    for k, yaw in enumerate(heads.tolist()):
+        place += 0.05 * np.array([math.cos(yaw), math.sin(yaw)]) + 1e-3 * rng.normal(size=2)
+        messages.append(pose("/base/pose", at(k), yaw, place))
+    _, proposal = proposed(tmp_path, messages, {"/base/pose": POSE})
+    free = re.findall("from: ([a-z_]+)", proposal.text)
+    assert free == (["position_x", "position_y", "yaw"] if turn > 1 else [])
 
 
 @pytest.mark.parametrize(("command", "apart", "depends"), [("direction_cmd", 30, True), ("course_cmd", 140, False)])

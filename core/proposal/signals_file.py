@@ -266,7 +266,8 @@ def signals_file(
     if members:
         lines = for_members(lines, states[0].element, list(members))
     elif around:
-        lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle heads for.", "structure:"]
+        lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle is or heads for."]
+        lines.append("structure:")
         lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
     return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
 
@@ -292,11 +293,23 @@ def endless(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[
     def is_free(state: Candidate) -> bool:
         if of_wheel(state):
             return not _is_pulled(state, controls)
-        heads = of_compass(state) and FieldPath(state.path).unwrap
+        heads = (of_compass(state) and FieldPath(state.path).unwrap) or _is_of_turning(state, states)
         goes_on = heads and not steered and not _is_pulled(state, controls)
         return bool(goes_on or (_goes_round(state) and not holds))
 
     return [c for c in states if is_free(c)]
+
+
+_PLACE = re.compile(r"(.*\b)(position|translation)\.[xy]")
+_TURNS = 1.0
+"""rad, by which a body turns at least whose place goes where it heads."""
+
+
+def _is_of_turning(place: Candidate, states: Sequence[Candidate]) -> bool:
+    """Whether it is a coordinate of a vehicle on the map, which another drive may take elsewhere."""
+    base = match[1] if (match := _PLACE.fullmatch(place.path)) else None
+    yaws = (c for c in states if c.topic == place.topic and c.path == f"unwrap(yaw({base}orientation))")
+    return any(np.ptp(c.finite) > _TURNS for c in yaws)
 
 
 TELLS = 0.02
