@@ -1134,6 +1134,8 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
     for more in ("A", "*"):  # of which one is noise
         proposal = propose([table], states=[f"/table:{more}"], controls=["/table:B"])
         assert signals_of(proposal) == ([("/table", c) for c in more.replace("*", "AC")], [("/table", "B")])
+    proposal = propose([table], controls=["/table:B"])  # one column of what is measured leaves the others there
+    assert signals_of(proposal) == ([("/table", "A"), ("/table", "C")], [("/table", "B")])
     for asked in ({"states": ["/none"]}, {"controls": ["/other/cmd:date"]}):
         refuses(BagError, "meets nothing that moves", propose, [path], **asked)
 

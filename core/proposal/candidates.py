@@ -550,8 +550,9 @@ def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str
     fewer, more = sorted(met, key=lambda role: len(met[role]))
     met[more] -= met[fewer]
     for source in list(sources):
-        mine = met["control"].intersection(source.candidates)
-        if mine and met["state"].intersection(source.candidates):
+        mine, others = (met[role].intersection(source.candidates) for role in ("control", "state"))
+        of_field = any(":" in pattern for pattern in controls) and source.role == "state" and not states
+        if mine and (others or (of_field and mine != {*source.candidates})):  # one of what is measured is asked for
             sources.append(source.parted(mine, "control"))
     for source in sources:
         for role, patterns in asked.items():
