@@ -1565,6 +1565,35 @@ def test_nothing_depends_on_where_a_vehicle_is(tmp_path, turn):
     assert free == (["position_x", "position_y", "yaw"] if turn > 1 else [])
 
 
+def test_a_column_in_degrees_that_jumps_by_a_turn_is_unwrapped(tmp_path):
+    """The fit asked for it; a power that is switched by as much is none."""
+    rng = np.random.default_rng(3)
+    on = np.repeat(rng.choice([0.0, 350.0], size=60), 25)
+    columns = {"shaft_position_deg": np.cumsum(0.02 * on) % 360, "heater_power": on + rng.normal(size=1500)}
+    proposal = propose([table_of(tmp_path / "a.csv", columns)])
+    assert {c.path for c in proposal.states} == {"unwrap(shaft_position_deg, 360)", "heater_power"}, proposal.text
+
+
+def test_channels_of_an_aircraft_and_inputs_are_controls_and_what_is_in_a_cabinet_is_measured():
+    plane = ["aileron", "elevator", "throttle", "roll"]
+    assert [role_of_column(name, plane) for name in plane] == ["control", "control", "control", "state"]
+    assert role_of_column("elevator", ["elevator", "elevator_b", "load"]) == "state"
+    assert [role_of_column(name, ["uest", "yest"]) for name in ("uEst", "yEst")] == ["control", "state"]
+    assert [role_of_column(f"tau_{what}_0") for what in ("cal", "est")] == ["control", "state"]
+    assert [role_of_column(f"control_{what}") for what in ("module_voltage", "voltage")] == ["state", "control"]
+
+
+def test_a_current_that_is_hardly_there_is_no_switch_and_a_variance_no_signal(tmp_path):
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    columns = {"speed": answers(rng, u[:, None])[:, 0], "duty": u, "spare_current": (u > 1.2) * 0.11, "valve": u > 1}
+    columns |= {"heading_var": answers(rng, u[:, None])[:, 0], "process_var": answers(rng, u[:, None])[:, 0]}
+    proposal = propose([table_of(tmp_path / "a.csv", columns)])
+    assert "heading_var" not in proposal.text and "process_var" in proposal.text
+    assert "spare_current: takes two values only" in proposal.text
+    assert "spare_current" not in [c.path for c in proposal.controls]
+
+
 @pytest.mark.parametrize(("command", "apart", "depends"), [("direction_cmd", 30, True), ("course_cmd", 140, False)])
 def test_a_heading_depends_on_a_command_it_follows_but_on_none_that_jumps(tmp_path, command, apart, depends):
     """A vehicle goes the shorter way to its course, and no linear model knows how often it went round."""
@@ -1668,7 +1697,8 @@ def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "step"), [("q{}", 0.05), ("pose.orientation.{}", 0.05), ("Q_{}", 2.0), ("q[{}]", 0.05)]
+    ("name", "step"),
+    [("q{}", 0.05), ("pose.orientation.{}", 0.05), ("Q_{}", 2.0), ("q[{}]", 0.05), ("q{}", 0.06)],
 )
 def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
     """q and -q are one attitude: what jumps in each column is no movement, and in the next run an alarm."""
@@ -1678,7 +1708,8 @@ def test_four_columns_of_a_quaternion_are_angles(tmp_path, name, step):
     sign = rng.choice([-1.0, 1.0], size=len(u))
     parts = {"x": 0 * u, "y": 0 * u, "z": sign * np.sin(yaw / 2), "w": sign * np.cos(yaw / 2)}
     letters = str.upper if "Q" in name else str
-    numbers = dict(zip("xyzw", "1230", strict=True)) if "[" in name else {axis: letters(axis) for axis in "xyzw"}
+    numbered = "[" in name or step == 0.06
+    numbers = dict(zip("xyzw", "1230" if numbered else map(letters, "xyzw"), strict=True))
     columns = {name.format(numbers[axis]): part for axis, part in parts.items()} | {"rudder_cmd": u}
     path = table_of(tmp_path / "a.csv", columns, step * np.arange(len(u)))
     proposal = propose([path])

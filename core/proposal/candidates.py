@@ -313,7 +313,7 @@ _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|pedal|joy|ackerm
 _COMMANDS += "|drive(?!n|_?(train|axle|shaft|wheel|end))"  # parts of a machine are none
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 _COLUMN = re.compile(
-    r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?con)?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
+    r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?(con|calc?))?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
 )
 _DESIRED = re.compile(r"(^|_)(Des[A-Z]|[A-Z]Des$)")  # as the log of an autopilot spells what its controllers follow
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
@@ -418,6 +418,9 @@ def part_by_role(source: Source) -> list[Source]:
 
 _BODY = {"u", "v"}, {"w", "p", "q", "r"}
 """Velocities of a body in its own frame: where both of the first and one of the others are columns, u is no control."""
+_CHANNEL = re.compile(r"(throttle|aileron|elevator|rudder|elevon|flap)s?(_?\w{1,2})?")
+"""Of an aircraft: where two of these are columns, no elevator is that of a building."""
+_OF_CABINET = re.compile(r"control(ler)?_(module|unit|box|board|panel|cabinet)_|controller_temp")
 _EFFECTOR = re.compile(r"(delta|rudder|aileron|elevator|flap|fin|sail|prop(eller)?|n|n_?prop|rpm)(_?\w{1,2})?")
 
 
@@ -434,6 +437,12 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
     if _BODY[0].issubset(beside) and not _BODY[1].isdisjoint(beside):
         if low in _BODY[0] or _EFFECTOR.fullmatch(low):
             return "state" if low in _BODY[0] else "control"
+    if _CHANNEL.fullmatch(low) and len({m[1] for b in beside if (m := _CHANNEL.fullmatch(b))}) > 1:
+        return "control"
+    if _OF_CABINET.search(low) and not _REFERENCE.search(low):
+        return "state"
+    if low[:1] == "u" and "y" + low[1:] in beside:  # of an experiment's input and output
+        return "control"
     loop = {b for b in beside if "setpoint" in b and b.replace("setpoint", "input") in beside}  # of a PID's log
     if "input" in low and low.replace("input", "setpoint") in loop:
         return "state"
@@ -447,6 +456,8 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
     return "control" if _COMMAND.search(low) or _COLUMN.search(low) or _SET.search(name) else "state"
 
 
+READ = re.compile(r"temperature|humidity|pressure|voltage|current(_?\w{1,2})?$")
+"""What is measured by its name, also where a sensor gives whole numbers and few of them."""
 TWO_VALUES = "takes two values only"
 """Why a measurement is no state; in a table it may be a switch."""
 
@@ -497,6 +508,10 @@ def _is_code(candidate: Candidate) -> bool:
     return 0 < len(values) <= _LABELS and bool((values == np.rint(values)).all())
 
 
+def _may_switch(candidate: Candidate) -> bool:
+    return not candidate.flickers and not READ.search(candidate.path.lower())
+
+
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls; codes are no states."""
     found, driven = [], any(s.role == "control" and s.free for s in sources)
@@ -506,7 +521,7 @@ def take_switches(sources: Sequence[Source]) -> list[Source]:
         codes = [c for c in table.free if _is_code(c)]
         for candidate in codes * driven:  # else it may be the only control
             candidate.reason, candidate.ready = _NO_AMOUNTS, "control"
-        if turned := codes * (not driven) + [c for c in table.candidates if c.reason == TWO_VALUES and not c.flickers]:
+        if turned := codes * (not driven) + [c for c in table.candidates if c.reason == TWO_VALUES and _may_switch(c)]:
             found.append(table.parted(turned, "switch"))
         for candidate in turned:
             candidate.reason = ""

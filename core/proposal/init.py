@@ -99,6 +99,7 @@ _FILL = "fill the empty cells with the number above"
 
 
 _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
+_VARIANCE = re.compile(r"variance|(?<!process)_var(?=\[|$)")  # of an estimate
 
 
 def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[Source]:
@@ -227,7 +228,7 @@ def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
 def _candidates(source: Source, fields: Sequence[str]) -> list[Candidate]:
     """Paths as they would stand in a file; arrays entry by entry, long ones once with the reason."""
     found: list[Candidate] = []
-    for path in (path for path in fields if "variance" not in path):
+    for path in (path for path in fields if not _VARIANCE.search(path)):
         size = math.prod(int(b) - int(a) + 1 for a, b in _SPREAD.findall(path))
         if size > LONGEST_ARRAY:
             found.append(Candidate(source, path, reason=f"an array of {size} numbers"))
@@ -258,7 +259,7 @@ def _sift(source: Source) -> None:
     """Say of each number whether it moves; angles in place of the quaternions that are some."""
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
     for base in bases:
-        part = re.compile(rf"{re.escape(base)}(\.[xyzw]|\[[0-3]\]|_[0-3])").fullmatch
+        part = re.compile(rf"{re.escape(base)}(\.[xyzw]|\[[0-3]\]|_?[0-3])").fullmatch
         read = [c.values for c in source.candidates if part(c.path) and c.values]
         norm = np.sqrt(sum(np.concatenate(values) ** 2 for values in read)) if len(read) == 4 else np.zeros(1)
         unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
@@ -389,6 +390,9 @@ def _drop_computed(sources: Sequence[Source]) -> None:
             candidate.reason = f"follows from {shortlist(of, 3)} of the same row"
 
 
+_ANGLE = re.compile(r"angle|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg|_(deg(ree)?|rad(ian)?)s?$")
+
+
 def _wrapped(source: Source) -> None:
     """Angles that jump by a turn are unwrapped, those of a quaternion and a compass always."""
     for candidate in source.free:
@@ -397,7 +401,7 @@ def _wrapped(source: Source) -> None:
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
         low, high, turning = candidate.finite.min(), candidate.finite.max(), of_compass(candidate)
         compass = bool(turning and -180 <= low and high <= 360 and max(-low, high) > math.tau)
-        named = turning or re.search("angle|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg", candidate.path.lower())
+        named = turning or _ANGLE.search(candidate.path.lower())
         turned = (t for t in (math.tau, 360.0) if any(s <= 1.1 * t and step > 0.8 * t for s, step in steps))
         turn = math.tau if angle else next(turned if named else iter(()), 360.0 * compass or turn_of_count(candidate))
         if turn:

@@ -18,7 +18,7 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.evidence import FASTEST, held_for
-from uncertain_lti.proposal.candidates import FEWEST, SHOWS, TWO_VALUES, Candidate, Source, Steps, steps_of
+from uncertain_lti.proposal.candidates import FEWEST, READ, SHOWS, TWO_VALUES, Candidate, Source, Steps, steps_of
 from uncertain_lti.proposal.choosing import drop_copies
 from uncertain_lti.proposal.signals_file import set_own_scale
 from uncertain_lti.recordings.table_times import field_name
@@ -39,8 +39,6 @@ HELD = 0.8
 GATED = 0.99
 """Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
 _WEATHER = re.compile(r"(^|_)(outdoor|outside|ambient|wea(ther|bus_|sta_))(?!.*(coil|damper|fan|flow|pump|unit|valve))")
-_READ = re.compile(r"temperature|humidity|pressure|voltage")
-"""What is measured by its name, also where a sensor gives whole numbers and few of them."""
 _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
 
 
@@ -109,7 +107,7 @@ def _is_set(candidate: Candidate, called: bool) -> bool:
         candidate.why = (
             f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"
         )
-    elif len(values) <= (few if by_name or not _READ.search(candidate.path.lower()) else 2) and not candidate.flickers:
+    elif len(values) <= (few if by_name or not READ.search(candidate.path.lower()) else 2) and not candidate.flickers:
         candidate.why = f"switched between {', '.join(f'{v + 0.0:.6g}' for v in values)}"
     elif _WEATHER.search(candidate.path.lower()):
         candidate.why = "the weather, by its name, which is no fault of the machine"

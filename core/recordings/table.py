@@ -211,7 +211,7 @@ class Table(Recording):
         step = float(np.median(steps)) if len(steps) else 0.0
         columns, quaternions = self._of(topic)
         numbers = [(name, c) for name, c in columns.items() if _field_type(c).kind == "number"]
-        numbered = [base for base in quaternions if f"{base}_0" in columns]
+        numbered = [base for base, names in quaternions.items() if names[3].endswith("0")]
         parts = {name for base, names in quaternions.items() if base not in numbered for name in names}
         whole = [(name, c) for name, c in numbers if name not in parts]
         fields = tuple(name if c.ndim == 1 else f"{name}[0..{c.shape[1] - 1}]" for name, c in whole)
@@ -498,13 +498,13 @@ _QUATERNION = "quaternion"
 
 
 def _quaternions(columns: Mapping[str, Column]) -> dict[str, list[str]]:
-    """Names of the columns of x, y, z, w, by their beginning: `q` of `qx` to `qw`, or of `q[0]` (w) to `q[3]`."""
+    """Names of the columns of x, y, z, w, by their beginning: `q` of `qx` to `qw`, or of `q0`, `q[0]` (w) to `q[3]`."""
     found = {}
     for name in columns:
         base = name[:-1].rstrip("_")
         parts = [name[:-1] + axis for axis in ("XYZW" if name[-1] == "W" else "xyzw")]
-        if name[-1] == "0" and base in QUATERNION_ARRAYS and f"{base}_4" not in columns:
-            parts = [f"{base}_{entry}" for entry in "1230"]
+        if name[-1] == "0" and base in QUATERNION_ARRAYS and f"{name[:-1]}4" not in columns:
+            parts = [name[:-1] + entry for entry in "1230"]
         if name == parts[3] and base and base not in columns and all(part in columns for part in parts):
             if all(_field_type(columns[part]) == FieldType("number", "float64") for part in parts):
                 found[base] = parts
