@@ -1155,6 +1155,17 @@ def test_a_matrix_whose_first_line_grows_has_its_time_there(tall, tmp_path):
     refuses(BagError, "no column is called time", open_recording, tmp_path / "b.npz")
 
 
+@pytest.mark.parametrize("stated", ["# Columnas: t y i u", "% columns of it: t, y,i, u", "# Columns: t y"])
+def test_names_that_a_comment_states_are_those_of_the_columns(stated, tmp_path):
+    """Nothing had a name, and the command was not told from what answers it."""
+    rows = [f"{k / 100:.2f}\t{k % 7}\t{k % 5}\t{k % 3}" for k in range(60)]
+    (tmp_path / "a.txt").write_text(
+        "\n".join(["# Ts: 0.01s", stated, "# Model: a=1, b=2, c=3, d=4", "# By: Ada of Old York", "#", *rows])
+    )
+    names = list(open_recording(tmp_path / "a.txt").columns_by_field)
+    assert names == (["y", "i", "u"] if "u" in stated.split()[-1] else ["column_2", "column_3", "column_4"])
+
+
 @pytest.mark.parametrize("beside", [{}, {"t": 0.5 * np.arange(50)}])
 def test_the_time_is_in_a_matrix_where_no_vector_beside_it_is_one(beside, tmp_path):
     """Of a motor, beside what was computed from it and the parameters, the file could not be read."""

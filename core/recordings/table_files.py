@@ -335,12 +335,25 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     kinds = [len(set(cells) - {""}) for cells in above]
     lines_of_names = [i for i, kind in enumerate(kinds) if kind > 1]
     if not lines_of_names:
+        if stated := next(filter(None, (_stated(line, wide) for line in reversed(lines[:first]))), ()):
+            return _Shape(delimiter, begin, stated, ())
         unlike = f"its header names {len(last)} columns and its rows have {wide} cells"
         unlike = f"{unlike}, so no column has a name; mend it" * bool(last)
         return _Shape(delimiter, begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike)
     # above the names there may be groups of them
     chosen = next((i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0])
     return _Shape(delimiter, begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
+
+
+_OF_COLUMNS = re.compile(r"(?i)\b([ck]olu?m?n|colonne|spalte|campo|fields?\b|channels?\b|signals?\b|header|format)")
+
+
+def _stated(line: str, wide: int) -> tuple[str, ...]:
+    """Names that a comment states after a colon, as `# Columns: t y u` does, if there are as many as columns."""
+    before, _, after = line.lstrip("#%; ").partition(":")
+    names = re.split(r"\s*[,;|\t]\s*" if re.search(r"[,;|\t]", after) else r"\s+", after.strip())
+    plain = len(set(names)) == wide and not any(map(_is_value, names))
+    return tuple(names) if plain and line.startswith(("#", "%")) and _OF_COLUMNS.search(before) and all(names) else ()
 
 
 _FEW = 10  # lines with a number or an instant that may come above the names
