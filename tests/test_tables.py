@@ -1203,7 +1203,7 @@ def test_row_numbers_without_a_name_are_no_time(tmp_path):
     rows = [f"{k},{k % 7},{k % 5}" for k in range(60)]
     refuses(BagError, "no column is called time", read_csv, tmp_path, ",x,y", rows)
     (tmp_path / "b.csv").write_text("\n".join(rows))
-    assert "taken for the time" in open_recording(tmp_path / "b.csv").warnings[0]
+    assert "a second a row; if it numbers the rows" in open_recording(tmp_path / "b.csv").warnings[0]
 
 
 def test_numbers_of_rows_are_no_seconds(tmp_path):

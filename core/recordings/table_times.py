@@ -164,8 +164,10 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
     for name in [*(n for n in names if _OF_WHAT.fullmatch(_bare(n))), *first]:
         says = name in table.units or names[1:2] == ["column 2"]  # a unit, or that none has a name
-        if _grows(table.columns[name]) and (says or (np.diff(table.columns[name]) != 1).any()):
-            return name, _GROWS  # and are no numbers of rows, as `step` or the first column of a data frame
+        counts = _grows(table.columns[name]) and bool((np.diff(table.columns[name]) == 1).all())  # as a data frame does
+        if _grows(table.columns[name]) and (says or not counts):
+            each = ", a second a row; if it numbers the rows, say how many s each has, `--table step=0.01`"
+            return name, _GROWS + each * (counts and name not in table.units)
     none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
     none = f"column {lasting[0]!r} says how long something has lasted, and no other" if lasting else none
     same = [float(table.columns[name][0]) for name in still if table.columns[name].dtype.kind in "iuf"]
