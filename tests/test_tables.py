@@ -1155,6 +1155,17 @@ def test_a_matrix_whose_first_line_grows_has_its_time_there(tall, tmp_path):
     refuses(BagError, "no column is called time", open_recording, tmp_path / "b.npz")
 
 
+@pytest.mark.parametrize("header", ["  Time   ref  lev2  lev1", "  Time   ref  Func. Gen.  lev1"])
+def test_a_title_of_as_many_words_is_no_header(header, tmp_path):
+    """Of the export of a laboratory's bench the columns were called after the program that wrote it."""
+    rows = [f"  {k / 10:.2f}  {k % 7}  {k % 5}  {k % 3}" for k in range(60)]
+    (tmp_path / "a.txt").write_text("\n".join(["Data of TecBench CE2", "", header, *rows]))
+    bag = open_recording(tmp_path / "a.txt")
+    fits = len(header.split()) == 4
+    assert list(bag.columns_by_field) == (["ref", "lev2", "lev1"] if fits else ["column_2", "column_3", "column_4"])
+    assert fits or "names 5 columns and its rows have 4 cells" in bag.warnings[0]
+
+
 @pytest.mark.parametrize("stated", ["# Columnas: t y i u", "% columns of it: t, y,i, u", "# Columns: t y"])
 def test_names_that_a_comment_states_are_those_of_the_columns(stated, tmp_path):
     """Nothing had a name, and the command was not told from what answers it."""

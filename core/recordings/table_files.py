@@ -333,7 +333,8 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     last = next((cells for cells in reversed(above) if len(cells) > 1 and not any(map(_is_value, cells))), [])
     above = [cells for cells in above if len(cells) == wide]
     kinds = [len(set(cells) - {""}) for cells in above]
-    lines_of_names = [i for i, kind in enumerate(kinds) if kind > 1]
+    prose = delimiter == " " and len(last) != wide  # above a header that does not fit
+    lines_of_names = [i for i, kind in enumerate(kinds) if kind > 1 and not prose]
     if not lines_of_names:
         if stated := next(filter(None, (_stated(line, wide) for line in reversed(lines[:first]))), ()):
             return _Shape(delimiter, begin, stated, ())
@@ -341,10 +342,12 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
         unlike = f"{unlike}, so no column has a name; mend it" * bool(last)
         return _Shape(delimiter, begin, tuple(f"column {i + 1}" for i in range(wide)), (), unlike)
     # above the names there may be groups of them
-    chosen = next((i for i in lines_of_names if 2 * kinds[i] > wide), lines_of_names[0])
+    many = [i for i in lines_of_names if 2 * kinds[i] > wide] or lines_of_names[:1]
+    chosen = next((i for i in many if any(map(_TIME.match, above[i]))), many[0])  # of as many words may be a title
     return _Shape(delimiter, begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
 
 
+_TIME = re.compile(r"(?i)(t|time|date|zeit|tiempo|temps)\b")
 _OF_COLUMNS = re.compile(r"(?i)\b([ck]olu?m?n|colonne|spalte|campo|fields?\b|channels?\b|signals?\b|header|format)")
 
 
