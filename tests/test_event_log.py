@@ -325,6 +325,20 @@ def test_a_steady_control_that_ceases_is_told_while_its_publisher_stays(every: i
     assert f"messages on {CONTROL} again" in rig.lines and not rig.session.ceased(rig.now, TIMEOUT)
 
 
+def test_of_a_topic_with_a_control_that_ends_no_line_says_that_its_last_values_count_on() -> None:
+    rig = Rig()
+    signals = rig.model.signals
+    first, *others = signals.controls
+    mixed = replace(signals, controls=(replace(first, max_hold=None), *others))
+    rig.watch(rig.model.replace(signals=mixed), rig.session.rule)
+    rig.send(25)
+    rig.lines.clear()
+    rig.send(400, control=False)
+    silent, none = rig.lines
+    assert silent == f"no message on {CONTROL} for 1.0 s"
+    assert none.startswith("no verdict for 1.0 s") and f"{others[0].name} missing" in none
+
+
 def test_the_reason_names_what_is_expected_and_what_was_heard_where_no_message_names_a_signal() -> None:
     rig = Rig()
     for _ in range(30):

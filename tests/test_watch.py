@@ -12,7 +12,9 @@
 import json
 import re
 import shutil
+import signal
 import socket
+import struct
 import subprocess
 import time
 import urllib.error
@@ -156,3 +158,16 @@ def test_a_name_that_no_node_has_and_a_port_that_is_taken_are_refused(tmp_path, 
         ):
             assert main(["watch", *words]) == 2
             assert said in capfd.readouterr().err
+
+
+def test_a_reader_that_leaves_before_its_answer_prints_nothing(world):
+    watch = world.command("watch", "--port", 0)
+    address = address_of(watch)
+    port = int(address.rsplit(":")[-1].strip("/"))
+    for _ in range(10):
+        with socket.create_connection(("127.0.0.1", port)) as reader:
+            reader.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # leave at once
+            reader.sendall(b"GET / HTTP/1.0\r\n\r\n")
+    assert get(address, Host="localhost")[0] == 200
+    watch.signal(signal.SIGTERM)
+    assert watch.wait() == 0 and "Error" not in watch.output

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -188,8 +189,14 @@ def serving(watched: Watched, host: str, port: int) -> Iterator[str]:
         def log_message(self, format: str, *args: Any) -> None:
             """Nothing: a line a second would hide all others."""
 
+    class Server(ThreadingHTTPServer):
+        def handle_error(self, request: Any, client_address: Any) -> None:
+            """As it is, but for a reader that left before its answer: a page that is closed does that."""
+            if not isinstance(sys.exception(), ConnectionError):
+                super().handle_error(request, client_address)
+
     try:
-        server = ThreadingHTTPServer((host, port), Handler)
+        server = Server((host, port), Handler)
     except (OSError, OverflowError) as error:
         why = error.strerror if isinstance(error, OSError) else str(error)
         raise UncertainLTIError(f"{host}:{port}: cannot be served: {why}; choose another --port or --host") from None

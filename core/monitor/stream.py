@@ -532,12 +532,12 @@ class Stream:
         return self._heard.get(topic)
 
     def held(self, topic: str) -> float:
-        """How long the last values of a topic may be used, s; for ever of that of the enable condition."""
+        """How long all the last values of a topic may be used, s; for ever of that of the enable condition."""
         on = self.model.signals.on(topic)
         if any(i < self.model.n for i in on):
             return 0.0
         holds = [self.model.signals[i].max_hold for i in on]
-        return max((math.inf if hold is None else hold for hold in holds), default=math.inf)
+        return min((math.inf if hold is None else hold for hold in holds), default=math.inf)
 
     def without_verdict(self, now: float) -> float:
         """Time since the last verdict, or since the start."""
