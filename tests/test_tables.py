@@ -952,6 +952,38 @@ def test_names_above_the_rows_are_no_comments_where_there_are_other_names(tmp_pa
     assert list(read_csv(tmp_path, "# time,x", (f"{k},{k % 7}" for k in range(50))).columns_by_field) == ["x"]
 
 
+ROWS = [f"{k / 10},{k % 7},{k % 5}" for k in range(50)]
+
+
+@pytest.mark.parametrize(
+    ("text", "fields"),
+    [
+        (['time,"x\n[m/s, mean]","y\n\n[V]"', *ROWS], ["x_m_s_mean", "y_V"]),  # Alt and Enter in a spreadsheet
+        (["time,x,y", *(f"{row},,," for row in ROWS)], ["x", "y"]),
+        (["time,x,y", *ROWS[:25], "\ufefftime,x,y", *ROWS[25:]], ["x", "y"]),  # one file put behind another
+        (["time,x,y", *ROWS, "\0" * 4096], ["x", "y"]),  # after a power cut
+    ],
+)
+def test_names_in_several_lines_and_what_is_behind_rows_and_files_cost_no_row(text, fields, tmp_path):
+    bag = read_csv(tmp_path, text[0], text[1:])
+    assert list(bag.columns_by_field) == fields
+    assert bag.columns_by_field[fields[0]].tolist() == [k % 7 for k in range(50)]
+    assert bag.times.tolist() == [k * 10**8 for k in range(50)]
+
+
+def test_a_first_row_with_a_cell_that_is_too_long_is_not_passed_over(tmp_path):
+    with pytest.raises(BagError, match=r"line 2 cannot be read \(field larger than field limit"):
+        read_csv(tmp_path, "time,x,note", [f"0,1,{'y' * 200_000}", *(f"{k},{k % 7},z" for k in range(1, 50))])
+
+
+def test_an_array_of_structures_has_a_row_in_each_and_durations_are_seconds():
+    """As `log(k).time = ...` of MATLAB makes it, and numpy writes a time."""
+    read = _of_arrays(Path("a.mat"), {"log": [{"time": k / 10, "x": k % 7, "mode": "auto"} for k in range(50)]})
+    assert list(read.columns) == ["log_time", "log_x", "log_mode"] and read.columns["log_x"].tolist()[:9:8] == [0, 1]
+    read = _of_arrays(Path("a.npz"), {"time": np.arange(50).astype("timedelta64[ms]"), "x": np.arange(50) % 7})
+    assert read.columns["time"].tolist()[:3] == [0.0, 0.001, 0.002]
+
+
 @pytest.mark.parametrize("header", ["sec,nanosec,frame,x", "stamp_secs,stamp_nsecs,frame,x", ""])
 def test_the_stamp_of_a_message_in_two_columns_is_the_time(header, tmp_path):
     """As `ros2 topic echo --csv` writes it, without names; seconds alone made rows of a second even."""

@@ -33,6 +33,7 @@ from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, 
 _DELIMITERS = ",;\t|"
 _LOOK = 1 << 20  # bytes in which the shape of a CSV file is looked for
 _LOOK_LINES = 60
+_HIGH = 10  # lines over which a cell in quotes may go above the rows
 _MISSING = {"", "na", "n/a", "nan", "null", "none", "-", "--", "nil", "#n/a", "?"}
 _TRUTH = dict.fromkeys("true yes on wahr ja ein an vrai oui".split(), 1.0)
 _TRUTH |= dict.fromkeys("false no off falsch nein aus faux non".split(), 0.0)
@@ -115,12 +116,13 @@ def _read_csv(path: Path) -> RawTable:
     except UnicodeDecodeError as error:
         if encoding == "utf-8-sig" and error.start < len(head) - 8:
             encoding = "cp1252"  # of Windows
-    if "\0" in (start := head.decode(encoding, errors="replace")):
+    start = head.decode(encoding, errors="replace").rstrip("\0")  # which a power cut leaves behind the last line
+    if "\0" in start:
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
     whole, decimals = start.rpartition("\n")[0], [match[2] for match in _CUT_TIME.finditer(start)]
     cut_times = any(three.startswith("0") for three in decimals)  # which numbers do not
     cut_times = cut_times and len(_CUT_TIME.findall(whole)) == len(re.findall(r"\d:\d\d:\d\d", whole))
-    lines = re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES]
+    lines = _names_on_one_line(re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES])
     mend = partial(_CUT_TIME.sub, r"\1.") if cut_times else _without_arrow if any(map(_ARROW.match, lines)) else None
     lines = list(map(mend, lines)) if mend else lines
     shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), mend=mend)
@@ -136,6 +138,16 @@ def _read_csv(path: Path) -> RawTable:
     exact = partial(_texts, path, encoding, shape, names)
     found = dict(zip(names, np.ascontiguousarray(values.T), strict=True))
     return RawTable(found, notes, exact, units)
+
+
+def _names_on_one_line(lines: list[str]) -> list[str]:
+    """The lines, those of a cell in quotes that goes on put on its first, with empty ones in their places."""
+    for first, line in enumerate(lines):
+        if line.count('"') % 2 and re.search(r'(^|[,;\t|])\s*"[^"]*$', line):
+            odd = (i for i, other in enumerate(lines) if first < i < first + _HIGH and other.count('"') % 2)
+            last = next(odd, first)
+            lines[first : last + 1] = [" ".join(lines[first : last + 1]), *[""] * (last - first)]
+    return lines
 
 
 def _without_arrow(line: str) -> str:
@@ -180,7 +192,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     first_odd = odd = line = again = 0
     for line, cells in _rows(path, encoding, shape):
         if known.intersection(map(str.strip, cells[:2])):
-            plain = [cell.strip() for cell in cells]
+            plain = [cell.strip().lstrip("\ufeff") for cell in cells]  # of a file that was put behind another
             if 2 * len(known.intersection(plain)) > wide or (all(plain) and not any(map(_is_value, plain))):
                 if any(a != b and not _is_value(a) for a, b in zip(plain, header, strict=False)):
                     rest = "write the rows from there on to a file of their own"
@@ -327,8 +339,9 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     above = [cells[:-1] if len(cells) == wide + 1 and not cells[-1] else cells for cells in above]
     rows = [cells for cells in split[begin:] if len(cells) == wide]
     named = any(len(cells) == wide and 2 * len(set(cells) - {""}) > wide for cells in above)
-    if not named and not any(cells[-1] for cells in rows):  # a delimiter at the end of the rows, and none of the names
-        above = [[*cells, ""] if len(cells) == wide - 1 else cells for cells in above]
+    if not named:  # delimiters at the end of the rows, and none of the names
+        used = max((place for cells in rows for place, cell in enumerate(cells, 1) if cell), default=wide)
+        above = [[*cells, *[""] * (wide - len(cells))] if used <= len(cells) < wide else cells for cells in above]
     above = [filled if len(filled := [c for c in cells if c]) == wide else cells for cells in above]
     last = next((cells for cells in reversed(above) if len(cells) > 1 and not any(map(_is_value, cells))), [])
     above = [cells for cells in above if len(cells) == wide]
@@ -376,8 +389,8 @@ def _split(line: str, delimiter: str) -> list[str]:
         return line.split()
     try:
         cells = next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
-    except csv.Error:
-        return []
+    except csv.Error:  # a cell that is too long, which `_rows` refuses
+        cells = line.split(delimiter)
     return [cell.strip() for cell in cells]
 
 
@@ -512,7 +525,9 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
     while waiting:
         name, value = waiting.pop()
         if isinstance(value, list) and value and all(isinstance(one, Mapping) for one in value):
-            value = {str(number): one for number, one in enumerate(value, 1)}
+            numbers = all(one.keys() == value[0].keys() and not any(map(np.ndim, one.values())) for one in value)
+            each = {key: np.array([one[key] for one in value]) for key in value[0]} if numbers else {}  # a row in each
+            value = each or {str(number): one for number, one in enumerate(value, 1)}
         if isinstance(value, Mapping):
             waiting += [(f"{name}_{key}", inner) for key, inner in list(value.items())[::-1]]
             continue
@@ -531,6 +546,8 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
             array = array.ravel()
         if array.dtype.kind == "M":
             array = _nanoseconds(path, name, array)
+        elif array.dtype.kind == "m":
+            array = array / np.timedelta64(1, "s")
         elif array.dtype.kind in "US":
             array = array.astype(str).astype(object)
         elif array.dtype.kind in "bf":
