@@ -962,6 +962,7 @@ ROWS = [f"{k / 10},{k % 7},{k % 5}" for k in range(50)]
         (["time,x,y", *(f"{row},,," for row in ROWS)], ["x", "y"]),
         (["time,x,y", *ROWS[:25], "\ufefftime,x,y", *ROWS[25:]], ["x", "y"]),  # one file put behind another
         (["time,x,y", *ROWS, "\0" * 4096], ["x", "y"]),  # after a power cut
+        (['"Format","MoTeC CSV File",,,"Workbook",""', '"Rate","20.0","Hz"', "", "time,x,y", *ROWS], ["x", "y"]),
     ],
 )
 def test_names_in_several_lines_and_what_is_behind_rows_and_files_cost_no_row(text, fields, tmp_path):
@@ -974,6 +975,20 @@ def test_names_in_several_lines_and_what_is_behind_rows_and_files_cost_no_row(te
 def test_a_first_row_with_a_cell_that_is_too_long_is_not_passed_over(tmp_path):
     with pytest.raises(BagError, match=r"line 2 cannot be read \(field larger than field limit"):
         read_csv(tmp_path, "time,x,note", [f"0,1,{'y' * 200_000}", *(f"{k},{k % 7},z" for k in range(1, 50))])
+
+
+def test_a_parquet_without_rows_or_with_a_name_twice(tmp_path):
+    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    of_50 = [
+        pa.array(range(50), pa.float64()),
+        pa.array([k % 7 for k in range(50)]),
+        pa.array([k % 5 for k in range(50)]),
+    ]
+    parquet.write_table(table := pa.Table.from_arrays(of_50, names=["time", "x", "x"]), tmp_path / "a.parquet")
+    assert read_table(tmp_path / "a.parquet").columns["x 2"].tolist()[:6] == [0, 1, 2, 3, 4, 0]
+    parquet.write_table(table.slice(0, 0), tmp_path / "b.parquet")
+    with pytest.raises(BagError, match="has columns and no row; record or copy it again"):
+        read_table(tmp_path / "b.parquet")
 
 
 def test_an_array_of_structures_has_a_row_in_each_and_durations_are_seconds():
@@ -1270,8 +1285,17 @@ def test_another_time_is_taken_where_most_rows_share_one(tmp_path):
     assert not read_csv(tmp_path, "time_s,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9))).warnings
 
 
-def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(tmp_path):
-    rows = [f"{k // 150 % 60:02}:{0.4 * (k % 150):04.1f},{k}" for k in range(18000)]
+@pytest.mark.parametrize("name", ["Time of day", "time_of_day"])
+def test_seconds_of_a_day_are_no_days(name, tmp_path):
+    bag = read_csv(tmp_path, f"{name},x", (f"{45_000 + k / 10},{k % 7}" for k in range(50)))
+    assert (bag.times[1:] - bag.times[:-1]).tolist() == [10**8] * 49
+    bag = read_csv(tmp_path, f"{name},x", (f"{0.5 + k / 1000},{k % 7}" for k in range(50)))
+    assert (bag.times[1] - bag.times[0]) * 1e-9 == pytest.approx(86.4)
+
+
+@pytest.mark.parametrize("digits", ["02", ""])
+def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(digits, tmp_path):
+    rows = [f"{k // 150 % 60:{digits}}:{0.4 * (k % 150):04.1f},{k}" for k in range(18000)]
     bag = read_csv(tmp_path, "time,x", rows)
     assert set(np.diff(bag.times).tolist()) == {4 * 10**8} and not bag.warnings
     back = read_csv(tmp_path, "time,x", (f"{minute}:00.5,{k}" for k, minute in enumerate([40, 41, 42, 30, 31, 32])))

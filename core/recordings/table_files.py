@@ -342,7 +342,7 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     if not named:  # delimiters at the end of the rows, and none of the names
         used = max((place for cells in rows for place, cell in enumerate(cells, 1) if cell), default=wide)
         above = [[*cells, *[""] * (wide - len(cells))] if used <= len(cells) < wide else cells for cells in above]
-    above = [filled if len(filled := [c for c in cells if c]) == wide else cells for cells in above]
+        above = [filled if len(filled := [c for c in cells if c]) == wide else cells for cells in above]
     last = next((cells for cells in reversed(above) if len(cells) > 1 and not any(map(_is_value, cells))), [])
     above = [cells for cells in above if len(cells) == wide]
     kinds = [len(set(cells) - {""}) for cells in above]
@@ -417,7 +417,7 @@ def _read_arrow(path: Path) -> RawTable:
                 states = f"states {rows.num_rows} rows of {rows.num_columns} columns"
                 remedy = "write the columns and rows that are needed"
                 raise BagError(f"{path}: {states}, which is more than is read of a file of its size; {remedy}")
-            table = pa.parquet.read_table(path, memory_map=False)
+            table = pa.parquet.ParquetFile(path, memory_map=False).read()
             if table.num_rows != rows.num_rows:
                 states = f"it states {rows.num_rows} rows, and {table.num_rows} are read"
                 raise BagError(f"{path}: is damaged: {states}; copy it again")
@@ -569,6 +569,8 @@ def _is_text(array: NDArray[Any]) -> bool:
 
 def _of_one_length(path: Path, found: Mapping[str, Column], notes: dict[str, list[str]]) -> RawTable:
     """The columns of the length that most have; lines of a matrix count as samples, else its columns do."""
+    if found and not any(map(len, found.values())):
+        raise BagError(f"{path}: has columns and no row; record or copy it again")
     said = []
     matrices = [name for name, column in found.items() if column.ndim == 2]
     if len(matrices) == 1:

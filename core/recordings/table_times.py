@@ -331,7 +331,7 @@ def _with_colons(cells: Sequence[object]) -> Sequence[object]:
     minutes = {row: int(match[1]) for row, match in found if match}
     hours = np.cumsum(np.diff([*minutes.values()], prepend=[*minutes.values()][:1]) < -30).tolist()
     for row, hour in zip(minutes, hours, strict=True):
-        texts[row] = f"{hour}:{texts[row]}"
+        texts[row] = f"{hour}:{minutes[row]:02}:{texts[row].partition(':')[2]}"
     return texts
 
 
@@ -376,6 +376,8 @@ def _spelt(text: str) -> str:
 def _unit(name: str, values: Column, stated: str = "") -> str:
     """Unit below the names, or in the name, such as `t_ms` or `time [us]`, else by the size since 1970, or ""."""
     low = name.lower().replace("μ", "µ")
+    if (values > 1.0).any():  # of a day, and no days
+        low = re.sub(r"(?<=[_\s]of)[_\s]day$", "", low)
     for unit, pattern in _UNIT.items():
         if re.fullmatch(rf"[\[(]?\s*({pattern})\s*[\])]?", stated.lower().replace("μ", "µ")):
             return unit
