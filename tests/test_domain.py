@@ -58,6 +58,11 @@ def test_what_is_outside_is_named_by_signal_or_by_pair() -> None:
     assert not outside_in_words(model, np.array([[0.5], [0.2]]))
 
 
+def test_the_span_of_a_state_is_in_recorded_units() -> None:
+    domain = Domain(*map(np.array, ([-0.5, 0.0], [1.5, 0.25], [0.0], [1.0])))
+    assert domain.span(np.array([3.0, 8.0])).tolist() == [6.0, 2.0]
+
+
 def test_rounding_of_what_never_moved_is_not_outside() -> None:
     still = Domain(*(np.array([0.7]) for _ in range(4)))
     for share, outside in ((1e-13, False), (1e-11, True)):

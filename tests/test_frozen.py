@@ -368,6 +368,16 @@ def test_a_machine_that_is_active_is_not_parked() -> None:
     assert not EnvelopeMonitor(model.replace(repeats=Repeats([60.0], [40.0], [40.0], [0.0]))).check(parked).frozen.any()
 
 
+@pytest.mark.parametrize(("dt", "told"), [(0.1, False), (0.26, True)])
+def test_at_zero_only_activity_of_more_than_a_half_width_tells(dt: float, told: bool) -> None:
+    """It is 0.4 and 1.04 half-widths here, and 0.3 would be enough elsewhere: brakes and friction hold what rests."""
+    x = 0.01 * np.minimum(np.arange(80) - 40, 0.0)[:, None]
+    model = UncertainLTI([[0.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5], repeats=Repeats([60.0], [0.4], [0.4], [0.3]))
+    for value, frozen in ((0.0, told), (0.5, True)):
+        transient = Transient(dt * np.arange(80), x + value, np.tile([1.0, -1.0], 40)[:, None])
+        assert EnvelopeMonitor(model).check(transient).frozen.any() == frozen
+
+
 def test_a_fit_learns_how_active_a_machine_is_whose_state_changes(model: UncertainLTI) -> None:
     """A quarter of the seconds is less active if the machine was parked, half if not; of few it is a half-width."""
     few = [run(1), run(2, rest=(3.0, 4.2))]

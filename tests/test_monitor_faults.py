@@ -593,6 +593,9 @@ def test_snapshots_stay_within_their_folder_and_their_megabytes(tmp_path: Path) 
         assert sum(p.stat().st_size for p in mine) <= limit
         assert sorted(p.name for p in mine) == [p.name for p in written[-len(mine) :]], "the oldest go first"
     assert len(mine) == 3 and len(list(folder.iterdir())) == 4
+    for size in (70_000, 5_000, 5_000, 30_000):  # as much goes as there must be room
+        written.append(Path(album.take(scene(size), patience=300.0).removeprefix("wrote ")))
+    assert [path.is_file() for path in written[-4:]] == [False, True, True, True]
     # a link that bears the name of a snapshot leads elsewhere, and is left alone
     (folder / written[0].name).symlink_to(outside)
     with pytest.raises(ModelError, match=r"more than snapshot.megabytes allows"):

@@ -516,6 +516,7 @@ def test_speeds_and_times_that_are_none_are_refused_in_words(text: str, capsys: 
         (["play", "in.mcap", f"--rate={text}"], f"argument --rate: {text} is not a speed; give a number above 0"),
         (["demo", f"--rate={text}"], f"argument --rate: {text} is not a speed; give a number above 0"),
         (["play", "in.mcap", f"--wait={text}"], f"argument --wait: {text} is not a time; give seconds, 0 or more"),
+        (["record", "/x", "-o", "b", f"--note={text}"], f"argument --note: {text!r} does not read NAME=TEXT"),
     ):
         if text == "0" and "--wait=0" in arguments:
             continue

@@ -77,6 +77,7 @@ def test_a_missing_value_has_no_weights() -> None:
         (lambda: Schedule((SPEED,)).positions(["torque"]), "'speed'"),
         (lambda: Schedule.from_list([{"signal": "a", "knots": [0, 1], "odd": 1}]), "odd"),
         (lambda: Schedule.from_list([{"signal": "a", "knots": [0, True]}]), "knots"),
+        (lambda: Schedule.from_list([{"signal": 3, "knots": [0, 1]}]), "must be an object with 'signal'"),
         (lambda: Schedule.from_list({}), "list"),
     ],
 )

@@ -191,6 +191,6 @@ cdef class Repeating:
             return _ACTIVE
         if rests or parked:
             return 0
-        if steps > 0 and found[0] >= self.limit(i, 6):
+        if found[0] >= self.limit(i, 6):
             return _NOISE
         return _NOISE if unusual and steps >= self.least and found[0] >= self.limit(i, 5) else 0
