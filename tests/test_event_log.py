@@ -325,6 +325,18 @@ def test_a_steady_control_that_ceases_is_told_while_its_publisher_stays(every: i
     assert f"messages on {CONTROL} again" in rig.lines and not rig.session.ceased(rig.now, TIMEOUT)
 
 
+def test_publishers_that_are_taken_for_one_are_in_the_reason_while_all_is_well() -> None:
+    rig = Rig.at_work()
+    assert rig.session.reason(rig.now, TIMEOUT) == "no alarm"
+    rig.session.know_rivals([STATE])
+    rig.send(1)
+    said = f"{STATE}: several publishers send by turns, and are taken for one; stop all but one"
+    assert said in rig.session.reason(rig.now, TIMEOUT)
+    rig.session.know_rivals([])
+    rig.send(1)
+    assert rig.session.reason(rig.now, TIMEOUT) == "no alarm"
+
+
 def test_of_a_topic_with_a_control_that_ends_no_line_says_that_its_last_values_count_on() -> None:
     rig = Rig()
     signals = rig.model.signals

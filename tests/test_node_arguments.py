@@ -189,6 +189,7 @@ def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path:
         process = world.run_node("envelope_monitor", {}, "--params-file", str(file))
         process.says("not configured: parameter model is empty")
         assert process.running and says in process.output
+        assert process.output.count("nothing in it") == says.count("nothing in it")
         process.kill()
 
     with open_world(tmp_path) as world:
