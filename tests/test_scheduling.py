@@ -25,7 +25,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.cli.command import schedule as _schedule
 from uncertain_lti.cli.main import main
 from uncertain_lti.identification import fitting
-from uncertain_lti.model.free_run import run_over
+from uncertain_lti.model.horizon import run_over
 from uncertain_lti.proposal.search import EXCESS, KnotCandidate, Score, choose_knots, chosen_of
 from uncertain_lti.proposal.tune import promise, thinned
 from uncertain_lti.signals.signal_map import ScheduleRule, Signal, SignalMap

@@ -26,7 +26,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
-from uncertain_lti.model import free_run as nominal
+from uncertain_lti.model import horizon as nominal
 from uncertain_lti.model import interchange
 from uncertain_lti.model.alarm_rule import JOINT, AlarmRule, Rule, StatisticRule, checked_rules, with_containment
 from uncertain_lti.model.domain import Domain, Sampling

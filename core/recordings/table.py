@@ -31,7 +31,8 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import QUANTITY, Column, RawTable, read_table
+from uncertain_lti.recordings.table_files import read_table
+from uncertain_lti.recordings.table_text import QUANTITY, Column, RawTable
 from uncertain_lti.recordings.table_times import (
     NO_TIME,
     field_name,

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import meant, shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
-from uncertain_lti.recordings.table_files import ODD_SHARE, YEARS, Column, RawTable, left_out
+from uncertain_lti.recordings.table_text import ODD_SHARE, YEARS, Column, RawTable, left_out
 from uncertain_lti.signals.values import UNITS, TableLayout
 
 NO_TIME = -(2**63)
