@@ -1090,6 +1090,14 @@ def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):
         read_csv(tmp_path, "x,Messzeitpunkt", (f"{k % 7},shift {k}" for k in range(30)))
 
 
+@pytest.mark.parametrize("time", ["Zeit", "Messzeit", "Time", "Vorgang"])
+def test_a_temperature_is_no_time_whatever_the_time_is_called(tmp_path, time):
+    """`T_Oel` of a test stand was the time beside `Zeit`: half of the rows were older than the row before."""
+    rows = (f"{k / 10},{90 + 3 * math.sin(k / 4):.2f},{k % 7}" for k in range(60))
+    bag = read_csv(tmp_path, f"{time},T_Oel,x", rows)
+    assert set(np.diff(bag.times).tolist()) == {10**8} and set(bag.columns_by_field) >= {"T_Oel", "x"}
+
+
 @pytest.mark.parametrize("odd", ["", "-", "#NAME?"])
 @pytest.mark.parametrize("form", ["{m:02}:{s:02}.0", "13/01/14 12:{m:02}:{s:02}", "2024-03-13 12:{m:02}:{s:02}"])
 def test_a_cell_that_is_no_time_among_many_that_are_is_left_out_and_named(tmp_path, form, odd):

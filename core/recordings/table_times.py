@@ -31,11 +31,12 @@ NO_TIME = -(2**63)
 
 _NAMES = (
     r"(__|%)?time(_?stamp)?", r"ts?", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
-    r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"t_.*", r"(uhr)?zeit(stempel)?",
-    r"temps|tempo", r"elapsed|up_?time", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
+    r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"((uhr|mess)_?)?zeit(stempel)?",
+    r"temps|tempo", r"t_.*", r"elapsed|up_?time", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
 _LASTS = re.compile(r"time_(since|until|till|to|run|running|on|off|in|left|remaining|with(out)?)(_.*)?")
 _LONGEST_STEP = 3600  # s that a number beside the columns may say, as `Ts` of a benchmark
+_GOES_BACK = 0.1  # share of rows older than the one before from which on a column `t_...` has temperatures
 _OF_WHAT, _GROWS = re.compile(r"\w+_time"), "it is taken for the time, as it grows from row to row"
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
@@ -146,9 +147,10 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     plain = [name for name in names if table.columns[name].ndim == 1]
     called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
     still = [name for name in called if _stands_still(table.columns[name])]
-    called = [name for name in called if name not in still and not _of_a_minute(name, table.columns[name])]
     lasting = [name for name in called if _LASTS.fullmatch(_bare(name)) and _held(table.columns[name])]
-    called = [name for name in called if name not in lasting]
+    warm = [name for name in called if _bare(name).startswith("t_") and _goes_back(table.columns[name])]
+    none_of_them = {*still, *lasting, *warm}
+    called = [n for n in called if n not in none_of_them and not _of_a_minute(n, table.columns[n])]
     if likely := [name for name in called if may_be(table.columns[name])] or called:
         words_first = table.columns[called[0]].dtype.kind == "O" and not may_be(table.columns[called[0]])
         taken = called[0] if words_first and not goes_forward(table.columns[likely[0]]) else likely[0]
@@ -301,6 +303,10 @@ def _past_midnight(clock: Column, day: int) -> Column:
 def _stands_still(column: Column) -> bool:
     same = column.dtype.kind in "iuf" and len(column) > 2 and (column == column[0]).sum()
     return bool(same == len(column) or (same and np.count_nonzero(column == column) == 1))
+
+
+def _goes_back(column: Column) -> bool:
+    return column.dtype.kind in "iuf" and bool(np.mean(np.diff(column) < 0) > _GOES_BACK)
 
 
 def _of_a_minute(name: str, column: Column) -> bool:
