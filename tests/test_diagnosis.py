@@ -109,6 +109,14 @@ def test_controls_that_nearly_move_together_are_named_with_the_cure():
     u[:, 1] = 0.7 * u[:, 0] + 0.01 * u[:, 1]
     (message,) = [m for m in messages(run(u=u, noise=0.0)) if WORDS["collinear"] in m]
     assert "'valve' and 'pump'" in message and "record 'valve' moving while 'pump' rests" in message
+    third = np.column_stack([u[:, 0], rng.normal(size=1501), 0 * u[:, 0]])
+    third[:, 2] = third[:, 0] - third[:, 1] + 0.01 * rng.normal(size=1501)  # of three no two move together
+    x = np.zeros((1501, 1))
+    for k in range(1500):
+        x[k + 1] = 0.9 * x[k] + third[k, :1] + 0.01 * rng.normal()
+    three = Transient(0.05 * np.arange(1501), x, third, control_names=["a", "b", "c"])
+    (message,) = [m for m in messages(three) if WORDS["collinear"] in m]
+    assert "record 'a' moving while 'b' and 'c' rest;" in f"{message};", message
 
 
 def test_columns_that_move_together_in_two_ways_are_named_once():

@@ -218,7 +218,8 @@ def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], pa
             continue
         states, controls = [names[j] for j in part if j < problem.n], [names[j] for j in part if j >= problem.n]
         if not states:
-            cure = f"record {quoted(controls[:1])} moving while {quoted(controls[1:])} rests"
+            still = "rests" if len(controls) == 2 else "rest"
+            cure = f"record {quoted(controls[:1])} moving while {quoted(controls[1:])} {still}"
         elif controls:
             cure = f"record steps of {quoted(controls)} that are sharper than {quoted(states)} can follow"
         else:
