@@ -388,6 +388,100 @@ def test_a_topic_of_unknown_name_is_taken_where_no_state_answers_and_its_bursts_
     assert "step: constant\nmax_gap: 0." in proposal.text
 
 
+def test_the_set_points_of_a_test_stand_are_its_commands_and_what_its_actuators_reach_is_measured(tmp_path):
+    """Of an engine's test stand the throttle was the control and the manifold's pressure the only state."""
+    rng, messages = np.random.default_rng(0), []
+    speed, throttle, torque, demands = 0.0, 0.0, 0.0, np.zeros(2)
+    for k in range(3000):
+        demands = rng.normal(size=2) if k % 40 == 0 else demands
+        values = {"/dyno/speed_demand": demands[0], "/engine/pedal_demand": demands[1], "/engine/speed": speed}
+        values |= {"/engine/throttle_position": throttle, "/dyno/torque": torque}
+        noise = 1e-3 * rng.normal(size=len(values)) * ["demand" not in topic for topic in values]
+        messages += [
+            f64(topic, at(k), value + more) for (topic, value), more in zip(values.items(), noise, strict=True)
+        ]
+        throttle += 0.1 * (demands[1] - throttle)
+        torque += 0.2 * (throttle + 3 * (speed - demands[0]) - torque)
+        speed += 0.05 * (throttle - torque)
+    path, proposal = proposed(tmp_path, messages)
+    assert {c.topic for c in proposal.controls} == {"/dyno/speed_demand", "/engine/pedal_demand"}, proposal.text
+    assert {c.name for c in proposal.states} == {"speed", "throttle_position", "torque"}, proposal.text
+    fitted([path], proposal)
+    asked = propose([path], states=["/engine/speed"])
+    assert [c.topic for c in asked.states] == ["/engine/speed"], asked.text
+
+
+def test_an_outer_set_point_is_none_where_the_command_that_follows_it_is_recorded(tmp_path):
+    rng, messages, x, target, integral = np.random.default_rng(0), [], 0.0, 0.0, 0.0
+    for k in range(2000):
+        target = float(rng.normal()) if k % 60 == 0 else target
+        u = 2.0 * (target - x) + integral
+        messages += [f64("/base/target", at(k), target), f64("/base/cmd", at(k), u), f64("/base/state", at(k), x)]
+        integral += 0.02 * (target - x)
+        x += 0.05 * (u - x) + 1e-3 * float(rng.normal())
+    _, proposal = proposed(tmp_path, messages)
+    assert signals_of(proposal) == ([("/base/state", "data")], [("/base/cmd", "data")]), proposal.text
+
+
+def test_what_a_message_has_beside_what_is_commanded_is_measured_and_an_angle_named_by_its_topic_goes_round(tmp_path):
+    """Of an aeroplane's `/nav_info/roll` the attitude was nothing by its name, and its heading jumped by 360."""
+    rng, pair, messages = np.random.default_rng(1), "nav_msgs/msg/Pair", []
+    angle, demand, speed = np.zeros(2), np.zeros(2), 16.0
+    for k in range(2000):
+        demand = rng.uniform(-40, 40, 2) if k % 40 == 0 else demand
+        speed += 0.02 * (16 - speed + 0.01 * demand[0]) + 0.01 * float(rng.normal())
+        for topic, now, sent in zip(("/nav_info/roll", "/nav_info/yaw"), angle, demand, strict=True):
+            data = cdr(POSE_2D, x=sent, y=float((now + 180) % 360 - 180), theta=0.0)
+            messages.append(Message(topic, at(k), data[:-8]))
+        messages.append(f64("/hud/airspeed_measured", at(k), speed))
+        angle += [0.1 * (demand[0] - angle[0]), 0.1 * demand[1] + 1.0] + 0.05 * rng.normal(size=2)
+    pairs = [
+        Topic(f"/nav_info/{axis}", pair, schema="float64 commanded\nfloat64 measured\n") for axis in ("roll", "yaw")
+    ]
+    path = write([*pairs, Topic("/hud/airspeed_measured", FLOAT64)], messages).save(tmp_path / "a.mcap")
+    proposal = propose([path])
+    assert {"roll_measured", "yaw_measured"} <= {c.name for c in proposal.states}, proposal.text
+    assert {c.name for c in proposal.controls} == {"roll_commanded", "yaw_commanded"}, proposal.text
+    (yaw,) = (c for c in proposal.states if c.name == "yaw_measured")
+    assert yaw.path == "unwrap(measured, 360)"
+
+
+def test_signals_of_one_name_have_the_word_in_which_their_topics_differ(tmp_path):
+    """The two thrusters of a vessel were `thrust` and `thrust_command`."""
+    both = driven(("/hull/surge", "/thrusters/left/thrust"), 800)
+    both += driven(("/hull/yaw_speed", "/thrusters/right/thrust"), 800, seed=1)
+    kind, rng, heat = "sensor_msgs/msg/Temperature", np.random.default_rng(0), np.full(2, 20.0)
+    types = {"/engine/oil_temperature": kind, "/engine/inlet_temperature": kind}
+    for k in range(800):
+        sent = [float(np.frombuffer(both[2 * k + 1 + 1600 * number].data[-8:])[0]) for number in range(2)]
+        for topic, value in zip(types, heat, strict=True):
+            data = cdr(kind, header=header(at(k)), temperature=float(value), variance=0.0)
+            both.append(Message(topic, at(k) + 1, data, at(k)))
+        heat += 0.03 * (20.0 + np.array(sent) - heat) + 1e-3 * rng.normal(size=2)
+    _, proposal = proposed(tmp_path, sorted(both, key=lambda m: m.log_time), types)
+    assert {c.name for c in proposal.controls} == {"left_thrust", "right_thrust"}, proposal.text
+    assert {"oil_temperature", "inlet_temperature"} <= {c.name for c in proposal.states}, proposal.text
+
+
+def test_more_slower_sensors_than_fast_ones_give_the_instants_where_these_lose_little(tmp_path):
+    """Of an engine's test stand what came 100 times a second was judged alone, 3 of 13 signals."""
+    rng, messages, speed, u = np.random.default_rng(0), [], 0.0, 0.0
+    others = np.zeros(2)
+    for k in range(6000):
+        u = float(rng.normal()) if k % 60 == 0 else u
+        messages += [f64("/shaft/speed", at(k) // 2, speed + 2e-3 * float(rng.normal()))]
+        if k % 2 == 0:
+            noise = others + 1e-3 * rng.normal(size=2)
+            messages += [f64("/drive_cmd", at(k) // 2, u)]
+            messages += [
+                f64(f"/unit/{name}", at(k) // 2, value) for name, value in zip(("flow", "heat"), noise, strict=True)
+            ]
+        others += [0.02 * (u - others[0]), 0.01 * (others[0] - others[1]) + 2e-3 * float(rng.normal())]
+        speed += 0.02 * (u - speed)
+    _, proposal = proposed(tmp_path, messages)
+    assert {c.name for c in proposal.states} == {"speed", "flow", "heat"}, proposal.text
+
+
 def test_bursts_are_those_of_the_times_that_count(tmp_path):
     """Header stamps that mostly stand still came evenly; by the times of arrival half of the samples were gaps."""
     rng, messages, yaw = np.random.default_rng(4), [], 0.0
@@ -1605,6 +1699,17 @@ def test_a_heading_depends_on_a_command_it_follows_but_on_none_that_jumps(tmp_pa
     proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(1500))])
     assert [c.path for c in proposal.states] == ["unwrap(heading, 360)"], proposal.text
     assert ("structure:" in proposal.text) != depends, proposal.text
+
+
+def test_a_heading_that_a_course_turns_and_does_not_hold_is_where_nothing_depends_on(tmp_path):
+    """Of an aeroplane the bearing of its waypoint went round, and 3 of 9 healthy flights alarmed."""
+    rng = np.random.default_rng(3)
+    bearing = 180 + 170 * np.sin(np.arange(1500) / 60)
+    heading = np.cumsum(0.01 * (bearing - 150) + 0.05 * rng.normal(size=1500))
+    columns = {"yaw": (heading + 180) % 360 - 180, "course_cmd": bearing % 360}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(1500))])
+    assert [c.path for c in proposal.states] == ["unwrap(yaw, 360)"], proposal.text
+    assert "from: yaw, nominal: 0" in proposal.text, proposal.text
 
 
 def test_wheels_are_judged_by_what_their_encoders_count(tmp_path):

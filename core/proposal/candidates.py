@@ -413,6 +413,7 @@ def part_by_role(source: Source) -> list[Source]:
         return []
     for candidate in errors:
         candidate.reason = "a controller's error, or part of its answer to it"
+    source.role = "state"  # beside what is commanded it is told what came of it, whatever the topic is called
     return [source.parted(some, role) for role, some in found.items() if some]
 
 

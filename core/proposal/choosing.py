@@ -256,6 +256,10 @@ class _Room:
         self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
 
 
+_REACHED = re.compile(r"_(position|pos|angle)$")
+"""Name of what an actuator has reached, where something else says what it is to reach."""
+ONE_NUMBER = {f"std_msgs/msg/{kind}" for kind in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32")}
+"""Messages of one number, which only their topic names."""
 FEWEST_SET, MOST_SET = 3, 0.2
 """A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
 
@@ -275,17 +279,47 @@ def _held_columns(table: Source) -> Source | None:
     return table.parted(held, "guess") if shows else None
 
 
-def assign_roles(sources: Sequence[Source]) -> tuple[list[Source], list[Source]]:
-    """Which topics are controls, and which may be the state."""
+def _within_loops(
+    controls: list[Source], states: list[Source], references: Sequence[Source]
+) -> tuple[list[Source], list[Source]]:
+    """Controls and states, where the loop that follows a reference is part of the machine.
+
+    What an actuator has reached (`throttle_position`) is measured, where a reference shows in it. A reference is a
+    control where it shows clearly in what no command does, and in no command: its controller's output is not there.
+    """
+    reached = [s for s in controls if _REACHED.search(s.topic) and explained(s, references) > STEERS]
+    controls, states = [s for s in controls if s not in reached], [*states, *reached]
+    used = [c for s in controls for c in s.free]
+    unmoved = [s for s in states if not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
+    outer = [r for r in references if any(_answers(s, r) for s in controls)]
+    inner = (r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved))
+    return [*controls, *inner], states
+
+
+def _answers(command: Source, reference: Source) -> bool:
+    """Whether a reference shows in the next command, or in the one that comes with it."""
+    every = reference.free
+    steps = (steps_of(command.free, every, [lag] * len(every)) for lag in (0, -1))
+    return any(float(np.max(some.effects()[0], initial=0.0)) > SHOWS for some in steps)
+
+
+def assign_roles(sources: Sequence[Source], asked: bool = False) -> tuple[list[Source], list[Source]]:
+    """Which topics are controls, and which may be the state; `asked`: a person says which, as far as names do not."""
     moving = [s for s in sources if s.free]
     controls = [s for s in moving if s.role == "control"]
     references = [s for s in moving if s.role == "reference"]
     if not controls:
         controls, references = references, []
-    for source in references:
-        source.reason = "a reference for some controller, and there is a command"
     states = [s for s in moving if s.role == "state"]
     unknown = unnamed = [s for s in moving if s.role == ""]
+    if references and not asked:
+        controls, states = _within_loops(controls, states, references)
+    for source in references:
+        if source not in controls:
+            source.reason = "a reference for some controller, and there is a command"
+    if controls and states and not asked:  # as a column of a table, which is measured unless its name says otherwise
+        states += [s for s in unknown if s.type in ONE_NUMBER]
+        unknown = [s for s in unknown if s not in states]
     if controls and states and unknown and not any(explained(s, controls) > SHOWS for s in states):
         states += [s for s in unknown if explained(s, controls) > SHOWS]
         unknown = [s for s in unknown if s not in states]
@@ -318,10 +352,10 @@ def choose(
     """
     for source in states:
         prefer_rates(source)
+    used = [c for s in controls for c in s.free]
     shows = {s.topic: explained(s, controls) if controls else math.inf for s in states}
     shown = [s for s in states if shows[s.topic] > SHOWS] or list(states)
     fastest = max(s.rate for s in shown)
-    used = [c for s in controls for c in s.free]
     slowest = min(s.rate for s in shown) if asked else _slowest(shown, used)
     main = max((s for s in shown if s.rate >= ALIKE * fastest), key=lambda s: (shows[s.topic], s.rate, s.count))
     pool = list(main.free)

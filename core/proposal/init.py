@@ -401,7 +401,8 @@ def _wrapped(source: Source) -> None:
         steps = [(np.ptp(v), np.abs(np.diff(v)).max()) for v in finite if len(v) > 1]
         low, high, turning = candidate.finite.min(), candidate.finite.max(), of_compass(candidate)
         compass = bool(turning and -180 <= low and high <= 360 and max(-low, high) > math.tau)
-        named = turning or _ANGLE.search(candidate.path.lower())
+        called = f"{source.topic.rpartition('/')[2]} {candidate.path}".lower()
+        named = turning or _ANGLE.search(called)
         turned = (t for t in (math.tau, 360.0) if any(s <= 1.1 * t and step > 0.8 * t for s, step in steps))
         turn = math.tau if angle else next(turned if named else iter(()), 360.0 * compass or turn_of_count(candidate))
         if turn:
@@ -503,7 +504,7 @@ def propose(
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     switches = [] if controls else take_switches(sources)
-    commands, measured = assign_roles(sources)
+    commands, measured = assign_roles(sources, bool(states or controls))
     commands += switches
     sources += [s for s in commands if s not in sources]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}

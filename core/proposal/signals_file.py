@@ -63,7 +63,8 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
         for candidate, name in plain.items():
             others = (c for c in group if plain[c] == name and (candidate.ready or not c.ready))  # or in a comment
             alike = [other.topic for other in others]
-            name = "_".join([*_apart(candidate.topic, alike), name])
+            apart = "_".join(_apart(candidate.topic, alike))
+            name = apart if apart.endswith(name) else "_".join(filter(None, [apart, name]))  # left_thrust
             if name in taken or (suffix == "command" and candidate.element in elements):
                 name = f"{name}_{suffix}"
             numbered = (f"{name}_{number}" for number in count(2))
@@ -80,10 +81,12 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     inner = re.sub(rf"^({OF_QUATERNION})\(.*", r"\1", FieldPath(candidate.path).angle)
     inner = re.sub(rf"^({'|'.join(FUNCTIONS)})\(|\)$", "", inner)
     words = [w for w in words_of(inner) if w not in _DULL]
+    of_topic = words_of(candidate.topic.rstrip("/").rpartition("/")[2])
     if all(len(w) == 1 or w.isdigit() for w in words):
         array = candidate.kind if "[" in candidate.path else ""  # of a table, whose topic says nothing more
-        of_topic = array if of_table(candidate.topic) else candidate.topic.rstrip("/").rpartition("/")[2]
-        words = [*words_of(of_topic), *words]
+        words = [*(words_of(array) if of_table(candidate.topic) else of_topic), *words]
+    elif of_topic[-len(words) :] == words:  # /exhaust_temperature temperature
+        words = of_topic
     return words or ["signal"]
 
 
@@ -295,7 +298,7 @@ def endless(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[
             return not _is_pulled(state, controls)
         heads = (of_compass(state) and FieldPath(state.path).unwrap) or _is_of_turning(state, states)
         goes_on = heads and not steered and not _is_pulled(state, controls)
-        return bool(goes_on or (_goes_round(state) and not holds))
+        return bool(goes_on or (_goes_round(state) and not (holds and _is_pulled(state, controls))))
 
     return [c for c in states if is_free(c)]
 
