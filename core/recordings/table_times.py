@@ -147,7 +147,8 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     plain = [name for name in names if table.columns[name].ndim == 1]
     called = [name for pattern in _NAMES for name in plain if re.fullmatch(pattern, _bare(name))]
     still = [name for name in called if _stands_still(table.columns[name])]
-    lasting = [name for name in called if _LASTS.fullmatch(_bare(name)) and _held(table.columns[name])]
+    moved = [name for name in called if name not in still]
+    lasting = [name for name in moved if _LASTS.fullmatch(_bare(name)) and _held(table.columns[name])]
     warm = [name for name in called if _bare(name).startswith("t_") and _goes_back(table.columns[name])]
     none_of_them = {*still, *lasting, *warm}
     called = [n for n in called if n not in none_of_them and not _of_a_minute(n, table.columns[n])]
