@@ -18,6 +18,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.identification.evidence import (
     LONGEST_DELAY,
     NOISE,
@@ -366,7 +367,7 @@ def choose(
             continue
         source.reason = "the controls do not show in it"
         if source in shown:
-            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
+            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; {_SEE}"
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
@@ -394,6 +395,17 @@ def choose(
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
     return keep, doubt
+
+
+_SEE = "see --states"
+
+
+def as_too_slow(sources: Sequence[Source]) -> list[str]:
+    """What is said of topics that no model watches as they are slower than the others."""
+    slower = [s.topic for s in sources if s.reason.endswith(_SEE)]
+    said = f"{shortlist(slower, 3)} {'is' if len(slower) == 1 else 'are'} slower than the states, so nothing watches"
+    remedy = f"for a second model `init` the same recordings with --states {' '.join(slower)}"
+    return [f"{said} {'it' if len(slower) == 1 else 'them'}; {remedy}"] * bool(slower)
 
 
 def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
