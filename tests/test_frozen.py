@@ -31,6 +31,7 @@ from uncertain_lti.reports.check import check_data, check_text
 from uncertain_lti.reports.findings import findings
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.reading import read_as_fitted
+from uncertain_lti.validation.monitor_fit import fit_monitored
 
 DT = 0.01
 
@@ -66,6 +67,29 @@ def held(transient: Transient, state: int | slice, begin: int, end: int) -> Tran
 @pytest.fixture(scope="module")
 def model() -> UncertainLTI:
     return fit([run(1), run(2, rest=(3.0, 4.0))], additive="noise")
+
+
+def coarse(seed: int, n: int = 5, count: int = 80) -> Transient:
+    """States that sensors round to whole numbers."""
+    rng, B = np.random.default_rng(seed), np.random.default_rng(0).normal(size=(n, 2))
+    u, x = rng.normal(size=(count, 2)), np.zeros((count, n))
+    for k in range(count - 1):
+        x[k + 1] = 0.9 * x[k] + 0.3 * B @ u[k] + 0.3 * rng.normal(size=n)
+    return Transient(DT * np.arange(count), np.round(x), u)
+
+
+def test_what_was_left_out_tells_how_far_a_model_moves_a_healthy_repeat() -> None:
+    """Of a recording that it was fitted to a model of many elements knows why a state stood still."""
+    runs = [coarse(seed) for seed in range(3)]
+    plain, found = fit(runs, "lp", additive="noise").repeats, fit_monitored(runs, criterion="lp", additive="noise")
+    assert plain is not None and found.model.repeats is not None and found.validation is not None
+    left = np.max([repeats_in(part.model, part.transient).most for part in found.validation.parts], axis=0)
+    assert (found.model.repeats.largest_sum >= left[2]).all() and (plain.largest_sum < left[2]).any()
+    assert (found.model.repeats.active_beyond >= 2.0 * left[3]).all() and (plain.active_beyond < 2.0 * left[3]).any()
+    assert np.array_equal(found.model.repeats.longest_repeat_s, plain.longest_repeat_s)
+    once = plain.reaching(np.array([np.zeros(5), plain.largest_run, np.full(5, 7.0), np.zeros(5)]))
+    assert once.largest_sum.tolist() == [7.0] * 5 and np.array_equal(once.largest_run, plain.largest_run)
+    assert np.array_equal(once.active_beyond, plain.active_beyond)
 
 
 def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI) -> None:

@@ -135,6 +135,24 @@ class Repeats:
         run, total, beyond = (values if np.isfinite(values).all() else None for values in (run, total, beyond))
         return Repeats(longest, run, total, beyond, noisy)
 
+    def reaching(self, most: Array) -> Repeats:
+        """The same where a repeat that was left out went farther by the model fitted without it.
+
+        Parameters
+        ----------
+        most : array (4, n)
+            As of `Found`.
+
+        Returns
+        -------
+        Repeats
+            What was fitted, the model knows: where that is far from what it knows of others, no other is frozen.
+        """
+        known = self.largest_run, self.largest_sum, self.active_beyond
+        reached = np.minimum(most[1:] * [[1.0], [1.0], [MORE_ACTIVE]], LARGEST)
+        run, total, beyond = map(np.maximum, known, reached)
+        return Repeats(self.longest_repeat_s, run, total, beyond, self.noisy_steps)
+
     def to_dict(self) -> dict[str, list[float]]:
         """As it is in a model file."""
         found = {name: getattr(self, name).tolist() for name in _KEYS}

@@ -22,6 +22,7 @@ from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit, update
 from uncertain_lti.identification.assembly import is_constant
 from uncertain_lti.model.operating_point import OperatingPoint
+from uncertain_lti.model.repeats import repeats_in
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.transient import Transient, Transitions
 from uncertain_lti.validation.groups import resolve_groups
@@ -138,7 +139,9 @@ def _armed(validation: Validation, fitted: Sequence[Part], rate: float | None) -
     alike = [part for part in validation.parts if part.judged and part.name not in panel.unlike]
     new = float(np.median([part.outside_domain / part.judged for part in alike])) if alike else 0.0
     domain = replace(model.domain, measure=None if new > NEW else model.domain.measure)
-    return model.replace(alarm=panel.rules, residuals=panel.residuals, domain=domain), panel
+    left = [repeats_in(part.model, part.transient).most for part in validation.parts if part.model is not model]
+    repeats = model.repeats and model.repeats.reaching(np.max([np.zeros((4, model.n)), *left], axis=0))
+    return model.replace(alarm=panel.rules, residuals=panel.residuals, domain=domain, repeats=repeats), panel
 
 
 def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], **options: Any) -> Monitored:
