@@ -423,7 +423,7 @@ def test_quiet_of_a_machine_that_is_parked_says_nothing(model, moved):
 def test_one_recording_does_not_vouch_for_another_day(runs):
     alarm = fit(runs[:1], "lp", additive="noise").fit_summary["alarm"]
     assert alarm["what"] == "block" and alarm["worth"] == "some"
-    assert "says nothing of another day" in alarm["headline"]
+    assert "says nothing of another day: fit 4 or more, or expect alarms" in alarm["headline"]
 
 
 def test_a_combination_that_the_others_lack_is_far_though_each_signal_is_in_its_range():

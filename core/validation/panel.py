@@ -518,8 +518,8 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
     if panel.what == "block" or panel.units == 1:
         return "some", (
-            f"worth having while the machine runs as in the one recording, which says nothing of another day: check it "
-            f"on one that was not fitted; {sees}"
+            f"worth having while the machine runs as in the one recording, which says nothing of another day: fit "
+            f"{TELLING} or more, or expect alarms in healthy ones; {sees}"
         )
     if 2 * panel.alarming > panel.units:
         return "some", f"worth having, but expect an alarm in most healthy recordings: {sees}"
