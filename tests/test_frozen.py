@@ -82,11 +82,12 @@ def test_what_was_left_out_tells_how_far_a_model_moves_a_healthy_repeat() -> Non
     """Of a recording that it was fitted to a model of many elements knows why a state stood still."""
     runs = [coarse(seed) for seed in range(3)]
     plain, found = fit(runs, "lp", additive="noise").repeats, fit_monitored(runs, criterion="lp", additive="noise")
-    assert plain is not None and found.model.repeats is not None and found.validation is not None
+    repeats = found.finished().repeats
+    assert plain is not None and repeats is not None and found.validation is not None
     left = np.max([repeats_in(part.model, part.transient).most for part in found.validation.parts], axis=0)
-    assert (found.model.repeats.largest_sum >= left[2]).all() and (plain.largest_sum < left[2]).any()
-    assert (found.model.repeats.active_beyond >= 2.0 * left[3]).all() and (plain.active_beyond < 2.0 * left[3]).any()
-    assert np.array_equal(found.model.repeats.longest_repeat_s, plain.longest_repeat_s)
+    assert (repeats.largest_sum >= left[2]).all() and (plain.largest_sum < left[2]).any()
+    assert (repeats.active_beyond >= 2.0 * left[3]).all() and (plain.active_beyond < 2.0 * left[3]).any()
+    assert np.array_equal(repeats.longest_repeat_s, plain.longest_repeat_s)
     once = plain.reaching(np.array([np.zeros(5), plain.largest_run, np.full(5, 7.0), np.zeros(5)]))
     assert once.largest_sum.tolist() == [7.0] * 5 and np.array_equal(once.largest_run, plain.largest_run)
     assert np.array_equal(once.active_beyond, plain.active_beyond)

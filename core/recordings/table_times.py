@@ -167,8 +167,10 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     first = [n for n in names[:1] if not re.fullmatch(r"index|unnamed.*|row|no\.?|id|nr", n.lower())]
     for name in [*(n for n in names if _OF_WHAT.fullmatch(_bare(n))), *first]:
         says = name in table.units or names[1:2] == ["column 2"]  # a unit, or that none has a name
-        counts = _grows(table.columns[name]) and bool((np.diff(table.columns[name]) == 1).all())  # as a data frame does
-        if _grows(table.columns[name]) and (says or not counts):
+        if not _grows(values := table.columns[name]):
+            continue
+        counts = bool((np.diff(values) == 1).all())  # as a data frame does
+        if says or not counts:
             each = ", a second a row; if it numbers the rows, say how many s each has, `--table step=0.01`"
             return name, _GROWS + each * (counts and name not in table.units)
     none = f"column {still[0]!r} is the same in all rows, and no other" if still else "no column"
@@ -307,6 +309,7 @@ def _stands_still(column: Column) -> bool:
 
 
 def _goes_back(column: Column) -> bool:
+    """Whether it goes back often; unlike `goes_forward`, a time that stands still for many rows does not."""
     return column.dtype.kind in "iuf" and bool(np.mean(np.diff(column) < 0) > _GOES_BACK)
 
 

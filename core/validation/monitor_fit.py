@@ -11,7 +11,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -67,6 +67,8 @@ class Monitored:
                 model = model.replace(memory={**model.memory, "evidence": panel.evidence.to_dict()})
             if self.why:
                 alarm["note"] = self.why
+            if self.validation is not None:
+                model = _told(model, self.validation.parts, panel.unlike)
         alarm |= {"centred": True} if self.centred else {}
         left = {"not_done": self.why} if self.validation is None else self.validation.judged_as(model).to_dict()
         return model.replace(fit_summary={**model.fit_summary, "alarm": alarm}, validation=left)
@@ -134,14 +136,20 @@ def _seen(model: UncertainLTI, transients: Sequence[Transient], most: float) -> 
 
 
 def _armed(validation: Validation, fitted: Sequence[Part], rate: float | None) -> tuple[UncertainLTI, Panel]:
-    """The model with the panel, and with ranges alone for a domain where new combinations are the rule."""
-    panel, model = learn(validation, fitted, rate), validation.model
-    alike = [part for part in validation.parts if part.judged and part.name not in panel.unlike]
-    new = float(np.median([part.outside_domain / part.judged for part in alike])) if alike else 0.0
-    domain = replace(model.domain, measure=None if new > NEW else model.domain.measure)
-    left = [repeats_in(part.model, part.transient).most for part in validation.parts if part.model is not model]
-    repeats = model.repeats and model.repeats.reaching(np.max([np.zeros((4, model.n)), *left], axis=0))
-    return model.replace(alarm=panel.rules, residuals=panel.residuals, domain=domain, repeats=repeats), panel
+    panel = learn(validation, fitted, rate)
+    return validation.model.replace(alarm=panel.rules, residuals=panel.residuals), panel
+
+
+def _told(model: UncertainLTI, parts: Sequence[Part], unlike: Collection[str]) -> UncertainLTI:
+    """The model with what parts left out tell of it besides thresholds; `unlike`: those that others do not cover.
+
+    Ranges alone are its domain where new combinations are the rule, and healthy repeats went as far as in any of them.
+    """
+    alike = [part.outside_domain / part.judged for part in parts if part.judged and part.name not in unlike]
+    measure = None if alike and np.median(alike) > NEW else model.domain.measure
+    most = [repeats_in(part.model, part.transient).most for part in parts]
+    repeats = model.repeats and model.repeats.reaching(np.max([np.zeros((4, model.n)), *most], axis=0))
+    return model.replace(domain=replace(model.domain, measure=measure), repeats=repeats)
 
 
 def choose_monitored(transients: Sequence[Transient], ways: Sequence[Mapping[str, Any]], **options: Any) -> Monitored:
