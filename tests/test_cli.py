@@ -24,10 +24,10 @@ from engine_bag import SIGNALS, engine_bag
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.progress import Progress
 from uncertain_lti.cli.main import build_parser, main
-from uncertain_lti.model.alarm_rule import StatisticRule
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.plants.leibov import STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.reports.check import check_data, check_text, overview
 from uncertain_lti.reports.findings import findings
 
 
@@ -303,6 +303,32 @@ def test_an_alarm_is_dated_where_seconds_say_nothing(begin_s, step_s, lasts, wor
     assert jumps == ["jump 6", "jump 5", "x1 jumped", "jump 4", "jump 3", "  and 3 more jumps; --json has all"]
     (told,) = findings(model, "m.model.json", [verdicts])["happened"]
     assert ("first at 2023-11-15T23:13:20 UTC, 25 h on" in told["text"]) == (at.endswith("on"))
+
+
+def test_a_quiet_recording_says_how_near_to_an_alarm_it_came():
+    """Of the states that count, and where they count; with several recordings the last table has all of them."""
+    x = np.zeros((300, 2))
+    x[20:, 0], x[60:, 1] = 0.5, 0.7
+    rule = StatisticRule("mean", 0.0, 2.0)
+    model = UncertainLTI(
+        np.zeros((2, 2)), np.zeros((2, 0)), np.zeros((2, 2)), np.zeros((2, 0)), v=[0.5, 0.5], alarm=[rule]
+    )
+    near = Transient(np.arange(300.0), x, np.zeros((300, 0)), name="near")
+    quiet = check_data(model, EnvelopeMonitor(model).check(near))
+    assert check_text(quiet).splitlines()[-2:] == [
+        "nearest to an alarm: mean of x2 at 0.7 times its threshold, at 60.0000 s", "no alarm",
+    ]  # fmt: skip
+    masked = check_data(model, EnvelopeMonitor(model, masked=["x2"]).check(near))
+    assert masked["farthest"] == {**masked["farthest"], "state": "x1", "k": 20, "value": 0.5}
+    x[200:, 0] = -5.0
+    loud = check_data(model, EnvelopeMonitor(model).check(near.replace(x=x, name="loud")))
+    assert loud["farthest"]["value"] == -5.5 and "nearest" not in check_text(loud)
+    assert overview([quiet, loud]).rows == [
+        ["near", "no alarm", "-", "0.7", "mean of x2"],
+        ["loud", "ALARM", "200.0000 s", "5.5", "mean of x1"],
+    ]
+    plain = check_data(model, EnvelopeMonitor(model.replace(alarm=[AlarmRule()])).check(near))
+    assert plain["farthest"] is None and overview([plain]).rows[0][3:] == ["-", ""]
 
 
 def test_the_longest_alarm_is_told_beside_the_first():

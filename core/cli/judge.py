@@ -148,7 +148,7 @@ _SLOW = "say what took how long"
 def check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.monitor.deployed import drift_in_words
-    from uncertain_lti.reports.check import check_data, check_text, outcome
+    from uncertain_lti.reports.check import check_data, check_text, outcome, overview
 
     judged = Judged(options, load_model(options.model), options.bags)
     model, bags, deployed = judged.model, judged.bags, judged.deployed
@@ -169,6 +169,8 @@ def check(options: argparse.Namespace) -> Result:
             data["written"] = {"file": str(made.path), "topics": made.topics, "messages": made.messages}
             messages = plural(made.messages, "message")
             options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
+    if len(results) > 1:
+        options.say(str(overview(results)))
     status = judged.status(results)
     drift = drift_in_words(model, results)
     for text in drift:

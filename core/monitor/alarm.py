@@ -173,6 +173,21 @@ class Alarm:
                 found[label] = one
         return found
 
+    def farthest(self, values: Array) -> tuple[int, Raised] | None:
+        """Of many verdicts (K, statistics) the one after which some statistic that counts is largest, and that one."""
+        limits = [() if isinstance(rule, AlarmRule) else rule.thresholds(self._model.n) for rule in self.rules]
+        places = [(i, j) for i, some in enumerate(limits) for j in range(len(some))]
+        joint = [self.rules[i].kind in JOINT for i, _ in places]
+        counts = np.array([one or self._counted[j] for one, (_, j) in zip(joint, places, strict=True)], dtype=bool)
+        sizes = np.fmax(np.fmax.reduce(values, initial=np.nan), -np.fmin.reduce(values, initial=np.nan))
+        if not (sizes := np.where(counts, sizes, np.nan))[~np.isnan(sizes)].any():
+            return None
+        column = int(np.nanargmax(sizes))
+        k, (i, j) = int(np.nanargmax(np.abs(values[:, column]))), places[column]
+        state = "" if joint[column] else self._model.state_names[j]
+        rule, size = self.rules[i], float(values[k, column])
+        return k, Raised(self.labels[i], rule.kind, rule.horizon, state, size, self._spans[i])
+
     def raised(self) -> tuple[tuple[int, int], ...]:
         """Rules that raise the alarm, and the state that each points to if it looks at all together, else -1."""
         if not self.alarm:

@@ -109,6 +109,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
             {**_span(transient, start, stop), "raised": [_raised(r) for r in verdicts.raised(start)]}
             for start, stop in runs(verdicts.alarm)
         ],
+        "farthest": _farthest(verdicts),
         "episodes": [_episode(model, verdicts, rows) for rows in islice(_episodes(verdicts), MOST_EPISODES)],
         "episode_count": sum(1 for _ in _episodes(verdicts)),
         "frozen": _repeats(model, verdicts, verdicts.frozen),
@@ -136,6 +137,12 @@ def _jitter(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
         problem = assemble([verdicts.transient], model.operating_point, None, "none")
         return jittering(model, problem, [*model.state_names, *model.control_names])
     return []
+
+
+def _farthest(verdicts: Verdicts) -> dict[str, Any] | None:
+    """Where the alarm's statistics came nearest to their thresholds, or farthest beyond; None where it has none."""
+    found = verdicts.alarms.farthest(verdicts.statistics)
+    return None if found is None else {**_instant(verdicts.transient, found[0]), **_raised(found[1])}
 
 
 def _raised(r: Raised) -> dict[str, Any]:
@@ -192,7 +199,7 @@ def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, 
         return {"utilisation": None, "t": None}
     k = int(rows[np.argmax(np.abs(verdicts.utilisation[rows, state]))])
     value = float(verdicts.utilisation[k, state])
-    return {"utilisation": value if math.isfinite(value) else None, "t": float(verdicts.transient.t[k])}
+    return {"utilisation": value if math.isfinite(value) else None, "t": _instant(verdicts.transient, k)["t"]}
 
 
 def _jump(verdicts: Verdicts, name: str, bad: NDArray[np.intp], change: Array, largest: float) -> dict[str, Any] | None:
@@ -278,12 +285,16 @@ def _episodes(verdicts: Verdicts) -> Iterator[NDArray[np.intp]]:
 
 
 def _episode(model: UncertainLTI, verdicts: Verdicts, rows: NDArray[np.intp]) -> dict[str, Any]:
-    first, last, t = int(rows[0]), int(rows[-1]), verdicts.transient.t
+    first, last = int(rows[0]), int(rows[-1])
     states = {}
     for i, name in enumerate(model.state_names):
         bad = rows[verdicts.flags[rows, i] == 1.0]
         if len(bad):
-            states[name] = {"violations": len(bad), "first": float(t[bad[0]]), **_worst(verdicts, i, bad)}
+            states[name] = {
+                "violations": len(bad),
+                "first": _instant(verdicts.transient, int(bad[0]))["t"],
+                **_worst(verdicts, i, bad),
+            }
     ends = {name: _instant(verdicts.transient, k) for name, k in (("first", first), ("last", last))}
     alarm = bool(verdicts.alarm[first : last + 1].any())
     return {**ends, "verdicts_violated": len(rows), "alarm": alarm, "states": states}
@@ -355,7 +366,8 @@ def _inside(bad: int, count: int) -> float | None:
 
 def _instant(transient: Transient, k: int) -> dict[str, Any]:
     """Sample k: its time since the first sample, s, and its stamp, ns."""
-    return {"k": k, "t": float(transient.t[k]), "t_ns": int(transient.t_ns[k])}
+    t_ns = transient.t_ns
+    return {"k": k, "t": float((t_ns[k] - t_ns[0]) * 1e-9), "t_ns": int(t_ns[k])}
 
 
 def _span(transient: Transient, start: int, stop: int) -> dict[str, Any]:
@@ -517,8 +529,23 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
             blocks += [f"  the longest at {_when(longest_alarm)}", *_raised_by(longest_alarm)]
         blocks += [f"  {text}, and fit again" for text in data["jitter"]]
     elif data["verdicts"]:
+        near = data["farthest"]
+        blocks += [f"nearest to an alarm: {near['words']}, at {instant_text(near)}"] if near else []
         blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return blocks
+
+
+def overview(recordings: Sequence[Mapping[str, Any]]) -> Table:
+    """What came of each of several recordings, a row each."""
+    rows = []
+    for r in recordings:
+        first = instant_text(r["alarms"][0]) if r["alarms"] else "-"
+        far = r["farthest"] or {"value": math.nan, "words": ""}
+        size, of = number(abs(far["value"])), far["words"].partition(" at ")[0]
+        came = "ALARM" if r["alarm"] else "UNKNOWN" if r["reason"] else "no alarm"
+        rows.append([r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size, of])
+    header = ("recording", "outcome", "first alarm", "largest", "times the threshold of")
+    return Table(header, rows, left=(1, 4), most=1000)
 
 
 def _when(alarm: Mapping[str, Any]) -> str:

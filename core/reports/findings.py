@@ -162,7 +162,8 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         text += f"{bad} violated, in {'one episode' if count == 1 else f'{count} episodes'}, first at {first}; "
         text += f"most often {', '.join(f'{shortened(name)} ({states[name]})' for name in most)}"
     if bad and not recording["alarms"]:
-        text += ". The alarm was not raised"
+        near = recording["farthest"]
+        text += ". The alarm was not raised" + (f"; nearest to it came {near['words']}" if near else "")
     if judged and state == "unknown":
         text += f", but {recording['reason']}"
     if frozen := [f"{repeat['text']}, {repeat['why']}" for repeat in recording["frozen"]]:

@@ -354,8 +354,8 @@ class Transient:
             return []
         back = np.diff(self.t_ns) < 0
         cut = np.diff(self.segment) > 0
-        kinds = np.select([back, cut, ~self.usable], [Status.RESET, Status.GAP, Status.MISSING], Status.OK)
-        return [Status.FIRST, *(Status(kind) for kind in kinds)]
+        kinds = Status.RESET, Status.GAP, Status.MISSING, Status.OK
+        return [Status.FIRST, *map(kinds.__getitem__, np.select([back, cut, ~self.usable], range(3), 3).tolist())]
 
     @property
     def segments(self) -> int:
