@@ -416,7 +416,7 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
 
 def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transient]) -> list[str]:
     """States that keep exactly one value for long while the other signals move; at an end of its range one may rest."""
-    messages = []
+    found = list[tuple[int, str, str]]()
     low, high = problem.z.min(axis=1), problem.z.max(axis=1)
     spread = high - low
     for i in range(problem.n):
@@ -430,13 +430,16 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
             moving = (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
             moving[i] = False
             if moving.any() and low[i] < problem.z.T[start, i] < high[i]:
-                messages.append(
-                    f"'{names[i]}' stands at exactly one value for {stop - start} samples "
-                    f"({_where(problem, [start], transients)}) while '{names[int(np.argmax(moving))]}' moves: a frozen "
-                    f"sensor? Leave that stretch out, or the envelope will take it for healthy"
-                )
+                where, other = _where(problem, [start], transients), names[int(np.argmax(moving))]
+                found.append((stop - start, names[i], f"({where}) while '{other}' moves"))
                 break
-    return messages
+    if not found:
+        return []
+    most, name, when = max(found)
+    others = [f"'{other}' for {count}" for count, other, _ in found if other != name]
+    also = f", and so does {shortlist(others, 4)}" * bool(others)
+    advice = "a frozen sensor? Leave that stretch out, or the envelope will take it for healthy"
+    return [f"'{name}' stands at exactly one value for {most} samples {when}{also}: {advice}"]
 
 
 def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int]) -> list[str]:
