@@ -9,6 +9,7 @@
 
 """Rules of the alarm: in the model, and in its file."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -201,6 +202,8 @@ def test_each_rule_names_the_states_that_it_blames() -> None:
     assert joint.words == "chi2 of all states (points to x1) at 7 times its threshold"
     (nobody,) = alarm.reasons([(3, -1)], values, sizes, flags)
     assert nobody.words == "chi2 of all states at 7 times its threshold"
+    over, below = (replace(nobody, value=value).words for value in (1.0004, 0.9996))
+    assert "at 1.0004 times" in over and "at 0.9996 times" in below
 
 
 PATHS = [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)", "rate")]

@@ -328,7 +328,7 @@ def test_a_quiet_recording_says_how_near_to_an_alarm_it_came():
         ["loud", "ALARM", "200.0000 s", "5.5", "mean of x1"],
     ]
     plain = check_data(model, EnvelopeMonitor(model.replace(alarm=[AlarmRule()])).check(near))
-    assert plain["farthest"] is None and overview([plain]).rows[0][3:] == ["-", ""]
+    assert plain["farthest"] is None and overview([plain]).rows[0][3:] == ["", ""]
 
 
 def test_the_longest_alarm_is_told_beside_the_first():

@@ -61,7 +61,9 @@ class Raised:
             state = " of all states" + f" (points to {self.state})" * bool(self.state)
         over = f" over {self.horizon} steps" if self.horizon > 1 else ""
         what = f"{self.kind}{state}{over}" + f" ({self.span})" * bool(self.span)
-        return what if self.kind == "containment" else f"{what} at {abs(self.value):.3g} times its threshold"
+        size = abs(self.value)
+        digits = 3 if abs(size - 1.0) >= 0.005 else 6  # none that rounds to the threshold
+        return what if self.kind == "containment" else f"{what} at {size:.{digits}g} times its threshold"
 
 
 class Nearest(NamedTuple):

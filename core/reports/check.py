@@ -540,10 +540,11 @@ def overview(recordings: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     for r in recordings:
         first = instant_text(r["alarms"][0]) if r["alarms"] else "-"
-        far = r["farthest"] or {"value": math.nan, "words": ""}
-        size, of = number(abs(far["value"])), far["words"].partition(" at ")[0]
+        of, _, size = (r["farthest"] or {"words": ""})["words"].partition(" at ")
         came = "ALARM" if r["alarm"] else "UNKNOWN" if r["reason"] else "no alarm"
-        rows.append([r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size, of])
+        rows.append(
+            [r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size.partition(" ")[0], of]
+        )
     header = ("recording", "outcome", "first alarm", "largest", "times the threshold of")
     return Table(header, rows, left=(1, 4), most=1000)
 
