@@ -17,7 +17,7 @@ import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -337,11 +337,12 @@ def run(options: argparse.Namespace) -> int:
 
 def _json_lines(data: Any, depth: int, new: str = "\n") -> Iterator[str]:
     """Text of data in lines; what is so deep in takes one, such as a sample, as the compiled encoder writes it."""
-    if not (depth and data and isinstance(data, dict | list | tuple)):
+    many = isinstance(data, Iterable) and isinstance(data, Sized) and not isinstance(data, str)
+    if not (depth and many and data):
         yield json.dumps(data, allow_nan=False)
         return
     named = isinstance(data, dict)
-    items = data.items() if isinstance(data, dict) else [("", inner) for inner in data]
+    items = data.items() if isinstance(data, dict) else (("", inner) for inner in data)
     for number, (name, inner) in enumerate(items):
         yield (("{" if named else "[") if number == 0 else ",") + f"{new} " + named * f"{json.dumps(str(name))}: "
         yield from _json_lines(inner, depth - 1, f"{new} ")

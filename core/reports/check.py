@@ -121,7 +121,7 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
     data["reason"] = _why_unknown(model, verdicts, data)
     data["outcome"] = OUTCOMES[[data["alarm"], bool(data["reason"]), bool(violated), True].index(True)]
     if samples:
-        data["verdict_per_sample"] = _per_sample(model, verdicts)
+        data["verdict_per_sample"] = PerSample(model, verdicts)
     return data
 
 
@@ -300,17 +300,36 @@ def _episode(model: UncertainLTI, verdicts: Verdicts, rows: NDArray[np.intp]) ->
     return {**ends, "verdicts_violated": len(rows), "alarm": alarm, "states": states}
 
 
-def _per_sample(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
-    names = [*NUMBERS, *["horizon_utilisation"] * bool(model.horizons)]
-    lists = {name: _nulls(getattr(verdicts, name)) for name in names}
-    lists |= {name: getattr(verdicts, name).tolist() for name in ("outside_domain", "alarm")}
-    if model.schedule is not None:
-        lists["unknown_regime"] = verdicts.unknown_regime.tolist()
-        lists["regime"] = [r if r >= 0 else None for r in sample_blocks(model, verdicts).tolist()]
-    lists = {
-        "t_ns": verdicts.transient.t_ns.tolist(), "status": [status.value for status in verdicts.statuses()], **lists,
-    }  # fmt: skip
-    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+class PerSample:
+    """A verdict per sample as plain data, made when it is looked at: of a million samples all take 2 GB."""
+
+    def __init__(self, model: UncertainLTI, verdicts: Verdicts) -> None:
+        names = [*NUMBERS, *["horizon_utilisation"] * bool(model.horizons)]
+        self._numbers = {name: getattr(verdicts, name) for name in names}
+        self._verdicts, self._statuses = verdicts, verdicts.statuses()
+        self._blocks = None if model.schedule is None else sample_blocks(model, verdicts)
+
+    def __len__(self) -> int:
+        return len(self._statuses)
+
+    def __getitem__(self, k: int) -> dict[str, Any]:
+        return self._of(slice(k, k + 1))[0]
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        for k in range(0, len(self), MOST_EPISODES):
+            yield from self._of(slice(k, k + MOST_EPISODES))
+
+    def _of(self, on: slice) -> list[dict[str, Any]]:
+        verdicts = self._verdicts
+        lists = {
+            "t_ns": verdicts.transient.t_ns[on].tolist(), "status": [status.value for status in self._statuses[on]],
+            **{name: _nulls(values[on]) for name, values in self._numbers.items()},
+            **{name: getattr(verdicts, name)[on].tolist() for name in ("outside_domain", "alarm")},
+        }  # fmt: skip
+        if self._blocks is not None:
+            lists["unknown_regime"] = verdicts.unknown_regime[on].tolist()
+            lists["regime"] = [r if r >= 0 else None for r in self._blocks[on].tolist()]
+        return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
 
 
 def _nulls(values: Array) -> list[Any]:
