@@ -32,7 +32,6 @@ from uncertain_lti.base.text import (
     number,
     plural,
     share,
-    shortened,
     shortlist,
     text_of,
     times,
@@ -592,18 +591,6 @@ def raised_by(alarm: Mapping[str, Any]) -> list[str]:
 def _raised_by(alarm: Mapping[str, Any]) -> list[str]:
     by = raised_by(alarm)
     return [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
-
-
-def episodes_table(data: Mapping[str, Any]) -> Table:
-    """When which states left their bounds; the states early, where a phone shows them without scrolling."""
-    rows = []
-    for e in data["episodes"]:
-        where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
-        listed = [f"{shortened(name)} ({s['violations']}, worst {beyond(s['utilisation'])})" for name, s in where]
-        first, last = f"{e['first']['t']:.4f}", f"{e['last']['t']:.4f}"
-        rows.append([first, shortlist(listed, 4), str(e["verdicts_violated"]), "yes" * e["alarm"], last])
-    header = ("first [s]", "states (violations, worst utilisation)", "violated", "alarm", "last [s]")
-    return Table(header, rows, left=(1,), most=20)
 
 
 def _first(lines: list[str], word: str) -> list[str]:

@@ -34,13 +34,13 @@ from markupsafe import Markup, escape
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, written
-from uncertain_lti.base.text import Block, Table, number, plural, share
+from uncertain_lti.base.text import Block, Table, beyond, number, plural, share, shortened, shortlist
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Spans
-from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, episodes_table
+from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.model_text import model_blocks, validation_blocks
 from uncertain_lti.sampling.transient import Transient
@@ -181,13 +181,25 @@ def _headline(facts: Mapping[str, Any]) -> tuple[str, str]:
     return "Nothing left its bounds", "good"
 
 
+def _episodes(data: Mapping[str, Any]) -> Table:
+    """When which states left their bounds; the states early, where a phone shows them without scrolling."""
+    rows = []
+    for e in data["episodes"]:
+        where = sorted(e["states"].items(), key=lambda item: -item[1]["violations"])
+        listed = [f"{shortened(name)} ({s['violations']}, worst {beyond(s['utilisation'])})" for name, s in where]
+        first, last = f"{e['first']['t']:.4f}", f"{e['last']['t']:.4f}"
+        rows.append([first, shortlist(listed, 4), str(e["verdicts_violated"]), "yes" * e["alarm"], last])
+    header = ("first [s]", "states (violations, worst utilisation)", "violated", "alarm", "last [s]")
+    return Table(header, rows, left=(1,), most=20)
+
+
 def _what_happened(recordings: Sequence[Mapping[str, Any]], drawn: Sequence[int]) -> list[Any]:
     blocks: list[Any] = []
     for r in (recordings[i] for i in drawn):
         blocks += [(charts.base_name(r["recording"]),), *check_blocks(r), *r["notes"][:5]]
         if r["episodes"]:
             apart = f"violations with fewer than {APART} verdicts between them"
-            blocks += [f"{plural(r['episode_count'], 'episode')} ({apart}):", episodes_table(r)]
+            blocks += [f"{plural(r['episode_count'], 'episode')} ({apart}):", _episodes(r)]
     if len(recordings) > 1:
         rows = []
         for r in recordings:
