@@ -200,7 +200,8 @@ class Panel:
     ten times, the threshold above twice the median size, or that alone brings chi2 to its threshold, recorded units;
     `figure`: what ways to fit are compared by, the geometric mean over the states of the lasting offset that the energy
     over a window shows; `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the others
-    do not cover; `asked`: rate that was asked for; `residuals`: of the model, in the form that the joint rules take.
+    do not cover; `asked`: rate that was asked for; `residuals`: of the model, in the form that the joint rules take;
+    `names`: of what was left out, where they are known.
     """
 
     rules: tuple[Rule, ...]
@@ -212,6 +213,7 @@ class Panel:
     unlike: tuple[str, ...] = ()
     asked: float | None = None
     residuals: Residuals | None = None
+    names: tuple[str, ...] = ()
 
     @classmethod
     def of(
@@ -247,10 +249,15 @@ class Panel:
         return len(self.evidence.peaks)
 
     @cached_property
-    def alarming(self) -> int:
-        """How many recordings, groups or blocks would alarm at thresholds of all the others, raised alike."""
+    def reached(self) -> Array:
+        """(G,): the largest size on each recording, group or block over thresholds of all the others, raised alike."""
         rules = [rule for rule in self.rules if isinstance(rule, StatisticRule)]
-        return int((self.evidence.apart(rules, self.what) > self.evidence.factor).sum())
+        return self.evidence.apart(rules, self.what) / self.evidence.factor
+
+    @property
+    def alarming(self) -> int:
+        """How many of them would alarm there."""
+        return int((self.reached > 1.0).sum())
 
     @property
     def vouched(self) -> bool:
@@ -358,7 +365,8 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
         if _limit(lower, len(rules)) > rate:
             break
         found = lower
-    return Panel.of(model, found, rules, validation.what, unlike, rate)
+    names = {unit: part.group or part.name for unit, part in zip(unit_numbers(parts), parts, strict=True)}
+    return replace(Panel.of(model, found, rules, validation.what, unlike, rate), names=tuple(names.values()))
 
 
 def _narrowest(
@@ -546,11 +554,15 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
         if panel.what != "block":
             alarming = f"{panel.alarming or 'none'} of {plural(panel.units, panel.what)}"
             further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
+            far = int(panel.reached.argmax())
+            one = f", {panel.names[far]} farthest at {panel.reached[far]:.3g} times" if panel.names else ""
             further = f"expect {further} of further ones"
             if panel.alarming and panel.asked is None:
                 low = float(f"{min(0.1 * most, _LOW):.1g}")  # one above the limit lowers the thresholds
                 further += f"; to have fewer, ask for a low rate (--false-alarms {low:g})"
-            found.append(f"at thresholds of the others alone {alarming} would alarm: {further}")
+            found.append(
+                f"at thresholds of the others alone {alarming} would alarm{one * (panel.alarming > 0)}: {further}"
+            )
     else:
         found = ["false alarms: one stretch says nothing of their rate; record more"]
     found.append(f"sees within {evidence.dt:.3g} s {'; '.join(sees)}")
