@@ -87,7 +87,10 @@ def assemble(
     if not square <= LARGEST**2:
         raise _too_large(transients)
     columns = Columns.of(additive, is_constant(dt), regimes)
-    chosen = _weights(weights, transients, k, source, n)
+    chosen = split_weights(weights, transients, n)
+    if isinstance(chosen, list):
+        chosen = np.concatenate([w[s.k] for w, s in zip(chosen, steps, strict=True)])
+    _refuse_no_metric(chosen)
     factors = _factors(transient_weights, count, source, len(transients))
     if factors is not None:
         factors = factors[source]
@@ -192,13 +195,10 @@ def scaled_eigenvalues(weights: Array) -> Array:
     return np.asarray(np.linalg.eigvalsh(weights * unit[:, :, None] * unit[:, None, :]))
 
 
-def _weights(
-    weights: ArrayLike | Sequence[ArrayLike] | None,
-    transients: Sequence[Transient],
-    k: NDArray[np.intp],
-    source: NDArray[np.intp],
-    n: int,
-) -> Array:
+def split_weights(
+    weights: ArrayLike | Sequence[ArrayLike] | None, transients: Sequence[Transient], n: int
+) -> Array | list[Array]:
+    """Weights of the steps of each transient; one array (n,) where they are the same in every step."""
     if weights is None:
         return np.ones(n)
     lengths = [max(len(t) - 1, 0) for t in transients]
@@ -216,22 +216,22 @@ def _weights(
                     )
             if len({np.ndim(w) for w in weights}) > 1:
                 raise FitError("weights: some transients have diagonals and some full matrices; give one kind")
-            stacked = np.concatenate([real(w) for w in weights])
-        else:
-            stacked = real(weights)
+            return [real(w) for w in weights]
+        stacked = real(weights)
     except (TypeError, ValueError):
         raise FitError("weights are not arrays of real numbers; give (n,), (N, n) or (N, n, n)") from None
     total = sum(lengths)
     if stacked.shape == (n,):
-        chosen = stacked
-    elif stacked.shape in ((total, n), (total, n, n)):
-        offset = np.concatenate([[0], np.cumsum(lengths)])[:-1]
-        chosen = stacked[offset[source] + k]
-    else:
+        return stacked
+    if stacked.shape not in ((total, n), (total, n, n)):
         raise FitError(
             f"weights have shape {stacked.shape}; they must be ({n},), ({total}, {n}) or ({total}, {n}, {n}), "
             f"one per step of the transients"
         )
+    return np.split(stacked, np.cumsum(lengths)[:-1])
+
+
+def _refuse_no_metric(chosen: Array) -> None:
     if not np.isfinite(chosen).all():
         raise FitError("weights hold a number that is not finite")
     if chosen.ndim == 3:
@@ -244,4 +244,3 @@ def _weights(
             raise FitError(f"weights: the matrix of step {int(np.argmin(smallest))} is not positive definite")
     elif (chosen <= 0).any():
         raise FitError("weights: every weight must be positive; leave samples out of the transient instead")
-    return chosen

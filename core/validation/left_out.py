@@ -23,6 +23,7 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification import fit
+from uncertain_lti.identification.assembly import split_weights
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -133,7 +134,7 @@ def leave_out(
         count = blocks or folds
         together = [[i for unit in together[k::count] for i in unit] for k in range(count)]
     parts: dict[int, Part] = {}
-    own = _split_weights(weights, transients, full.n)
+    own = split_weights(weights, transients, full.n)
     for number, out in enumerate(together):
         name = shown[out[0]] + (f" and {len(out) - 1} more" if len(out) > 1 else "")
         name = f"group {names[out[0]]}" if grouping else name
@@ -141,15 +142,15 @@ def leave_out(
             progress(CountedStep(f"fit {number + 1} of {len(together)}: without {name}", number + 1, len(together)))
         absent = {id(cuts[i][0]): cuts[i][1:] for i in out}
         pieces, kept = [], []
-        for transient, weight in zip(transients, own, strict=True):
+        for i, transient in enumerate(transients):
             gone = absent.get(id(transient))
             for a, b in [(0, len(transient))] if gone is None else remaining_spans(transient, *gone, gap):
                 if b - a >= 2:
                     pieces.append(cut(transient, a, b))
-                    kept.append(None if weight is None else weight[a : b - 1])
-        chosen = kept if own[0] is not None else weights
+                    if isinstance(own, list):
+                        kept.append(own[i][a : b - 1])
         try:
-            model = fit(pieces, weights=chosen, describe_data=False, near=full, **options)  # type: ignore[arg-type]
+            model = fit(pieces, weights=kept or weights, describe_data=False, near=full, **options)
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
         model, level = model.with_residuals_of(full), Reach(model, pieces).level
@@ -158,21 +159,6 @@ def leave_out(
     kind = "blocks" if blocks else "transients"
     hint = "" if grouping or blocks else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
-
-
-def _split_weights(
-    weights: ArrayLike | Sequence[ArrayLike] | None, transients: Sequence[Transient], n: int
-) -> list[Array | None]:
-    """Weights per step of each transient; None where they are the same in every step."""
-    if weights is None:
-        return [None] * len(transients)
-    if isinstance(weights, (list, tuple)) and all(np.ndim(w) >= 2 for w in weights):
-        return [np.asarray(w, dtype=np.float64) for w in weights]
-    stacked = np.asarray(weights, dtype=np.float64)
-    if stacked.ndim == 1 and stacked.shape == (n,):
-        return [None] * len(transients)
-    lengths = np.cumsum([max(len(t) - 1, 0) for t in transients])
-    return list(np.split(stacked, lengths[:-1]))
 
 
 def validate(
