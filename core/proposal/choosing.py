@@ -367,7 +367,8 @@ def choose(
             continue
         source.reason = "the controls do not show in it"
         if source in shown:
-            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; {_SEE}"
+            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
+            source.slower = True
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
@@ -397,12 +398,9 @@ def choose(
     return keep, doubt
 
 
-_SEE = "see --states"
-
-
 def as_too_slow(sources: Sequence[Source]) -> list[str]:
     """What is said of topics that no model watches as they are slower than the others."""
-    slower = [s.topic for s in sources if s.reason.endswith(_SEE)]
+    slower = [s.topic for s in sources if s.slower]
     said = f"{shortlist(slower, 3)} {'is' if len(slower) == 1 else 'are'} slower than the states, so nothing watches"
     remedy = f"for a second model `init` the same recordings with --states {' '.join(slower)}"
     return [f"{said} {'it' if len(slower) == 1 else 'them'}; {remedy}"] * bool(slower)
@@ -419,10 +417,9 @@ def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:
         if source.rate < first.rate / SLOWER:
             break
         if source.rate < ALIKE * slowest and _tells_more(source, faster, used):
-            if not all(_known_at(source, other, used) for other in faster):
-                nearly = all(_known_at(source, other, used, LOST) for other in faster)
-                if not (nearly and _driven_more(source, faster, used)):
-                    break
+            lost = max(_lost_at(source, other, used) for other in faster)
+            if lost > LOST or (lost > 0.0 and not _driven_more(source, faster, used)):
+                break
             slowest = source.rate
         faster.append(source)
     return slowest
@@ -442,19 +439,20 @@ def _tells_more(source: Source, faster: Sequence[Source], used: Sequence[Candida
     return own.size > 0
 
 
-def _known_at(slower: Source, source: Source, used: Sequence[Candidate], most: float = 0.0) -> bool:
-    """Whether the numbers of a topic that are more than noise are known as well from one instant of a slower one.
+def _lost_at(slower: Source, source: Source, used: Sequence[Candidate]) -> float:
+    """Share of the variance of a topic's number that only its own instants tell, not one of a slower topic; most of it.
 
-    `most`: share of their variance that may be unknown then, however little it is at their own.
+    0 where those of the latter do as well; numbers that are noise do not count.
     """
     n, shares = len(source.free), []
     for beside in ([], slower.free[:1]):
         steps = steps_of([*source.free, *beside], used)
         if len(steps.X) < FEWEST:
-            return False
+            return math.inf
         shares.append(predicted(steps.X[:, :n], steps.U, (steps.X + steps.dX)[:, :n]))
     own, slow = (share[shares[0] >= NOISE] for share in shares)
-    return bool(((slow >= NOISE) & (1.0 - slow <= np.maximum(BLURRED * (1.0 - own), most))).all())
+    lost = np.where(slow >= NOISE, np.where(1.0 - slow > BLURRED * (1.0 - own), 1.0 - slow, 0.0), math.inf)
+    return float(lost.max(initial=0.0))
 
 
 def _driven_more(source: Source, faster: Sequence[Source], used: Sequence[Candidate]) -> bool:
