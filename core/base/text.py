@@ -100,11 +100,6 @@ def _style(column: int) -> str:
     return f"text-align:{'right' if column else 'left'};white-space:nowrap"
 
 
-def number_text(value: float | None) -> str:
-    """Four digits; a dash where there is no finite number."""
-    return "–" if value is None or not math.isfinite(value) else f"{value:.4g}"
-
-
 @dataclass(frozen=True)
 class Table:
     """Cells as text; columns but the first and those in `left` stand to the right; `most` rows are shown."""

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, runs
-from uncertain_lti.base.text import html_table, named, number_text, plural, times
+from uncertain_lti.base.text import html_table, named, number, plural, times
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
 from uncertain_lti.model.repeats import Looked
 from uncertain_lti.monitor.alarm import Alarm, Raised
@@ -408,10 +408,10 @@ class Verdicts:
             bad = np.flatnonzero(self.flags[:, i] == 1.0)
             given = judged & ~np.isnan(self.flags[:, i])
             count, width = int(given.sum()), (self.upper - self.lower)[given, i]
-            first = f"{transient.t[bad[0]]:.4f} s" if len(bad) else "–"
+            first = f"{transient.t[bad[0]]:.4f} s" if len(bad) else "-"
             mean, largest = (float(width.mean()), float(width.max())) if count else (None, None)
-            inside = f"{1 - len(bad) / count:.3%}" if count else "–"
-            rows.append([named(name, unit), str(len(bad)), inside, number_text(mean), number_text(largest), first])
+            inside = f"{1 - len(bad) / count:.3%}" if count else "-"
+            rows.append([named(name, unit), str(len(bad)), inside, number(mean), number(largest), first])
         return html_table(repr(self), ("state", "violations", "inside", "mean width", "largest", "first"), rows)
 
     def statuses(self) -> list[Status]:

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import TransientError, refuse_other
-from uncertain_lti.base.text import html_table, meant, named, number_text, plural
+from uncertain_lti.base.text import html_table, meant, named, number, plural
 from uncertain_lti.sampling.clock import Counters, Status, longest_step, passed, to_ns
 from uncertain_lti.sampling.samples import (
     csv_columns,
@@ -383,7 +383,7 @@ class Transient:
             finite = values[np.isfinite(values)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)
             rms = float(np.sqrt(np.nanmean(np.diff(values) ** 2))) if len(finite) > 1 else math.nan
-            cells = [named(name, unit), kind, number_text(low), number_text(high), number_text(rms)]
+            cells = [named(name, unit), kind, number(low), number(high), number(rms)]
             rows.append([*cells, str(len(values) - len(finite))])
         counted = sorted((reason, n) for reason, n in self.counters.items() if n and reason != "samples")
         below = [f"not used, or without a verdict: {', '.join(f'{n} {reason}' for reason, n in counted)}"]

@@ -19,7 +19,7 @@ from typing import Any, Literal, NoReturn
 
 from uncertain_lti.base.arrays import LONGEST_S
 from uncertain_lti.base.errors import SignalError, refuse_other
-from uncertain_lti.base.text import html_table, named, number_text
+from uncertain_lti.base.text import html_table, named, number
 from uncertain_lti.signals.field_path import FieldPath, Memory, TypeFields
 from uncertain_lti.signals.signal import LISTS, STEP_CHOICES, map_arguments
 from uncertain_lti.signals.signal import Recalled as Recalled
@@ -430,8 +430,8 @@ class SignalMap:
         rows = []
         for kind, group in (("state", self.states), ("control", self.controls), ("scheduling", self.scheduling)):
             for s in group:
-                point = [value if isinstance(value, str) else number_text(value) for value in (s.steady, s.scale)]
-                hold = "" if s.max_hold is None else f"{number_text(s.max_hold)} s"
+                point = [value if isinstance(value, str) else number(value) for value in (s.steady, s.scale)]
+                hold = "" if s.max_hold is None else f"{number(s.max_hold)} s"
                 at = "" if s.at == "departure" else s.at
                 rows.append([named(s.name, s.unit), kind, s.topic, s.field, *point, hold, str(s.delay or ""), at])
         header = ("signal", "", "topic", "field", "steady", "scale", "max_hold", "delay", "at")

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.text import finite_data, html_table, named, number_text, plural
+from uncertain_lti.base.text import finite_data, html_table, named, number, plural
 from uncertain_lti.kernel.arithmetic import settled
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, containment
 from uncertain_lti.model.terms import ADDITIVE
@@ -161,10 +161,10 @@ class Validation:
         rows = [
             [
                 named(name, s["unit"]),
-                "–" if s["inside"] is None else f"{s['inside']:.3%}",
+                "-" if s["inside"] is None else f"{s['inside']:.3%}",
                 f"{s['parts_inside']}/{data['parts']}",
-                number_text(s["mean_width_left_out"]),
-                number_text(s["mean_width_full"]),
+                number(s["mean_width_left_out"]),
+                number(s["mean_width_full"]),
             ]
             for name, s in data["states"].items()
         ]
@@ -176,7 +176,7 @@ class Validation:
                 f"({data['confidence']:.0%} interval {low:.3%} to {high:.3%})"
             )
         for rule in data["false_alarms"][:1]:
-            below.append(f"false alarms per hour at {rule['rule']}: {number_text(rule['per_hour'])}")
+            below.append(f"false alarms per hour at {rule['rule']}: {number(rule['per_hour'])}")
         below += [data["scenario"]["words"], *(f"note: {note}" for note in data["notes"])]
         return html_table(repr(self), ("left out", "inside", "whole parts", "mean width", "fitted"), rows, below)
 
