@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import yaml
-from mcap.writer import CompressionType, Writer
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -32,12 +31,12 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp
+from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
 from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
-_CHUNK = 1 << 20  # bytes
 _LONGEST = 6.0  # s that messages wait for others that were held up
 _CLOCK = 60.0  # s later than ever: no message was on its way for so long, a clock was set
 
@@ -225,10 +224,9 @@ class _File:
             self._stream: BinaryIO = open(self._part, "xb")
         except OSError as error:
             raise BagError(f"{self._part}: cannot be written: {error.strerror}; choose another output") from None
-        self._writer = Writer(self._stream, chunk_size=_CHUNK, compression=CompressionType.ZSTD, enable_data_crcs=True)
-        self._writer.start(profile="ros2", library="uncertain-lti")
+        self._writer = McapWriter(self._stream, "uncertain-lti")
         if self._notes:
-            self._writer.add_metadata("uncertain_lti", self._notes)
+            self._writer.metadata("uncertain_lti", self._notes)
         return self
 
     def __exit__(self, *_: Any) -> None:
@@ -253,21 +251,22 @@ class _File:
         return (self._last - self._first) * 1e-9
 
     def channel(self, topic: str, type_name: str, offered: list[QoSProfile]) -> None:
-        schema = self._writer.register_schema(type_name, "ros2msg", definition(type_name).encode())
+        schema = self._writer.schema(type_name, "ros2msg", definition(type_name).encode())
         metadata = {"offered_qos_profiles": _qos_text(offered)}
         self.counts[topic] = 0
-        self._channels[topic] = int(self._writer.register_channel(topic, "cdr", schema, metadata))
+        self._channels[topic] = self._writer.channel(schema, topic, metadata=metadata)
 
     def write(self, topic: str, log_time: int, data: bytes) -> None:
         if not self.count:
             self._first = log_time
         self._last = max(log_time, self._last)  # a clock that is set back must not reorder what was received
-        self._to_disk(self._writer.add_message, self._channels[topic], self._last, bytes(data), self._last, self.count)
+        self._to_disk(self._writer.message, self._channels[topic], self._last, bytes(data))
         self.count += 1
         self.counts[topic] += 1
 
     def flush(self) -> None:
-        self._to_disk(self._writer.flush)
+        self._to_disk(self._writer.end_chunk)
+        self._to_disk(self._stream.flush)
 
     def _to_disk(self, write: Callable[..., None], *arguments: Any) -> None:
         """Write, unless an error was met: rclpy prints what is raised in a callback, so `hold` raises it elsewhere."""

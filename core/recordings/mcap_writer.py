@@ -100,11 +100,11 @@ class McapWriter:
         self._parts += (head, data)
         self._length += len(head) + len(data)
         if self._length >= _CHUNK_BYTES:
-            self._end_chunk()
+            self.end_chunk()
 
     def chunk(self, records: bytes, index: Mapping[int, bytes | bytearray], span: tuple[int, int]) -> None:
         """Add a chunk of messages: their records, `INDEX_ENTRY` of each by channel, and first and last log time."""
-        self._end_chunk()
+        self.end_chunk()
         self._write_chunk(records, index, span)
 
     def metadata(self, name: str, pairs: Mapping[str, str]) -> None:
@@ -117,12 +117,12 @@ class McapWriter:
 
     def record(self, opcode: int, body: bytes) -> None:
         """Add a record that no index knows, for example a private one."""
-        self._end_chunk()
+        self.end_chunk()
         self._write(_record(opcode, body))
 
     def finish(self) -> None:
         """Write the rest and the summary."""
-        self._end_chunk()
+        self.end_chunk()
         self._write(_record(_DATA_END, struct.pack("<I", self._sum)))
         counts = b"".join(struct.pack("<HQ", *pair) for pair in sorted(self._counts.items()))
         kinds = (_SCHEMA, _CHANNEL, _ATTACHMENT_INDEX, _METADATA_INDEX, _CHUNK_INDEX)
@@ -152,12 +152,13 @@ class McapWriter:
         return number
 
     def _indexed(self, opcode: int, body: bytes, index: int, about: bytes, names: bytes) -> None:
-        self._end_chunk()
+        self.end_chunk()
         place = struct.pack("<QQ", self._at, len(body) + 9)
         self._write(_record(opcode, body))
         self._summary[index].append(_record(index, place + about + names))
 
-    def _end_chunk(self) -> None:
+    def end_chunk(self) -> None:
+        """Write the messages that wait for more."""
         if self._parts:
             parts, index = self._parts, self._index
             self._parts, self._length, self._index = [], 0, {}
