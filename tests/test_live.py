@@ -319,9 +319,14 @@ def test_log_time_gives_live_what_it_gives_offline_in_lockstep(world: World, tmp
     verdicts = offline(path, bag)
     assert {v.status for v in verdicts} >= {Status.OK, Status.GAP}
     world.monitor(path, use_sim_time=True)
-    outputs = Outputs.of(world)
+    outputs, again = Outputs.of(world), tmp_path / "again.mcap"
+    recorder = world.command("record", *model.signals.topics, "--output", again, "--use-sim-time")
     world.command("play", bag, "--clock", "--lockstep", "envelope_monitor").succeed()
     outputs.hold_against(verdicts, ("a",))
+    recorder.signal(signal.SIGINT)
+    assert "not those of /clock" not in recorder.succeed()
+    recorded, played = ([(m.topic, m.log_time_ns) for m in Bag(b).raw_messages()] for b in (again, bag))
+    assert recorded == played, "a check of what was recorded beside it judges what the node judged"
 
 
 # --- behaviour ----------------------------------------------------------------------------------------------

@@ -378,6 +378,28 @@ def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_pat
     until(lambda: abs(world.status()["now_ns"] - time.time_ns()) < 10**10, "wall time")
 
 
+def test_a_node_that_was_busy_takes_each_message_at_its_simulated_time(world: World, tmp_path: Path) -> None:
+    """rclpy keeps the last tick alone: all that had come meanwhile was of one instant."""
+    model = by_hand("log")
+    process = world.monitor(saved(model, tmp_path), use_sim_time=True)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    clock = world.publisher(Clock, "/clock")
+    power, voltage = world.publisher(Float64, "/power"), world.publisher(Float64, "/voltage")
+    world.subscribed(clock, power, voltage)
+    process.signal(signal.SIGSTOP)
+    for k in range(20):
+        tick = Clock()
+        tick.clock.sec, tick.clock.nanosec = divmod(10**12 + k * STEP_NS, 10**9)
+        clock.publish(tick)
+        voltage.publish(Float64(data=float(model.operating_point.u_s[0])))
+        power.publish(Float64(data=float(model.operating_point.x_s[0])))
+        time.sleep(0.002)
+    process.signal(signal.SIGCONT)
+    got = flags.count(20)
+    assert [stamp_of(m) for m in got] == [10**12 + k * STEP_NS for k in range(20)]
+    np.testing.assert_array_equal([m.position[0] for m in got], [float("nan"), *[0] * 19])
+
+
 # --- what is lost on the way --------------------------------------------------------------------------------
 
 

@@ -249,6 +249,24 @@ def test_what_publishers_kept_is_put_in_the_order_of_sending(world: World, tmp_p
     assert len(numbers) > 3000 and (np.maximum.accumulate(numbers) - numbers).max() < 30
 
 
+def test_log_times_are_those_of_a_simulated_clock_until_it_goes_back(world: World, tmp_path: Path) -> None:
+    clock = world.publisher(Clock, "/clock")
+    pair = [world.publisher(Float64, name) for name in ("/command", "/state")]
+    process = recorder(world, ["/command", "/state"], tmp_path / "out.mcap", "--use-sim-time")
+    wall = recorder(world, ["/state"], tmp_path / "wall.mcap")
+    wall.says("note: log times are not those of /clock; --use-sim-time takes")
+    world.subscribed(clock, *pair)
+    for second in (None, 5, 6, 6, 4):  # before the first tick it is no time
+        if second is not None:
+            clock.publish(Clock(clock=Time(sec=second)))
+        for publisher in pair:
+            publisher.publish(Float64(data=float(second or 0)))
+        time.sleep(0.1)
+    assert "/clock went back from 6 to 4 s, so the recording ends there" in process.succeed()
+    recorded = [m.log_time_ns for m in Bag(tmp_path / "out.mcap").raw_messages()]
+    assert recorded == [5 * 10**9] * 2 + [6 * 10**9] * 4
+
+
 def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     numbers = world.publisher(Float64, "/numbers")

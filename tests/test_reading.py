@@ -25,6 +25,7 @@ from bag_writer import (
     cdr,
     float64,
     joint_state,
+    message,
     metadata_yaml,
     ramp,
     write,
@@ -39,6 +40,7 @@ from test_sampler import Reference, cases
 
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.proposal.init import propose
 from uncertain_lti.sampling.reading import read_as_fitted, read_transients, unused
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
@@ -130,17 +132,6 @@ def test_stamps_that_one_recording_lacks_are_used_of_none(tmp_path):
     assert [len(run) for run in runs] == [8, 8] and runs[0].signals.time == {"/x": "log", "/u": "log"}
     by_stamp = replace(signals, time={"/x": "header"})
     refuses(SignalError, "time is header, and no message of a recording has", read_transients, paths, by_stamp)
-
-
-@pytest.mark.parametrize(("stop", "said"), [(20, True), (90, False)])
-def test_a_clock_topic_that_falls_silent_is_told(tmp_path, stop, said):
-    sent = [("/x", 10**8 * k, joint_state(10**8 * k, [k])) for k in range(1, stop)]
-    sent += [("/u", 10**8 * k, joint_state(10**8 * k, [k])) for k in range(1, 95)]
-    path = save(tmp_path, dict.fromkeys(("/x", "/u"), JOINT_STATE), sent, "a.mcap")
-    (run,) = read_transients(path, SignalMap(states=(Signal("x", "/x", "position[0]"),)))
-    assert [f"the last message of /x comes {9.4 - (stop - 1) / 10:.3g} s before" in note for note in run.notes] == [
-        True
-    ] * said
 
 
 # --- real recordings against a plain reader -------------------------------------------------------------------
@@ -509,6 +500,24 @@ def test_a_clock_topic_that_stops_before_the_recording_does_is_said(
     (run,) = read_transients(path, SignalMap((Signal("x", "/x", "data"),), (Signal("u", "/u", "data"),)))
     said = [note for note in run.notes if f"the last message of /x comes {quiet} s before the recording ends" in note]
     assert len(said) == told
+
+
+@pytest.mark.parametrize("behind", [None, 0, 1700000000])
+def test_log_times_that_are_not_those_of_the_simulated_clock_beside_them_are_said(behind: int | None, tmp_path: Path):
+    """As `ros2 bag record` writes them without --use-sim-time; by fit or check, and in the file of init."""
+    start = 1700000000 * 10**9
+    sent = [
+        Message(t, start + k * 10 * MS, float64(math.sin(k * a)))
+        for k in range(99)
+        for t, a in (("/x", 1), ("/cmd", 0.3))
+    ]
+    tick = message("builtin_interfaces/msg/Time", sec=1700000000 - (behind or 0), nanosec=0)
+    clock = [Message("/clock", sent[0].log_time, cdr("rosgraph_msgs/msg/Clock", clock=tick))] * (behind is not None)
+    topics = [Topic("/x"), Topic("/cmd"), Topic("/clock", "rosgraph_msgs/msg/Clock")]
+    path = write(topics, [*clock, *sent]).save(tmp_path / "a.mcap")
+    (run,) = read_transients(path, SignalMap((Signal("x", "/x", "data"),)))
+    said = "/x goes by log times, which are not those of /clock: a monitor with use_sim_time judges other steps"
+    assert (said in "".join(run.notes)) == (said in propose([path], states=["/x"]).text) == bool(behind)
 
 
 def test_a_recording_that_cannot_be_sampled_is_an_error_and_not_silence(tmp_path: Path) -> None:

@@ -41,7 +41,7 @@ from uncertain_lti.signals.signal_map import below
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
-from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, input_values
+from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, SimulatedTime, input_values
 
 NAME = "envelope_monitor"
 _SUMMARY = (
@@ -105,6 +105,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.snapshots = Snapshots(self, self.settings)
         self._event_log = EventLog(self._log)
         self.intake = Intake(self.outputs.sender, self.snapshots, self._event_log.turned, self.note_failure)
+        self._simulated: SimulatedTime | None = None
         self._look_at_clock()
         self._noted = 0.0
         self._diagnostics = Diagnostics(self, self.settings["hardware_id"])
@@ -388,7 +389,9 @@ class EnvelopeMonitorNode(LifecycleNode):
 
     def _look_at_clock(self) -> None:
         """Take arrivals from /clock while that is in use."""
-        self.intake.clock = (lambda: self.clock.now().nanoseconds) if self.clock.ros_time_is_active else None
+        if (active := self.clock.ros_time_is_active) and self._simulated is None:
+            self._simulated = SimulatedTime(self)
+        self.intake.clock = self._simulated if active else None
 
     def _keep_beating(self) -> None:
         if self.active and time.monotonic() - self.outputs.sender.alarm_sent >= self.settings["heartbeat"] / 2:
@@ -469,7 +472,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             topic = f"{self.get_fully_qualified_name()}/{VIOLATION.name}"
             problems.append(f"another node publishes {topic} too; give one of them another name, -r __node:=NAME")
         problems += self.outputs.sender.problems
-        if self.clock.ros_time_is_active and not self.clock.now().nanoseconds:
+        if self.intake.clock is not None and not self.intake.clock():
             problems.append("use_sim_time is true, and no time has come on /clock")
         return problems + self.snapshots.problems
 
@@ -539,7 +542,7 @@ class EnvelopeMonitorNode(LifecycleNode):
                 "state": self.state_name,
                 "reason": self.reason,
                 "model": self.settings["model"],
-                "now_ns": self.clock.now().nanoseconds,
+                "now_ns": self.intake.clock() if self.intake.clock else self.clock.now().nanoseconds,
                 "use_sim_time": self.get_parameter("use_sim_time").value,
                 "received": {s.topic: s.received for s in self.inputs.values()},
                 "lost": {s.topic: s.lost for s in self.inputs.values()},

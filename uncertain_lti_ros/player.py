@@ -40,9 +40,8 @@ from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import TypeFields
 from uncertain_lti_ros.process import Life, living, seconds, speed
 from uncertain_lti_ros.recorder import resolved_name
-from uncertain_lti_ros.topics import live_fields, message_class
+from uncertain_lti_ros.topics import CLOCK, live_fields, message_class
 
-CLOCK = "/clock"
 _DEPTH = 1000
 _LOOKED_AT = 10_000  # messages in which a header stamp is looked for
 _CROWD = 2000.0

@@ -33,12 +33,13 @@ from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
-from uncertain_lti_ros.topics import POLL, MatchedSubscription, definition
+from uncertain_lti_ros.topics import CLOCK, POLL, MatchedSubscription, SimulatedTime, definition
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
 _LONGEST = 6.0  # s that messages wait for others that were held up
 _CLOCK = 60.0  # s later than ever: no message was on its way for so long, a clock was set
+_BACK_NS = 10**9  # /clock went back by more: what follows would lie among what was recorded
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", "-o", required=True, metavar="BAG", help="MCAP file to write; must not exist yet")
     parser.add_argument("--duration", type=seconds, metavar="S", help="stop S seconds after the first message")
     parser.add_argument("--wait", type=seconds, metavar="S", help="give up when a topic is not there after S seconds")
+    parser.add_argument("--use-sim-time", action="store_true", help="take log times from /clock")
     parser.add_argument(
         "--note", action="append", default=[], type=_note, metavar="NAME=TEXT",
         help="write this to the file too, in a metadata record; may be given several times",
@@ -63,17 +65,21 @@ def run(args: argparse.Namespace) -> Result:
     output = Path(args.output)
     if output.suffix != ".mcap":
         output = output.with_name(f"{output.name}.mcap")
+    simulated: bool = args.use_sim_time
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
         topics = list(dict.fromkeys(resolved_name(life.node, topic) for topic in args.topics))
-        types = _wait_for(life, topics, args.wait, args.progress.note)
-        taken = _InOrder(file, topics)
+        types = _wait_for(life, topics + [CLOCK] * simulated, args.wait, args.progress.note)
+        taken = _InOrder(file, topics, SimulatedTime(life.node) if simulated else None)
         subscriptions = [_subscribe(life.node, topic, types[topic], file, taken) for topic in topics]
         (args.progress.note if args.json else args.say)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
         stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
         with stage as step:
             _record(life, subscriptions, file, taken, args.duration, step, args.progress.note)
+        if taken.back:
+            args.progress.note(taken.back)
         if not file.count:
-            raise BagError(f"{output}: not written, no message came on {', '.join(topics)}; check who publishes")
+            came = f"no message came on {', '.join(topics)}{f' after a time on {CLOCK}' * simulated}"
+            raise BagError(f"{output}: not written, {came}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
     on_the_way = f", {lost} lost on the way" if lost else ""
     if taken.late:
@@ -132,6 +138,8 @@ def _record(
         for subscription in subscriptions:
             subscription.look()
             note(*subscription.problems)
+        if taken.clock is None and life.node.count_publishers(CLOCK):
+            note(f"log times are not those of {CLOCK}; --use-sim-time takes them from it")
 
     def poll() -> None:
         taken.release()
@@ -143,7 +151,8 @@ def _record(
     def over() -> bool:
         file.hold()
         step(f"{file.count} messages, {file.span:.1f} s")
-        return duration is not None and file.began is not None and time.monotonic() - file.began >= duration
+        limit = math.inf if duration is None or file.began is None else file.began + duration
+        return bool(taken.back) or time.monotonic() >= limit
 
     for period, task in ((POLL, poll), (_LOOK, look), (_FLUSH, file.flush)):
         life.node.create_timer(period, task)
@@ -158,11 +167,13 @@ class _InOrder:
     A process that stood still, or joins publishers that kept messages for it, gets the rest later, one topic after
     another; the live node puts that in order too.
 
-    `late`: how many came after others that were sent over `LATE` later, and stayed so; `latest`: s at most.
+    `clock`: gives log times, ns; None for the time of the system; `late`: how many came after others that were sent
+    over `LATE` later, and stayed so; `latest`: s at most; `back`: why nothing is taken any more, in words.
     """
 
-    def __init__(self, file: _File, topics: Iterable[str]) -> None:
+    def __init__(self, file: _File, topics: Iterable[str], clock: Callable[[], int] | None) -> None:
         self._file, self._began_ns = file, time.time_ns()
+        self.clock, self._logged_ns, self.back = clock, 0, ""
         self._came, self._least = -math.inf, dict[str, float]()
         self._heard = dict.fromkeys(topics, -math.inf)
         self._waiting: CatchUp | None = None
@@ -172,6 +183,13 @@ class _InOrder:
     def take(self, topic: str, data: bytes, sent_ns: int) -> None:
         """Take one message as it comes."""
         now, received_ns = time.monotonic(), time.time_ns()
+        log_ns = received_ns if self.clock is None else self.clock()
+        if self.clock is not None and log_ns < self._logged_ns - _BACK_NS and not self.back:
+            to = f"from {self._logged_ns * 1e-9:.9g} to {log_ns * 1e-9:.9g} s"
+            self.back = f"{CLOCK} went back {to}, so the recording ends there; record what follows to another file"
+        if self.back or not log_ns:  # no time has come on /clock
+            return
+        self._logged_ns = log_ns
         self._file.began = self._file.began or now
         way = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
         if now - self._came > STALL and self._waiting is None:
@@ -179,9 +197,9 @@ class _InOrder:
             self._waiting = CatchUp(lately, _LONGEST, start=False)
         self._came = self._heard[topic] = now
         if self._waiting is not None:
-            self._waiting.put((topic, received_ns, data), sent_ns, way, now)
+            self._waiting.put((topic, log_ns, data), sent_ns, way, now)
         else:
-            self._file.write(topic, received_ns, data)
+            self._file.write(topic, log_ns, data)
         if sent_ns <= self._began_ns:
             return  # it is late for a good reason
         least = min(way, self._least.get(topic, way))

@@ -36,6 +36,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
 from uncertain_lti.base.errors import ModelError, SignalError
@@ -135,6 +136,7 @@ def definition(type_name: str) -> str:
 
 POLL = 0.1
 """s between two polls: who listens, and publishers that changed, are known that late at most."""
+CLOCK = "/clock"
 DEPTH = 1000
 """Messages kept until they are taken: the graph does not show the depth of the publishers' queues."""
 RELIABILITY = {"reliable": ReliabilityPolicy.RELIABLE, "best_effort": ReliabilityPolicy.BEST_EFFORT}
@@ -363,6 +365,21 @@ class MatchedSubscription:
 
     def _lost(self, event: Any) -> None:
         self._reported_lost += event.total_count_change
+
+
+class SimulatedTime:
+    """The time of /clock, ns, as a message comes; rclpy forgets all but the last tick while the node is busy."""
+
+    def __init__(self, node: Node) -> None:
+        self._ns, qos = 0, QoSProfile(depth=DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+        node.create_subscription(Clock, CLOCK, self._take, qos)
+
+    def __call__(self) -> int:
+        """Give it; 0 before the first tick."""
+        return self._ns
+
+    def _take(self, tick: Clock) -> None:
+        self._ns = tick.clock.sec * 10**9 + tick.clock.nanosec
 
 
 def sendable(names: Sequence[str], velocities: bool = False) -> NamedVector:

@@ -131,6 +131,6 @@ class CatchUp:
         for number, _, _, (topic, arrival_ns, data) in order[:count]:
             self.reordered += number < newest
             newest = max(number, newest)
-            self._arrival_ns = max(arrival_ns, self._arrival_ns + 1)
+            self._arrival_ns = max(arrival_ns, self._arrival_ns)
             released.append((topic, self._arrival_ns, data))
         return released

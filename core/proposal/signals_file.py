@@ -26,6 +26,7 @@ from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, clock_of, held, steps_of
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.clock import coarse_ns, longest_pause
+from uncertain_lti.sampling.reading import of_another_clock
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
 from uncertain_lti.signals.signal_map import Signal
@@ -225,6 +226,8 @@ def signals_file(
         f"# Its messages define the sample instants: {by_them.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
+    if by_arrival or clock.offset is None:
+        lines += [f"# Beware: {other}." for other in of_another_clock(bags[0], clock.topic)]
     if pause := longest_pause(instants):
         lines += ["", "# They come in bursts, and their samples evenly.", "step: constant", f"max_gap: {pause:g}"]
     elif unit := coarse_ns(instants):

@@ -38,6 +38,8 @@ from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
 
+_CLOCK = "rosgraph_msgs/msg/Clock"
+
 
 @dataclass
 class Stream(Columns):
@@ -167,9 +169,11 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
     assert signals.max_gap is not None
     m, bag = len(signals.controls), stream.bag
     cut: dict[str, Any] = {"signals": signals, "max_gap": signals.max_gap, "min_step": signals.min_step}
-    read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts}
-    notes = (*bag.warnings, *lags_in_words(stream, signals), *_silence(stream, signals))
-    transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], name=os.fspath(bag.path), notes=notes, **cut, **read)
+    read: dict[str, Any] = {"counters": sampler.counters, "sources": bag.parts, "name": os.fspath(bag.path)}
+    notes = [*bag.warnings, *lags_in_words(stream, signals), *_silence(stream, signals)]
+    if signals.clock and signals.time[signals.clock] == "log":
+        notes += [f"{bag.path}: {other}" for other in of_another_clock(bag, signals.clock)]
+    transient = Transient(t_ns, x, held[:, :m], s=held[:, m:], notes=tuple(notes), **cut, **read)
     return transient, Decisions(*decisions)
 
 
@@ -204,6 +208,16 @@ def _silence(stream: Stream, signals: SignalMap) -> Iterator[str]:
     if quiet > max(10**9, (last - first) // 20):
         stops = f"the last message of {signals.clock} comes {quiet * 1e-9:.3g} s before the recording ends"
         yield f"{stream.bag.path}: {stops}, and nothing is judged after it; has the sensor or its driver stopped?"
+
+
+def of_another_clock(bag: Recording, clock: str) -> list[str]:
+    """A sentence on samples by log times, where the recording holds a simulated clock whose times are others."""
+    ticks = [topic for topic, info in bag.topics.items() if info.type == _CLOCK and info.readable]
+    _, log_ns, tick = next(iter(bag.messages(ticks)), (clock, 0, None)) if ticks else (clock, 0, None)
+    if tick is None or abs(tick.clock.sec - log_ns * 1e-9) < 2.0:
+        return []
+    judges = "a monitor with use_sim_time judges other steps; record with --use-sim-time"
+    return [f"{clock} goes by log times, which are not those of {ticks[0]}: {judges}"]
 
 
 def read_transients(
