@@ -24,6 +24,8 @@ from perturbed import CONTROL, STATE, STEP_NS
 
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Sampling
+from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.sampling.reading import read_as_fitted
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -36,6 +38,7 @@ from ros_processes import world as world
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64
+from std_srvs.srv import Trigger
 from test_live import Outputs, Plant, StartBench, by_hand, header_bag, offline, saved, stamp_of
 from test_live import bench as bench
 
@@ -350,7 +353,8 @@ def test_deactivation_ends_a_latched_alarm(bench: StartBench) -> None:
 def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_path: Path) -> None:
     """By log time: a jump forward is a gap, one back a reset, neither is judged; a paused clock repeats itself."""
     model = by_hand("log")
-    world.monitor(saved(model, tmp_path), use_sim_time=True, heartbeat=0.2)
+    path = saved(model, tmp_path)
+    world.monitor(path, use_sim_time=True, heartbeat=0.2, **{"snapshot.folder": str(tmp_path)})
     flags = world.listen(JointState, f"{NODE}/flags").connected()
     clock = world.publisher(Clock, "/clock")
     power, voltage = world.publisher(Float64, "/power"), world.publisher(Float64, "/voltage")
@@ -374,6 +378,10 @@ def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_pat
     np.testing.assert_array_equal(got, [nan, 0, 0, 0, 0, nan, 0, 0, 0, nan, 0, 0, 0, nan, nan, 0])
     counters = world.status()["counters"]
     assert (counters["gaps"], counters["resets"], counters["equal stamp"]) == (1, 1, 2)
+    world.call(Trigger, f"{NODE}/snapshot", Trigger.Request())
+    (file,) = tmp_path.glob("*.mcap")
+    since = read_as_fitted(file, UncertainLTI.load(path).signals)
+    assert since.t_ns[-5:].tolist() == [now - k * STEP_NS for k in (4, 3, 2, 1, 0)], "a snapshot holds what came since"
     world.set(use_sim_time=False)
     until(lambda: abs(world.status()["now_ns"] - time.time_ns()) < 10**10, "wall time")
 

@@ -16,7 +16,7 @@ import re
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import BinaryIO
@@ -30,6 +30,7 @@ from uncertain_lti.recordings.mcap_writer import McapWriter
 
 _OVERHEAD = 800  # bytes that one kept message takes besides its data, a verdict on it included
 _PER_STATE = 200  # and for each state of a verdict
+_BACK_NS = 10**9  # of a clock that begins anew
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +64,12 @@ class Recent:
         self._bytes = 0
 
     def add(self, entry: Entry) -> None:
-        """Keep one more."""
+        """Keep one more; of what came before its clock went back the last values alone."""
         entries = self._entries
+        if entries and entry.arrival_ns < entries[-1].arrival_ns - _BACK_NS:  # log times of a file never do
+            last, at_ns = {old.topic: old for old in self.entries()}, max(0, entry.arrival_ns - _BACK_NS)
+            self.clear()
+            self._before = {topic: replace(old, arrival_ns=at_ns, verdicts=()) for topic, old in last.items()}
         entries.append(entry)
         self._bytes += len(entry.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in entry.verdicts)
         oldest = entry.now - self._seconds
