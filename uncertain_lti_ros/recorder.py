@@ -187,7 +187,7 @@ class _InOrder:
         if self.clock is not None and log_ns < self._logged_ns - _BACK_NS and not self.back:
             to = f"from {self._logged_ns * 1e-9:.9g} to {log_ns * 1e-9:.9g} s"
             self.back = f"{CLOCK} went back {to}, so the recording ends there; record what follows to another file"
-        if self.back or not log_ns:  # no time has come on /clock
+        if self.back or log_ns <= 0:  # no time has come on /clock
             return
         self._logged_ns = log_ns
         self._file.began = self._file.began or now
