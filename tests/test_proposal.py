@@ -1184,7 +1184,7 @@ def test_every_signals_file_that_is_written_can_be_read(tmp_path, monkeypatch, m
         remembered = (Remembered(one[recalled][0].name, Memory(kind)),) if kind else ()
         monkeypatch.setattr(init, "choose_memories", lambda *_, found=remembered: (found, 0.5))
         alike = init._members(*one, {(c.topic, c.path): c for c in [*states, *controls]})
-        text = signals_file([SimpleNamespace(path=tmp_path)], sources, *one, "", init._memories(*one), alike)
+        text = signals_file([SimpleNamespace(path=tmp_path, topics={})], sources, *one, "", init._memories(*one), alike)
         signals = SignalMap.from_dict(yaml.safe_load(text))
         assert len(signals.states) == max(1, len(alike)), text
 
