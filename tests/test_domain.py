@@ -122,8 +122,8 @@ def test_levels_of_two_that_no_row_has_both_are_no_combination() -> None:
 def test_where_no_recording_repeats_the_combinations_of_another_ranges_alone_count() -> None:
     """A healthy arm that goes to other poses each time was outside in all it did, and its quiet said nothing."""
 
-    def joints(seed: int, poses: int) -> Transient:
-        drawn = np.random.default_rng(seed).uniform(-1.0, 1.0, (3, poses, 2))
+    def joints(seed: int, poses: int, of: int | None = None) -> Transient:
+        drawn = np.random.default_rng(seed if of is None else of).uniform(-1.0, 1.0, (3, poses, 2))
         ends = np.tile([[1.0, 1.0], [-1.0, -1.0]], (3, 1, 1))  # all go as far
         poses_of = [np.repeat([*ends[j], *drawn[j]], 5, axis=0) for j in range(3)]  # rests in each
         parts = [arms(seed + 50 * j, [*map(tuple, each)]) for j, each in enumerate(poses_of)]
@@ -137,6 +137,8 @@ def test_where_no_recording_repeats_the_combinations_of_another_ranges_alone_cou
     far = runs[0].replace(x=1.5 * runs[0].x, u=1.5 * runs[0].u)
     assert outside(model, far) > 0.1
     assert UncertainLTI.from_dict(json.loads(json.dumps(model.to_dict()))).domain.measure is None
+    alike = fit_public([*(joints(seed, 10, of=0) for seed in range(4)), joints(9, 10)], "lp", additive="noise")
+    assert alike.domain.measure is not None  # but for one that is not typical
     many = fit_public([joints(seed, 150) for seed in range(4)], "lp", additive="noise")
     assert many.domain.measure is not None  # enough of them to tell
 

@@ -91,6 +91,7 @@ def test_what_was_left_out_tells_how_far_a_model_moves_a_healthy_repeat() -> Non
     once = plain.reaching(np.array([np.zeros(5), plain.largest_run, np.full(5, 7.0), np.zeros(5)]))
     assert once.largest_sum.tolist() == [7.0] * 5 and np.array_equal(once.largest_run, plain.largest_run)
     assert np.array_equal(once.active_beyond, plain.active_beyond)
+    assert np.isfinite(plain.reaching(np.full((4, 5), np.inf)).largest_run).all(), "where one ran away"
 
 
 def test_a_fit_learns_the_longest_repeat_of_each_state(model: UncertainLTI) -> None:
