@@ -64,8 +64,7 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
         for candidate, name in plain.items():
             others = (c for c in group if plain[c] == name and (candidate.ready or not c.ready))  # or in a comment
             alike = [other.topic for other in others]
-            apart = "_".join(_apart(candidate.topic, alike))
-            name = apart if apart.endswith(name) else "_".join(filter(None, [apart, name]))  # left_thrust
+            name = "_".join([*_apart(candidate.topic, alike), name])
             if name in taken or (suffix == "command" and candidate.element in elements):
                 name = f"{name}_{suffix}"
             numbered = (f"{name}_{number}" for number in count(2))
