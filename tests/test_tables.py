@@ -189,6 +189,7 @@ def test_points_part_thousands_where_commas_part_decimals_in_another_column(tmp_
         (["-980", "-1'234", "1'000'000.25"], [-980, -1234, 1000000.25]),
         (["512 515", "99 515", "511 9"], None),
         (["1.234,5", "1.5", "2.5"], [math.nan, 1.5, 2.5]),
+        (["error", "1.234", "980"], [math.nan, 1.234, 980]),
     ],
 )
 def test_separators_of_thousands_are_read_where_cells_tell_them(cells, numbers, tmp_path):
@@ -1255,6 +1256,8 @@ def test_how_long_something_has_lasted_is_no_time_where_many_rows_share_it(tmp_p
 def test_a_step_beside_the_columns_is_named_for_rows_without_a_time(tmp_path):
     rows = [f"{k % 7},{k % 5},{4 if k == 0 else ''}" for k in range(60)]
     refuses(BagError, "'Ts' is the same in all rows.*`--table step=4` ", read_csv, tmp_path, "u,y,Ts", rows)
+    zero = [f"{k % 7},{k % 5},0" for k in range(60)]
+    refuses(BagError, "'t' is the same in all rows.*`--table step=0.01` ", read_csv, tmp_path, "u,y,t", zero)
 
 
 def test_times_since_1970_are_found_without_a_name_though_some_step_back(tmp_path):
