@@ -23,7 +23,7 @@ from perturbed import held_up, run, session_of
 
 from uncertain_lti import EnvelopeMonitor, UncertainLTI, read_transients
 from uncertain_lti.identification import fit
-from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp
+from uncertain_lti.monitor.catch_up import MOST, STALL, WINDOW, CatchUp, arrival_of
 from uncertain_lti.monitor.session import Rule
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
@@ -317,3 +317,17 @@ def test_a_topic_that_has_fallen_silent_has_no_lag(engine):
     session = session_of(model, Rule())
     run(session, come)
     assert session.lags == {}
+
+
+@pytest.mark.parametrize(
+    ("received", "taken", "before", "arrived", "case"),
+    [
+        (7, 10, 5, 7, "as received, however much later it is taken"),
+        (4, 10, 5, 5, "in the order in which the middleware gives messages"),
+        (0, 10, 5, 10, "nobody says when it was received"),
+        (12, 10, 5, 10, "in the future: by another clock"),
+        (4, 10, 20, 4, "the clock of the system was set back"),
+    ],
+)
+def test_a_message_arrives_when_the_middleware_receives_it(received, taken, before, arrived, case):
+    assert arrival_of(received, taken, before) == arrived, case

@@ -10,9 +10,11 @@
 """How monitors are put together: several in a process, inputs under a prefix, numbers as people write them, an end."""
 
 import re
+import threading
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from conftest import ROOT
@@ -22,9 +24,10 @@ pytest.importorskip("rclpy", reason="rclpy is not installed")
 from geometry_msgs.msg import Vector3Stamped
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
-from ros_processes import Diagnostics, World, until
+from ros_processes import PATIENCE, Diagnostics, World, until
 from ros_processes import world as world
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64
 from test_live import CONTROL, EPOCH_NS, STATE, by_hand, joint_state, saved, stamp_of, vector
 
 from uncertain_lti_ros.envelope_monitor import NAME, EnvelopeMonitorNode
@@ -87,6 +90,32 @@ def test_two_monitors_in_one_process(world: World, tmp_path: Path) -> None:
 
         until(reported, f"a report of {name}")
     assert [node.session.monitor.rule.margin for node in nodes if node.session] == [2.0, 2.0]
+
+
+def test_a_monitor_that_was_busy_takes_each_message_at_the_time_at_which_it_came(world: World, tmp_path: Path) -> None:
+    """All that had come meanwhile was of the instant at which it was taken."""
+    given = [Parameter("model", value=str(saved(by_hand("log"), tmp_path)))]
+    node = EnvelopeMonitorNode("busy", parameter_overrides=given, context=world.node.context)
+    world.host(node)
+    node.start()
+    flags = world.listen(JointState, "/busy/flags").connected()
+    power, voltage = world.publisher(Float64, "/power"), world.publisher(Float64, "/voltage")
+    World.subscribed(power, voltage)
+    busy = threading.Event()
+
+    def hold() -> None:
+        once.cancel()
+        busy.set()
+        time.sleep(0.5)
+
+    once = node.create_timer(0.001, hold)
+    assert busy.wait(PATIENCE)
+    for _ in range(10):
+        voltage.publish(Float64(data=0.1))
+        power.publish(Float64(data=0.3))
+        time.sleep(0.02)
+    stamps = [stamp_of(m) for m in flags.count(10)]
+    assert min(np.diff(stamps)) > 10_000_000
 
 
 def test_inputs_under_a_prefix_and_their_enable_condition(world: World, tmp_path: Path) -> None:

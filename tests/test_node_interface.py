@@ -283,7 +283,7 @@ def test_turns_are_told_from_a_publisher_that_is_started_again_and_from_losses(w
         heard = MatchedSubscription(world.node, "/x", "std_msgs/msg/Float64", lambda *_: None)
         heard.publishers = 2
         for number in numbers:
-            heard._take(b"", {"publication_sequence_number": number, "source_timestamp": 0})
+            heard._take(b"", {"publication_sequence_number": number, "source_timestamp": 0, "received_timestamp": 0})
         assert heard.takes_turns() is turns, case
         heard.destroy()
 

@@ -19,6 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from contextlib import nullcontext, suppress
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -30,7 +31,7 @@ from rclpy.qos import QoSProfile
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.cli.command import Result
-from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp
+from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, arrival_of
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
 from uncertain_lti_ros.topics import CLOCK, POLL, MatchedSubscription, SimulatedTime, definition
@@ -127,7 +128,7 @@ def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable
 
 def _subscribe(node: Node, topic: str, type_name: str, file: _File, taken: _InOrder) -> MatchedSubscription:
     file.channel(topic, type_name, [info.qos_profile for info in node.get_publishers_info_by_topic(topic)])
-    return MatchedSubscription(node, topic, type_name, lambda data, sent_ns: taken.take(topic, data, sent_ns))
+    return MatchedSubscription(node, topic, type_name, partial(taken.take, topic))
 
 
 def _record(
@@ -180,10 +181,10 @@ class _InOrder:
         self._newest_ns = 0
         self.late, self.latest = Counter[str](), 0.0
 
-    def take(self, topic: str, data: bytes, sent_ns: int) -> None:
-        """Take one message as it comes."""
-        now, received_ns = time.monotonic(), time.time_ns()
-        log_ns = received_ns if self.clock is None else self.clock()
+    def take(self, topic: str, data: bytes, sent_ns: int, received_ns: int) -> None:
+        """Take one message, as the middleware gives it."""
+        now, taken_ns = time.monotonic(), time.time_ns()
+        log_ns = arrival_of(received_ns, taken_ns, self._logged_ns) if self.clock is None else self.clock()
         if self.clock is not None and log_ns < self._logged_ns - _BACK_NS and not self.back:
             to = f"from {self._logged_ns * 1e-9:.9g} to {log_ns * 1e-9:.9g} s"
             self.back = f"{CLOCK} went back {to}, so the recording ends there; record what follows to another file"
@@ -191,7 +192,7 @@ class _InOrder:
             return
         self._logged_ns = log_ns
         self._file.began = self._file.began or now
-        way = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
+        way = (taken_ns - sent_ns) * 1e-9 if sent_ns else 0.0
         if now - self._came > STALL and self._waiting is None:
             lately = [other for other, heard in self._heard.items() if heard >= self._came - STALL]
             self._waiting = CatchUp(lately, _LONGEST, start=False)
@@ -206,7 +207,7 @@ class _InOrder:
         least = self._least[topic] = way if way - least > _CLOCK else least
         by, sent_ns = way - least, sent_ns + (round(least * 1e9) if abs(least) > LATE else 0)  # by another clock
         behind = (self._newest_ns - sent_ns) * 1e-9
-        self._newest_ns = max(self._newest_ns, min(sent_ns, received_ns))
+        self._newest_ns = max(self._newest_ns, min(sent_ns, taken_ns))
         if self._waiting is None and behind > LATE and by > LATE:
             self.late[topic] += 1
             self.latest = max(self.latest, behind)

@@ -245,7 +245,7 @@ class MatchedSubscription:
     """Subscription to one topic whose QoS `look` compares with the graph.
 
     `node`: the node; `topic`: as in the model or on the command line; expanded and remapped by the node; `type_name`:
-    `pkg/msg/Type`; `callback`: takes the bytes of a message, and when it was published, ns by its publisher;
+    `pkg/msg/Type`; `callback`: takes the bytes of a message, when it was published, by its publisher, and received, ns;
     `requested`: what the user requests; `received, lost, late`: messages received, those lost on the way or in the
     queue, and deadlines missed by publishers; `publishers`: publishers of this type that the graph knows; `published`:
     since when there are some, steady time in s; infinite without any; `qos`: what is asked of them now; `problems`:
@@ -260,7 +260,7 @@ class MatchedSubscription:
         node: Node,
         topic: str,
         type_name: str,
-        callback: Callable[[Any, int], None],
+        callback: Callable[[Any, int, int], None],
         requested: RequestedQos = RequestedQos(),
     ) -> None:
         self._node, self._asked_topic, self.type_name = node, topic, full_name(type_name)
@@ -355,7 +355,7 @@ class MatchedSubscription:
                 if goes_on or number <= before:
                     self._left = before
         self._number = number
-        self._callback(message, info["source_timestamp"])
+        self._callback(message, info["source_timestamp"], info["received_timestamp"])
 
     def _changed(self, _: Any) -> None:
         self.look_soon, self._alone = True, False

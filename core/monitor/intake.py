@@ -21,7 +21,7 @@ from typing import Any, Protocol
 
 import cython
 
-from uncertain_lti.monitor.catch_up import Waiting
+from uncertain_lti.monitor.catch_up import Waiting, arrival_of
 from uncertain_lti.monitor.outputs import FALSE, FLAGS, REASON, TRUE, VIOLATION, Encoder, VerdictMessages, text_message
 from uncertain_lti.monitor.snapshot import Entry
 from uncertain_lti.monitor.stream import Stream
@@ -253,6 +253,7 @@ class Intake:
     _memory: Any
     _turned: Any
     _failed: Any
+    _arrived_ns: cython.longlong  # the last message
 
     def __init__(
         self,
@@ -262,18 +263,19 @@ class Intake:
         failed: Callable[[str, Exception], None],
     ) -> None:
         self._sender, self._memory, self._turned, self._failed = sender, memory, turned, failed
-        self.session, self.active, self.clock = None, False, None
+        self.session, self.active, self.clock, self._arrived_ns = None, False, None, 0
 
-    def message(self, topic: str, data: bytes, sent_ns: int = 0) -> None:
-        """Take a message as it arrives; `sent_ns`: when it was published, 0 if that is not known."""
+    def message(self, topic: str, data: bytes, sent_ns: int = 0, received_ns: int = 0) -> None:
+        """Take a message; `sent_ns`, `received_ns`: when it was published, and received; 0 if that is not known."""
         session = self.session
         if session is None or not self.active:
             return
         now = time.monotonic()
         try:
-            received_ns = time.time_ns()
-            arrival_ns = received_ns if self.clock is None else self.clock()
-            late = (received_ns - sent_ns) * 1e-9 if sent_ns else 0.0
+            taken_ns = time.time_ns()
+            self._arrived_ns = arrival_of(received_ns, taken_ns, self._arrived_ns)
+            arrival_ns = self._arrived_ns if self.clock is None else self.clock()
+            late = (taken_ns - sent_ns) * 1e-9 if sent_ns else 0.0
             messages = session.accept(topic, arrival_ns, data, now, sent_ns, late)
         except Exception as error:
             self._failed(f"on a message of {topic}", error)
