@@ -1233,6 +1233,17 @@ def table_of(path, columns, time=None, fmt="%.18e"):
     return path
 
 
+def test_what_counts_the_hours_of_running_is_no_signal(tmp_path):
+    """It was taken for a set point that the others follow; degrees that rise one by one are no such count."""
+    rng = np.random.default_rng(0)
+    u, rows = np.repeat(rng.normal(size=(30, 1)), 60, axis=0), np.arange(1800)
+    warm = np.rint(80.0 - 60.0 * np.exp(-rows / 500.0))
+    columns = {"speed": answers(rng, u)[:, 0], "speed_cmd": u[:, 0], "run_minutes": 1e4 + rows // 60, "warm": warm}
+    text = propose([table_of(tmp_path / "run.csv", columns | {"crc": rng.integers(0, 1 << 32, 1800)}, rows)]).text
+    assert "run_minutes: grows as a clock or a counter does" in text and "warm: grows" not in text
+    assert "crc: of a computer, by its name" in text
+
+
 def answers(rng, commands, noise=1e-4, pole=0.95):
     """What follows commands (N, k) with a lag of the first order."""
     x = np.zeros_like(commands)

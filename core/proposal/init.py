@@ -88,7 +88,9 @@ _RUN = re.compile(
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
 _CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
-_COMPUTER = re.compile(r"(^|_)(elapsed|latency|cpu\d*)(_|$)|^dt$")  # what it took for a cycle, and how busy it is
+_COMPUTER = re.compile(
+    r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum)(_|$)|^dt$"
+)  # what it took for a cycle, how busy it is
 _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
@@ -330,9 +332,11 @@ def _counts(values: Array, arrival: NDArray[np.int64], wheel: bool) -> bool:
     finite, t = values[good], (arrival[good] - arrival[0]) * 1e-9
     if len(finite) < 3 or np.ptp(t) == 0:
         return False
-    x, y = t - t.mean(), finite - finite.mean()
+    moved = 1 + np.flatnonzero(np.diff(finite))
+    rows = moved if FEWEST <= len(moved) < 0.5 * len(finite) else slice(None)  # of the hours that it ran, each full one
+    x, y = (v[rows] - v[rows].mean() for v in (t, finite))
     slope = float(x @ y / (x @ x))
-    follows = bool(((y - slope * x) ** 2).sum() < (0.002 * np.ptp(finite)) ** 2 * len(finite))
+    follows = bool(((y - slope * x) ** 2).sum() < (0.002 * np.ptp(finite)) ** 2 * len(x))
     if np.mean(np.diff(finite) == 1) > 0.9 or (follows and any(abs(slope / 1000**k - 1) < 1e-3 for k in range(4))):
         return True
     if (np.diff(finite) < 0).any():
