@@ -1082,6 +1082,25 @@ def test_a_slower_topic_in_which_alone_a_command_shows_gives_states_and_the_cloc
     fitted([path], proposal)
 
 
+def test_a_heading_that_one_instant_tells_is_no_reason_to_leave_out_slower_topics(tmp_path):
+    """It turned by many radians, so that what was unknown of it grew from next to nothing to twice as much."""
+    rng = np.random.default_rng(0)
+    messages, speed, turn, yaw, u = [], 0.0, 0.0, 0.0, np.zeros(2)
+    for k in range(8000):
+        t = 10**18 + 10 * k * MS
+        if k % 40 == 0:
+            u = rng.normal(size=2) + [0.0, 1.0]
+        messages += [f64("/imu/yaw", t, yaw), f64("/imu/rate", t, turn + 1e-3 * rng.normal())]
+        if k % 2 == 0:
+            messages += [f64("/odom", t, speed + 1e-3 * rng.normal())]
+            messages += [f64("/drive_cmd", t, u[0]), f64("/turn_cmd", t, u[1])]
+        speed += 0.01 * (3.0 * u[0] - 2.0 * speed)
+        turn += 0.01 * (3.0 * u[1] + 0.1 * u[0] - 2.0 * turn)
+        yaw += 0.01 * turn
+    _, proposal = proposed(tmp_path, messages)
+    assert {c.topic for c in proposal.states} == {"/imu/yaw", "/imu/rate", "/odom"}, proposal.text
+
+
 def test_a_slow_topic_with_a_command_of_its_own_does_not_slow_down_what_moves_in_between(tmp_path):
     """An arm of 100 Hz was judged at the 11 Hz of a heater, where only jumps 4 to 10 times as large are seen."""
     rng = np.random.default_rng(0)

@@ -237,6 +237,8 @@ SLOWER = 10.0
 BLURRED = 2.0
 """Times the variance that one sample leaves unknown of the next at their own rate that is left at a slower one, from
 which on the numbers of a topic move in between."""
+STILL = 1e-4
+"""Likewise, from which on more of it counts: of a heading that goes round and round next to nothing is unknown."""
 LOST = 0.01
 """Share of the variance that one sample may leave unknown of the next for the sake of a control that shows in a slower
 topic alone."""
@@ -451,7 +453,8 @@ def _lost_at(slower: Source, source: Source, used: Sequence[Candidate]) -> float
             return math.inf
         shares.append(predicted(steps.X[:, :n], steps.U, (steps.X + steps.dX)[:, :n]))
     own, slow = (share[shares[0] >= NOISE] for share in shares)
-    lost = np.where(slow >= NOISE, np.where(1.0 - slow > BLURRED * (1.0 - own), 1.0 - slow, 0.0), math.inf)
+    clear = 1.0 - slow > np.maximum(BLURRED * (1.0 - own), STILL)
+    lost = np.where(slow >= NOISE, np.where(clear, 1.0 - slow, 0.0), math.inf)
     return float(lost.max(initial=0.0))
 
 
