@@ -19,7 +19,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import yaml
-from bag_writer import Message, Topic, array, cdr, float64, header, joint_state, message, write
+from bag_writer import Message, Topic, array, cdr, float64, header, joint_state, message, vector, write
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from processes import bounded
@@ -1367,6 +1367,24 @@ def test_stamps_that_are_rounded_of_an_even_clock_make_the_step_constant(tmp_pat
         recorded = fit(read_transients([path], other), describe_data=False)
         narrower = np.divide(model.fit_summary["mean_width"], recorded.fit_summary["mean_width"])
         assert narrower.max() < 0.5
+
+
+def test_stamps_of_simulated_time_give_the_step_where_a_command_has_none(tmp_path):
+    """Times of arrival jitter with the speed of the simulation, which differs from run to run."""
+    vector3 = "geometry_msgs/msg/Vector3Stamped"
+    paths = []
+    for run, speed in enumerate((0.6, 0.9)):
+        rng = np.random.default_rng(run)
+        u = np.repeat(rng.normal(size=60), 20)
+        x, wall, messages = answers(rng, u[:, None])[:, 0], 10**18, []
+        for k in range(len(u)):
+            messages.append(Message("/odom", wall, vector(20 * k * MS, x[k], 0.0), wall))
+            messages += [f64("/cmd", wall, u[k])]
+            wall += int(20 * MS / speed * rng.uniform(0.7, 1.3))
+        paths.append(save(tmp_path / f"{run}.mcap", messages, {"/odom": vector3}))
+    proposal = propose(paths)
+    assert "\nstep: 0.02\n" in proposal.text and "/odom: {time: log}" in proposal.text, proposal.text
+    assert fitted(paths, proposal).signals.step == 0.02
 
 
 def test_recordings_of_two_rates_have_no_constant_step(tmp_path):

@@ -25,7 +25,7 @@ from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.text import printable, shortlist
 from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, clock_of, held, steps_of
 from uncertain_lti.recordings.recording import Recording
-from uncertain_lti.sampling.clock import coarse_ns, longest_pause
+from uncertain_lti.sampling.clock import coarse_ns, even_ns, longest_pause
 from uncertain_lti.sampling.reading import of_another_clock
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
@@ -221,6 +221,7 @@ def signals_file(
     by_arrival = any(source.halting for source in topics.values()) or max(offsets) - min(offsets) > 1.0
     instants = clock.arrival if by_arrival else [clock.instants(clock, k)[0] for k in range(len(clock.arrival))]
     by_them = replace(clock, arrival=instants)
+    period = even_ns(clock.stamp) if by_arrival and clock.stamped and not clock.halting else None
     lines += [
         f"# Its messages define the sample instants: {by_them.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
@@ -229,6 +230,12 @@ def signals_file(
         lines += [f"# Beware: {other}." for other in of_another_clock(bags[0], clock.topic)]
     if pause := longest_pause(instants):
         lines += ["", "# They come in bursts, and their samples evenly.", "step: constant", f"max_gap: {pause:g}"]
+    elif period:
+        lines += [
+            "",
+            "# They arrive by another clock than that of their stamps, as of a simulation, by which they come",
+        ]
+        lines += ["# evenly.", f"step: {period * 1e-9:g}"]
     elif unit := coarse_ns(instants):
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     if by_arrival:

@@ -179,6 +179,13 @@ def coarse_ns(instants: Sequence[NDArray[np.int64]]) -> int | None:
     return unit if line and np.mean(line) >= 0.8 else None
 
 
+def even_ns(stamps: Sequence[NDArray[np.int64]]) -> int | None:
+    """Period of a clock nearly all of whose steps are the same (messages,), ns; None if they are not."""
+    steps = _pooled(stamps, 0)
+    period = int(np.median(steps)) if len(steps) >= _EVEN else 0
+    return period if period > 0 and np.mean(np.abs(steps - period) <= 0.02 * period) >= 0.98 else None
+
+
 def longest_pause(instants: Sequence[NDArray[np.int64]]) -> float | None:
     """Longest step that is no gap of an even clock whose messages come in bursts, s; None if no such clock.
 
