@@ -34,6 +34,7 @@ from uncertain_lti.proposal import init
 from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column, steps_of
 from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
+from uncertain_lti.proposal.members import all_of_them
 from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
 from uncertain_lti.sampling.reading import read_as_fitted
@@ -1202,7 +1203,7 @@ def test_every_signals_file_that_is_written_can_be_read(tmp_path, monkeypatch, m
         set_operating_point(*one)
         remembered = (Remembered(one[recalled][0].name, Memory(kind)),) if kind else ()
         monkeypatch.setattr(init, "choose_memories", lambda *_, found=remembered: (found, 0.5))
-        alike = init._members(*one, {(c.topic, c.path): c for c in [*states, *controls]})
+        alike = all_of_them(*one, {(c.topic, c.path): c for c in [*states, *controls]})
         text = signals_file([SimpleNamespace(path=tmp_path, topics={})], sources, *one, "", init._memories(*one), alike)
         signals = SignalMap.from_dict(yaml.safe_load(text))
         assert len(signals.states) == max(1, len(alike)), text
@@ -1432,6 +1433,69 @@ def test_the_angle_of_a_wheel_is_no_state_beside_its_rate(tmp_path):
     _, proposal = proposed(tmp_path, messages, {"/joint_states": JOINT})
     assert "position[wheel_left_joint]: grows with the way" in proposal.text
     assert "position[steering_wheel]: grows" not in proposal.text
+
+
+POINT = "trajectory_msgs/msg/JointTrajectoryPoint"
+
+
+def commanded(order, of=("positions", "velocities"), coupled=0.0, together=False, named=True):
+    """Joints of an arm that answer an array of commands in another order, and more than one of them may move as one."""
+    rng = np.random.default_rng(3)
+    names, still, empty = ["left", "right", "arm"], message("builtin_interfaces/msg/Duration", sec=0, nanosec=0), []
+    x, v, u, messages = np.zeros(3), np.zeros(3), np.zeros(3), []
+    for k in range(1500):
+        if k % 20 == 0:
+            u = rng.uniform(-1.0, 1.0, 3)
+            u[2] = -0.5 * u[0] if together else u[2]
+        pull = u + coupled * np.array([u[1], 0.0, 0.0])
+        seen = (x, v) if "positions" in of else (v, pull - x)  # speed and current
+        t, seen = at(k), [values + 1e-4 * rng.normal(size=3) for values in seen]
+        if named:
+            state = cdr(JOINT, header=header(t), name=names, position=seen[0], velocity=seen[1], effort=np.empty(0))
+        else:
+            arrays = dict.fromkeys(("positions", "velocities", "accelerations", "effort"), np.array(empty))
+            state = cdr(POINT, **arrays | dict(zip(of, seen, strict=True)), time_from_start=still)
+        messages += [Message("/joint_states", t, state, t), Message("/arm_commands", t, array(u[list(order)]), t)]
+        v = v + 0.02 * (40.0 * (pull - x) - 8.0 * v)
+        x = x + 0.02 * v
+    return messages
+
+
+@pytest.mark.parametrize("together", [False, True])
+def test_the_commands_of_an_array_without_names_are_of_the_joints_that_they_move(tmp_path, together):
+    """As of the forward controllers of ros2_control: all joints were one model, with the strongest states of some."""
+    order = (2, 0, 1)
+    path, proposal = proposed(
+        tmp_path, commanded(order, together=together), {"/joint_states": JOINT, "/arm_commands": ARRAY}
+    )
+    data = yaml.safe_load(proposal.text)
+    assert data["structure"] == "own" and set(proposal.members) == {"left", "right", "arm"}
+    fields = {entry["for"][0]: entry["field"] for entry in data["controls"]}
+    moved = {"arm": 0, "left": 1, "right": 2} if not together else {"left": 0, "arm": 1, "right": 2}  # in their order
+    assert fields == {name: f"data[{k}]" for name, k in moved.items()}
+    model = fitted([path], proposal)
+    joint = [[name.partition("_")[0] for name in names] for names in (model.state_names, model.control_names)]
+    assert len(joint[0]) == 6
+    assert (np.any([model.B, model.dB], axis=0) <= np.equal.outer(*joint)).all()
+
+
+@pytest.mark.parametrize(
+    ("coupled", "of", "own"),
+    [
+        (0.0, ("positions", "velocities"), True),
+        (3.0, ("positions", "velocities"), False),
+        (0.0, ("velocities", "effort"), False),
+    ],
+)
+def test_entries_of_arrays_without_names_are_of_one_joint_if_nothing_else_moves_it(tmp_path, coupled, of, own):
+    """But not where another command moves it more, nor of what is no joint, as it has no angle with its rate."""
+    messages = commanded((0, 1, 2), of, coupled, named=False)
+    _, proposal = proposed(tmp_path, messages, {"/joint_states": POINT, "/arm_commands": ARRAY})
+    data = yaml.safe_load(proposal.text)
+    assert (data.get("structure") == "own") == own, proposal.text
+    if own:
+        assert [e["field"] for e in data["states"]][:2] == ["positions[{}]", "velocities[{}]"]
+        assert [e["field"] for e in data["controls"]] == ["data[{}]"] and data["controls"][0]["for"] == ["0", "1", "2"]
 
 
 @pytest.mark.parametrize(("still", "members"), [("", ("left", "right", "arm")), ("right", ("left", "arm"))])

@@ -50,7 +50,7 @@ class Candidate:
     `state` or `control` for one that a person may well want back; empty for others; `steady`: steady state, recorded
     units; `scale`: scale, recorded units; `delay`: samples by which the states follow a control later; `ignore`: values
     that stand for none; `why`: why it is proposed; empty where its place in the file says it; `judged`: it is a control
-    that is judged as well.
+    that is judged as well; `member`: whose an entry of an array without names is, where its effect says so.
     """
 
     source: Source = field(repr=False)
@@ -66,6 +66,7 @@ class Candidate:
     ignore: tuple[float, ...] = ()
     why: str = ""
     judged: bool = False
+    member: str = ""
 
     @property
     def topic(self) -> str:
@@ -76,7 +77,13 @@ class Candidate:
     def element(self) -> str:
         """Name of the entry it is (`j0` of `position[j0]`), or ""; one in quotes is not told from an index."""
         match = re.search(r'\[([^\[\]"]+)\]$', self.path)
-        return match[1] if match and not match[1].isdigit() else ""
+        return match[1] if match and not match[1].isdigit() else self.member
+
+    @property
+    def shape(self) -> str:
+        """Path with nothing in the place of the entry that it is."""
+        own = f"[{self.element}]"
+        return self.path.replace(own, "[]") if own in self.path else re.sub(r"\[\d+\]", "[]", self.path, count=1)
 
     @property
     def family(self) -> tuple[str, str]:
@@ -167,8 +174,6 @@ class Source:
 
 SHOWS = 20.0
 """F statistic from which on something counts as visible in the next step."""
-
-
 FAINT = 5.0
 """F statistic below which a control counts as visible nowhere."""
 
@@ -185,16 +190,13 @@ class Steps:
     dX: Array
 
     def effects(self) -> Array:
-        """F statistics, in the next step of each state, of the controls together, and of each given the others.
-
-        All from the triangle of [1 X U dX]: what a regressor explains is its coefficient squared over its entry of the
-        inverse Gram matrix. Returns (1 + m, n).
-        """
+        """F statistics, in each state's next step, of all controls and of each given the others. Returns (1 + m, n)."""
         (N, n), m = self.X.shape, self.U.shape[1]
         freedom = N - n - m - 1
         if freedom < 5 or not m:
             return np.zeros((1 + m, n))
         scaled = [values / size_of(values) for values in (self.X, self.U)]
+        # of a triangle: a regressor explains its coefficient squared over its entry of the inverse Gram matrix
         R: Array = np.asarray(np.linalg.qr(np.hstack([np.ones((N, 1)), *scaled, self.dX]), mode="r"))
         own, explained = R[1 + n : 1 + n + m, 1 + n : 1 + n + m], R[1 + n : 1 + n + m, 1 + n + m :]
         full = (R[1 + n + m :, 1 + n + m :] ** 2).sum(axis=0)

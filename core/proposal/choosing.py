@@ -43,10 +43,8 @@ from uncertain_lti.proposal.candidates import (
     most_shown,
     steps_of,
 )
+from uncertain_lti.proposal.members import SHORT_DELAY, one_of_them, pair_entries
 from uncertain_lti.signals.values import TABLE, of_table
-
-SHORT_DELAY = 3
-"""Samples within which a control shows that keeps a state from being noise."""
 
 
 def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
@@ -374,7 +372,10 @@ def choose(
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
-    pool, used = _one_element(drop_copies(pool), used, like)
+    pool = drop_copies(pool)
+    if not all(c.element for c in used):
+        pair_entries(pool, used)
+    pool, used = one_of_them(pool, used, like)
     used = drop_copies(used)
     before = drop_functions(steps_of(pool, used), pool)
     pool, doubt = drop_noise(before, used)
@@ -486,23 +487,6 @@ def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = 
     U, V = np.hsplit(steps.U / size_of(steps.U), 2)
     servo = from_both_ends(steps.X, U, V, steps.dX, np.ones(m, dtype=bool))[0]
     return np.where(servo, most(Steps(steps.X, V, steps.dX)), found)
-
-
-def _one_element(pool: list[Candidate], used: list[Candidate], like: str) -> tuple[list[Candidate], list[Candidate]]:
-    """Where state and command name the same joints, those of the joint whose command shows most."""
-    shared = [e for e in dict.fromkeys(c.element for c in used) if e and any(s.element == e for s in pool)]
-    if len(shared) < 2:
-        return pool, used
-
-    def effect(element: str) -> float:
-        mine, its = ([c for c in group if c.element == element] for group in (pool, used))
-        return most_shown(mine, its)
-
-    best = like if like in shared else max(shared, key=effect)
-    for candidate in [*pool, *used]:
-        if candidate.element != best:
-            candidate.reason = f"of another member than {best}, which does not move as {best} does"
-    return [c for c in pool if not c.reason], [c for c in used if not c.reason]
 
 
 def _strongest(driven: Array, used: list[Candidate], room: _Room) -> list[Candidate]:

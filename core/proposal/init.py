@@ -46,6 +46,7 @@ from uncertain_lti.proposal.candidates import (
     take_switches,
 )
 from uncertain_lti.proposal.choosing import as_too_slow, assign_roles, choose
+from uncertain_lti.proposal.members import all_of_them, moves_per
 from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
     columns_of,
@@ -360,7 +361,7 @@ def _leave_out_places(source: Source) -> None:
     velocities = {m["b"] or m["c"]: c for c, m in found if not m["place"]}
     reason, left = "a place in a fixed frame, where the velocities are the body's", list[Candidate]()
     headed = {c: m for c in source.free if (m := _HEADED.fullmatch(c.path.lower()))}
-    if len(places) == len(velocities) == 2 and not all(_rate_of(places[axis], velocities[axis]) for axis in "xy"):
+    if len(places) == len(velocities) == 2 and not all(moves_per(velocities[axis], places[axis]) for axis in "xy"):
         left = list(places.values())
     elif len(velocities) < 2 and len(source.free) > len(headed):  # more than a pose is measured
         turning = {m["of"] for c, m in headed.items() if not m["place"] and np.ptp(c.finite) > 1.0}  # rad
@@ -368,14 +369,6 @@ def _leave_out_places(source: Source) -> None:
         left = [c for c, m in headed.items() if m["place"] and m["of"] in turning]
     for candidate in left:
         candidate.reason, candidate.ready = reason, "state"
-
-
-def _rate_of(place: Candidate, velocity: Candidate) -> bool:
-    """Whether a place moves in FEWEST rows as its velocity does meanwhile."""
-    move = np.concatenate([values[FEWEST:] - values[:-FEWEST] for values in place.values])
-    speed = np.concatenate([np.convolve(v, np.ones(FEWEST), "valid")[:-1] for v in velocity.values if len(v) > FEWEST])
-    good = np.isfinite(move) & np.isfinite(speed)
-    return bool(np.count_nonzero(good) < FEWEST or np.corrcoef(move[good], speed[good])[0, 1] > 0.9)
 
 
 def _drop_computed(sources: Sequence[Source]) -> None:
@@ -545,7 +538,7 @@ def propose(
         if 0 < len(lacking) < len(bags):
             without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
             warnings.append(f"{without}, so it is no control; leave those recordings out")
-    members = _members(chosen, used, moving)
+    members = all_of_them(chosen, used, moving)
     try:
         memories = _memories(chosen, used)
     except ModuleNotFoundError as error:  # all but this needs no solver
@@ -553,23 +546,6 @@ def propose(
         warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
     text = signals_file(bags, sources, chosen, used, doubt, memories, members, layout)
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
-
-
-def _members(
-    states: Sequence[Candidate], controls: Sequence[Candidate], moving: Mapping[tuple[str, str], Candidate]
-) -> dict[str, list[Candidate]]:
-    """Members in which every number moves that is proposed of one, with these numbers; empty if there is one only."""
-    group = [*states, *controls]
-    one = {c.element for c in group}
-    if len(one) != 1 or "" in one or not controls:
-        return {}
-    (like,) = one
-    found = {}
-    for member in dict.fromkeys(c.element for c in moving.values() if c.element):
-        places = [(c.topic, c.path.replace(f"[{like}]", f"[{member}]")) for c in group]
-        if moving.keys() >= set(places):
-            found[member] = [moving[place] for place in places]
-    return found if len(found) > 1 else {}
 
 
 def _memories(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[str]:

@@ -57,7 +57,7 @@ _UNITS = (
 def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> None:
     """Give every signal a name of its own and a unit."""
     taken: set[str] = set()
-    elements = {c.element for c in states} - {""}
+    elements = {c.element for c in states if not c.element.isdigit()} - {""}
     for group, suffix in ((states, "state"), (controls, "command")):
         kinds = {c.kind for c in group}
         plain = {c: "_".join(_words(c, len(kinds) > 1)) for c in group}
@@ -75,7 +75,7 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
 
 def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     """Words of a name: those of the path that say something, else the topic's last."""
-    if candidate.element:
+    if candidate.element and not candidate.element.isdigit():
         words = [re.sub(r"\W+", "_", candidate.element).strip("_") or "entry"]
         return [*words, *words_of(candidate.kind)] if several_kinds else words
     inner = re.sub(rf"^({OF_QUATERNION})\(.*", r"\1", FieldPath(candidate.path).angle)
@@ -276,7 +276,7 @@ def signals_file(
     if left_out := _left_out(sources, proposed):
         lines += ["", "# Not proposed, and why:", *left_out]
     if members:
-        lines = for_members(lines, states[0].element, list(members))
+        lines = for_members(lines, states[0].element, members)
     elif around:
         lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle is or heads for."]
         lines.append("structure:")
@@ -346,20 +346,34 @@ def _goes_round(candidate: Candidate) -> bool:
     return turn > 0 and max(spans, default=0.0) >= turn / 2
 
 
-def for_members(lines: Sequence[str], one: str, members: Sequence[str]) -> list[str]:
-    """The lines of one member of many alike as templates for all of them."""
-    listed = ", ".join(_quoted(m) for m in members)
+def for_members(lines: Sequence[str], one: str, members: Mapping[str, Sequence[Candidate]]) -> list[str]:
+    """The lines of one member of many alike as templates for all of them, or, where its place differs, for each."""
     found = []
     for line in lines:
         if line.startswith("states:"):
             alike = f"# {len(members)} that are alike: each depends on its own states and controls."
             found += [f"{alike} Shorten the lists to watch fewer.", "structure: own", ""]
-        if (name := re.match(r"  - \{name: ([^,]+),", line)) and f"[{one}]" in line:
-            line = f"  - {{for: [{listed}], name: {_place(name[1], one)}," + line[name.end() :]
-            line = line.replace(f"[{one}]", "[{}]")
-            if not re.search(r'field: "(rate|diff)\(', line):
-                line = re.sub(r"steady: [^,}]+, scale: [^,}]+", "steady: auto, scale: auto", line)
-        found.append(line)
+        name = re.match(r"  - \{name: ([^,]+),", line)
+        at = next(
+            (
+                k
+                for k, c in enumerate(members[one])
+                if name and _in_yaml(c.path) in line and f" {_quoted(c.topic)}," in line
+            ),
+            None,
+        )
+        if name is None or at is None:
+            found.append(line)
+            continue
+        if not re.search(r'field: "(rate|diff)\(', line):
+            line = re.sub(r"steady: [^,}]+, scale: [^,}]+", "steady: auto, scale: auto", line)
+        mine, rest = _in_yaml(members[one][at].path), line[name.end() :]
+        paths = {member: _in_yaml(of[at].path) for member, of in members.items()}
+        place = mine.replace(f"[{one}]", "[{}]")
+        if all(path == place.replace("{}", member) for member, path in paths.items()):
+            paths = {", ".join(map(_quoted, members)): place}
+        for listed, path in paths.items():
+            found.append(f"  - {{for: [{listed}], name: {_place(name[1], one)}," + rest.replace(mine, path))
     return found
 
 
@@ -381,7 +395,7 @@ def _quoted(text: str) -> str:
 def entry(candidate: Candidate, max_hold: float | None = None, comment: str = "", out: bool = False) -> str:
     """Line of a signal."""
     parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
-    parts.append('field: "' + re.sub(r'(["\\])', r"\\\1", candidate.path) + '"')
+    parts.append(f'field: "{_in_yaml(candidate.path)}"')
     parts += [f"steady: {_number(candidate.steady)}", f"scale: {_number(candidate.scale)}"]
     parts += [f"unit: {candidate.unit}"] * bool(candidate.unit)
     parts += [] if max_hold is None else [f"max_hold: {_number(max_hold)}"]
@@ -389,6 +403,10 @@ def entry(candidate: Candidate, max_hold: float | None = None, comment: str = ""
     parts += [f"delay: {candidate.delay}"] * bool(candidate.delay)
     parts += [f"ignore: [{', '.join(_number(v, exact=True) for v in candidate.ignore)}]"] * bool(candidate.ignore)
     return f"  {'# ' * out}- {{{', '.join(parts)}}}" + (f" # {comment}" if comment else "")
+
+
+def _in_yaml(path: str) -> str:
+    return re.sub(r'(["\\])', r"\\\1", path)
 
 
 def _number(value: float, exact: bool = False) -> str:
