@@ -96,3 +96,21 @@ def test_own_leaves_each_state_its_own_signals_and_those_of_none() -> None:
     assert all(model.B[i, i] >= 0 for i in range(3))
     more = fit(with_memories(run, [Remembered("j1", Memory("lag"))]))
     assert np.flatnonzero(more.B[:, -1]).tolist() == [1, 3] and not more.dB[[0, 2], -1].any()
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_joints_that_move_as_one_confound_nothing_where_each_depends_on_its_own(own: bool) -> None:
+    """As of a walking robot, all of whose joints were said to share their effects."""
+    rng = np.random.default_rng(0)
+    u = np.repeat(rng.normal(size=(60, 1)), 10, axis=0)
+    x = np.zeros((len(u), 2))
+    for k in range(len(u) - 1):
+        x[k + 1] = 0.9 * x[k] + 0.1 * u[k] + 0.01 * rng.normal(size=2)
+    signals = {
+        "states": [{"for": ["a", "b"], "name": "{}", "topic": "/x", "field": "{}"}],
+        "controls": [{"for": ["a", "b"], "name": "{}_command", "topic": "/u", "field": "{}"}],
+    } | ({"structure": "own"} if own else {})
+    transient = Transient(0.02 * np.arange(len(u)), x, np.hstack([u, u]), signals=SignalMap.from_dict(signals))
+    model = fit(transient, additive="noise")
+    said = [m for m in model.fit_summary["messages"] if "'a_command' and 'b_command' move together" in m]
+    assert bool(said) is not own and model.fit_summary["rank"] == 3

@@ -12,8 +12,9 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
+from itertools import repeat
 from operator import itemgetter
 
 import numpy as np
@@ -39,6 +40,7 @@ from uncertain_lti.identification.evidence import (
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.structure import EVERY, Rows, rows_of
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.clock import longest_pause
@@ -80,7 +82,7 @@ _REMEDIES = (  # words of a message on the state, or on any signal; what narrows
 )
 
 
-def _rank(problem: Fleet | Problem, sums: Moments, names: Sequence[str]) -> tuple[int, list[str]]:
+def _rank(problem: Fleet | Problem, sums: Moments, names: Sequence[str], rows: Rows) -> tuple[int, list[str]]:
     """Rank of the nominal regressors and, in words, which columns make it deficient."""
     names = [*names, "the disturbance c"] if problem.columns.drift else list(names)
     dead = sums.phi_scale == 0
@@ -92,23 +94,24 @@ def _rank(problem: Fleet | Problem, sums: Moments, names: Sequence[str]) -> tupl
             f"machine moving it, or leave it out"
         )
     free = np.flatnonzero(~dead)
-    values, _ = _directions(sums, free)
     limit = 1e-12 * len(free)
-    moving = np.flatnonzero(~dead & ~still)
-    for value, vector in zip(*[a.T for a in _directions(sums, moving)], strict=True):
+    for columns, value, vector in _directions(sums, np.flatnonzero(~dead & ~still), rows):
         if value <= limit:
-            part = [names[moving[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
+            part = [names[columns[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
             messages.append(
                 f"rank deficient: {quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
-    return int(np.count_nonzero(values > limit)), list(dict.fromkeys(messages))
+    return sum(value > limit for _, value, _ in _directions(sums, free)), list(dict.fromkeys(messages))
 
 
-def _directions(sums: Moments, columns: NDArray[np.intp]) -> tuple[Array, Array]:
-    """Eigenvalues and eigenvectors of the correlation of some regressors."""
-    unit = 1.0 / sums.phi_scale[columns]
-    return np.linalg.eigh(sums.centre[np.ix_(columns, columns)] * np.outer(unit, unit) / sums.count)
+def _directions(sums: Moments, of: NDArray[np.intp], rows: Rows = EVERY) -> Iterator[tuple[list[int], float, Array]]:
+    """Eigenvalues and eigenvectors of the correlation of some regressors, of those that come together in a row each."""
+    for row in rows:
+        own = of[(of >= len(row)) | row[np.minimum(of, len(row) - 1)]]
+        unit = 1.0 / sums.phi_scale[own]
+        values, vectors = np.linalg.eigh(sums.centre[np.ix_(own, own)] * np.outer(unit, unit) / sums.count)
+        yield from zip(repeat(own.tolist()), values.tolist(), vectors.T, strict=False)
 
 
 def describe(
@@ -129,14 +132,14 @@ def describe(
     scheduled, problem = problem, replace(problem, columns=replace(problem.columns, regimes=None))
     regimes_said = _tied(model, scheduled, sums) + _beyond_knots(model, scheduled)
     sums = sums.one_block()
-    rank, messages = _rank(problem, sums, names)
+    rank, messages = _rank(problem, sums, names, rows := rows_of(model))
     apart = not messages
     coded = [*_coded(problem, sums, signals), *_wrapped(problem, signals, transients)]
     messages = [*coded, *_bursting(model, transients), *messages, *regimes_said]
     if not coded:  # the envelope is fitted to the jumps, and what follows would be about them
         part, past = _stretches(problem), lagged_states(signals, model.n)
         messages += _carried(few, discarded, problem, names, transients)
-        alike = _collinear(problem, sums, names, past)
+        alike = _collinear(problem, sums, names, past, rows)
         noisy, late, held = _noise_like(part), _delayed(part, signals, past), _held(part, signals)
         messages += [*alike, *late, *held, *jittering(model, part, names), *_frozen(part, names, transients)]
         lacking = {} if late else _missing(part, signals)
@@ -158,8 +161,8 @@ def of_sums(model: UncertainLTI, fleet: Fleet | Problem, sums: Moments, mean_wid
     """`describe` of what sums alone show, where the transitions are not at hand together."""
     signals = (*model.signals.states, *model.signals.controls)
     names, tied, sums = [s.name for s in signals], _tied(model, fleet, sums), sums.one_block()
-    rank, messages = _rank(fleet, sums, names)
-    messages += [*tied, *_collinear(fleet, sums, names, lagged_states(signals, model.n))]
+    rank, messages = _rank(fleet, sums, names, rows := rows_of(model))
+    messages += [*tied, *_collinear(fleet, sums, names, lagged_states(signals, model.n), rows)]
     return rank, messages + _wide(sums, mean_width, names, not fleet.columns.names)
 
 
@@ -207,13 +210,14 @@ def _beyond_knots(model: UncertainLTI, problem: Problem) -> list[str]:
     return messages
 
 
-def _collinear(problem: Fleet | Problem, sums: Moments, names: Sequence[str], past: Collection[int]) -> list[str]:
+def _collinear(
+    problem: Fleet | Problem, sums: Moments, names: Sequence[str], past: Collection[int], rows: Rows
+) -> list[str]:
     """Signals that nearly move together, and the recording that would separate them."""
-    free = np.flatnonzero(sums.phi_scale[: problem.p] > 0)
-    free = free[~np.isin(free, list(past))]
+    free = np.flatnonzero((sums.phi_scale[: problem.p] > 0) & ~np.isin(range(problem.p), list(past)))
     found: dict[str, str] = {}  # several combinations may be of the same signals
-    for value, vector in zip(*[a.T for a in _directions(sums, free)], strict=True):
-        part = [int(free[j]) for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
+    for columns, value, vector in sorted(_directions(sums, free, rows), key=itemgetter(1)):
+        part = [columns[j] for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
         if not 1e-12 * problem.p < value < COLLINEAR or len(part) < 2:
             continue
         states, controls = [names[j] for j in part if j < problem.n], [names[j] for j in part if j >= problem.n]

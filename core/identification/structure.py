@@ -23,8 +23,22 @@ from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, NOMINAL, SHAPES, TERMS
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 _KEYS = {"state", "from", "nominal", "half_width", "knot", "shared"}
+
+
+Rows = NDArray[np.bool_]
+EVERY = np.ones((1, 1), dtype=bool)
+"""Rows that have all of [x; u], however many they are."""
+
+
+def rows_of(model: UncertainLTI) -> Rows:
+    """Which of [x; u] the rows of a model have, each set once: what its structure keeps apart confounds no row."""
+    if not model.signals.structure:
+        return EVERY
+    has = np.concatenate([np.abs(model.A) + model.dA, np.abs(model.B) + model.dB], axis=-1) > 0
+    return np.unique(has.reshape(-1, model.n, model.n + model.m).any(axis=0), axis=0)
 
 
 class Structure:
