@@ -22,7 +22,7 @@ from uncertain_lti import EnvelopeMonitor, Transient
 from uncertain_lti.base.errors import FitError, ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import assemble
-from uncertain_lti.identification.horizon_fit import better_run, fit_horizons, run_of
+from uncertain_lti.identification.optimum import better_run, fit_horizons, run_of
 from uncertain_lti.identification.problem import Regimes
 from uncertain_lti.identification.regimes import Modes
 from uncertain_lti.model.horizon import Run

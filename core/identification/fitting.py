@@ -28,9 +28,8 @@ from uncertain_lti.identification.assembly import assemble, median_step
 from uncertain_lti.identification.diagnosis import describe, of_sums
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
-from uncertain_lti.identification.horizon_fit import better_run, fit_horizons
 from uncertain_lti.identification.memory import Recording, elements_of, remembered
-from uncertain_lti.identification.optimum import optimum
+from uncertain_lti.identification.optimum import better_run, fit_horizons, optimum
 from uncertain_lti.identification.passes import Judged
 from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of

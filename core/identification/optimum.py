@@ -7,28 +7,44 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""The optimum of a criterion over all transitions, lifted until the verdict's own arithmetic finds none outside."""
+"""The optimum of a criterion over all transitions, lifted until the verdict's own arithmetic finds none outside.
+
+Of an envelope over several steps the transitions are windows: h transitions in a row give one of step T from x_k with
+the mean control ū; the state at its end is counted from x̂, the run of the model or of the least squares of its
+elements. What is unknown is linear again, so working set, proof and repair are those of one step.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import LARGEST, Array, one_thread_each
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
+from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Envelope, Judged
-from uncertain_lti.identification.problem import Problem, solve_as_written
+from uncertain_lti.identification.problem import Columns, Problem, Regimes, solve_as_written
 from uncertain_lti.identification.programmes import GOOD
+from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import Solution, WorkingSet
+from uncertain_lti.model.horizon import Horizon, Run, Widths
+from uncertain_lti.model.uncertain_lti import UncertainLTI
 
 E = TypeVar("E", bound=Envelope)
 
 _EPS = float(np.finfo(np.float64).eps)
 _ROUNDS = 40
+_UNKNOWN = frozenset({"c", "v"})
+_COMPARED = 20_000  # transitions, about, on which two runs are compared
+_ROUNDING = 1e-12  # a smaller distance is none
+_LOOKED_AT = 100_000  # windows, about, that mean and covariance of the residuals are taken from
+WIDER = 1.1
+"""An envelope whose mean half-width is this many times the largest move of a state over as many steps is useless: that
+the state stays where it is, give or take what it ever moved, says more."""
 
 
 def repair(
@@ -175,3 +191,144 @@ def _as_written(engine: WorkingSet, criterion: str) -> Solution:
     theta, d, objective = solve_as_written(problem, criterion)
     solver = "cvxpy with OSQP" if criterion == "qp" else "cvxpy with HiGHS"
     return Solution(theta, d, engine.violation(theta, d), objective if criterion == "lp" else None, solvers={solver})
+
+
+def run_of(problem: Problem, structure: Structure | None = None) -> Run:
+    """The least squares of the elements of a model, one step ahead."""
+    rows = WorkingSet(Fleet.of(problem), structure).rows
+    for row in rows:
+        row.start()
+    theta, d = (np.column_stack([getattr(row, name) for row in rows]) for name in ("theta", "d"))
+    found = problem.columns.arrays(theta, d)
+    return Run(found["A"], found["B"], found.get("c", np.zeros(found["A"].shape[:-1])))
+
+
+@one_thread_each()
+def better_run(model: UncertainLTI, problem: Problem, steps: Sequence[int], structure: Structure | None) -> Run | None:
+    """What is to be run over the windows: the least squares of one step where nearer than the model, which is None.
+
+    Compared is the largest distance of a window's end from the run with a linear correction, which is what widths are
+    made of: its geometric mean over horizons and states. Of many transitions, pieces of the recordings are looked at.
+    """
+    lengths = sorted(set(steps))
+    k, signals = problem.order, _signals(problem)
+    dt, after = problem.dt, problem.x_next
+    piece = max(20 * lengths[-1], 1000)
+    if len(dt) > _COMPARED:
+        starts = np.linspace(0, len(dt) - piece, max(_COMPARED // piece, 1)).astype(np.intp)
+        some = np.unique((starts[:, None] + np.arange(piece)).ravel())
+        k, signals, dt, after = k[some], signals[:, some], dt[some], after[:, some]
+
+    def distance(which: UncertainLTI) -> float:
+        logs = []
+        for windows in which.windows(k, signals, dt, lengths):
+            left = (after[:, windows.last] - windows.run).T
+            if not np.isfinite(left).all():
+                return np.inf
+            phi = np.vstack([windows.z[: problem.p], np.ones(len(left))]).T
+            left = left - phi @ np.linalg.lstsq(phi, left, rcond=None)[0]
+            logs.append(np.log(np.maximum(np.abs(left).max(axis=0, initial=0.0), _ROUNDING)))
+        return float(np.mean(logs)) if logs else 0.0
+
+    run = run_of(problem, structure)
+    return run if distance(model.replace(run=run)) < distance(model) else None
+
+
+def _signals(problem: Problem) -> Array:
+    """[x; u; s] of the transitions, one column for each."""
+    return problem.z if problem.s is None else np.vstack([problem.z, problem.s])
+
+
+@one_thread_each()
+def fit_horizons(
+    model: UncertainLTI,
+    problem: Problem,
+    steps: Sequence[int],
+    widths: Widths | Mapping[int, Widths] = "growing",
+    criterion: str = "qp",
+    progress: Callable[[str], None] | None = None,
+) -> tuple[tuple[Horizon, ...], list[dict[str, Any]], list[str], set[str]]:
+    """Envelopes of a fitted model over several steps: with facts of each, what was left out, and solvers."""
+    solvers: set[str] = set()
+    found: list[Horizon] = []
+    facts: list[dict[str, Any]] = []
+    messages: list[str] = []
+    p = problem.p
+    axes = 0 if model.schedule is None else len(model.schedule.axes)
+    regimes = None if model.schedule is None else Regimes(model.schedule, tuple(range(p, p + axes)))
+    columns = Columns(_UNKNOWN, regimes)
+    lengths = sorted(set(steps))
+    for windows in model.windows(problem.order, _signals(problem), problem.dt, lengths):
+        if progress is not None:
+            progress(f"horizon of {windows.steps} steps: {plural(len(windows.start), 'window')}")
+        few = 2 * (p + 1) * columns.count
+        if len(windows.start) < few:
+            messages.append(
+                f"no horizon of {windows.steps} steps: {plural(len(windows.start), 'window')} of so many transitions "
+                f"in a row, and {few} are needed; give shorter horizons, or longer recordings"
+            )
+            continue
+        largest = np.maximum(windows.run.max(axis=1), -windows.run.min(axis=1))
+        if not (largest <= LARGEST).all():
+            name = model.state_names[int(np.argmax(~(largest <= LARGEST)))]
+            messages.append(
+                f"no horizon of {windows.steps} steps: the nominal model runs away, '{name}' beyond all numbers; give "
+                f"shorter horizons"
+            )
+            continue
+        last = windows.last
+        unbroken = len(last) == int(last[-1]) - int(last[0]) + 1
+        part = Problem(
+            windows.z[:p],
+            problem.x_next[:, int(last[0]) : int(last[-1]) + 1] if unbroken else problem.x_next[:, last],
+            windows.time,
+            problem.weights if problem.weights.ndim == 1 else problem.weights[last],
+            windows.z[p:] if axes else None,
+            windows.run,
+            source=problem.source[windows.start],
+            k=problem.k[windows.start],
+            columns=columns,
+        )
+        kind = widths[windows.steps] if isinstance(widths, Mapping) else widths
+        horizon, fact = _fitted(model, part, windows.steps, kind, criterion, largest)
+        solvers |= fact.pop("solvers")
+        move = part.largest_moves()
+        if (0.5 * fact["mean_width"] > WIDER * move).all():
+            messages.append(
+                f"no horizon of {windows.steps} steps: its envelope is wider than if every state stayed where it was "
+                f"(half-widths x {float((0.5 * fact['mean_width'] / np.maximum(move, 1e-300)).min()):.3g} of the "
+                f"largest move, or more): the nominal model runs away over so many steps; give shorter horizons"
+            )
+            continue
+        found.append(horizon)
+        facts.append(fact)
+    return tuple(found), facts, messages, solvers
+
+
+def _fitted(
+    model: UncertainLTI, part: Problem, steps: int, widths: Widths, criterion: str, largest: Array
+) -> tuple[Horizon, dict[str, Any]]:
+    """One horizon."""
+    n, m = part.n, part.p - part.n
+    constant = Structure(n, m, fixed={"dA": np.zeros((n, n)), "dB": np.zeros((n, m))})
+    engine = WorkingSet(Fleet.of(part), constant if widths == "constant" else None)
+
+    def build(theta: Array, d: Array) -> Horizon:
+        return Horizon(steps, **part.columns.arrays(theta, d), widths=widths)
+
+    try:
+        found = optimum(engine, criterion, build, model.state_names, sizes=largest)
+    except FitError as error:
+        raise FitError(f"horizon of {steps} steps: {error}") from None
+    some = part if part.N <= 2 * _LOOKED_AT else part.subset(slice(None, None, part.N // _LOOKED_AT))
+    fleet = Fleet.of(some)
+    residuals = fleet.residuals(found.envelope, fleet.judge(found.envelope), own_law=False)
+    return found.envelope.with_residuals(residuals), {
+        "solvers": found.solution.solvers,
+        "steps": steps,
+        "seconds": float(np.median(part.dt)),
+        "widths": widths,
+        "windows": part.N,
+        **found.widths(model.operating_point.X),
+        **found.reached(),
+    }
