@@ -428,22 +428,18 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
         if still.mean() > 0.5:  # held, quantised, or at rest most of the time
             continue
         still[1:] &= problem.source[1:] == problem.source[:-1]
-        for start, stop in runs(still):
-            if stop - start < FROZEN:
-                continue
+        for start, stop in (run for run in runs(still) if run[1] - run[0] >= FROZEN):
             moving = (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
             moving[i] = False
             if moving.any() and low[i] < problem.z.T[start, i] < high[i]:
                 where, other = _where(problem, [start], transients), names[int(np.argmax(moving))]
                 found.append((stop - start, names[i], f"({where}) while '{other}' moves"))
                 break
-    if not found:
-        return []
-    most, name, when = max(found)
+    most, name, when = max(found, default=(0, "", ""))
     others = [f"'{other}' for {count}" for count, other, _ in found if other != name]
     also = f", and so does {shortlist(others, 4)}" * bool(others)
     advice = "a frozen sensor? Leave that stretch out, or the envelope will take it for healthy"
-    return [f"'{name}' stands at exactly one value for {most} samples {when}{also}: {advice}"]
+    return [f"'{name}' stands at exactly one value for {most} samples {when}{also}: {advice}"] * bool(found)
 
 
 def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int]) -> list[str]:

@@ -32,11 +32,7 @@ Waiting = tuple[str, int, bytes]
 
 
 def arrival_of(received_ns: int, taken_ns: int, before_ns: int) -> int:
-    """When a message arrived, ns: as the middleware received it, in the order in which it gave messages.
-
-    `received_ns`: by the middleware; 0 if it does not say; `taken_ns`: when this process took it, which may have been
-    busy; `before_ns`: of the message before.
-    """
+    """When a message arrived, ns: as the middleware received it, if it says; not before the message before."""
     if not 0 < received_ns <= taken_ns:
         received_ns = taken_ns
     return before_ns if received_ns < before_ns <= taken_ns else received_ns

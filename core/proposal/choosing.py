@@ -466,10 +466,9 @@ def _driven_more(source: Source, faster: Sequence[Source], used: Sequence[Candid
 
 
 def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
-    """How clearly all controls, and each, show in the next step of each candidate, at the delay at which they do most.
+    """How clearly all controls, and each, show in each candidate's next step (1 + m, n), at the delay at which most.
 
     It may be none: a servo carries a command out before the next message, which is the first to hold it.
-    Returns (1 + m, n).
     """
     m = len(used)
     found = np.zeros((1 + m, len(pool)))
@@ -499,9 +498,8 @@ def _strongest(driven: Array, used: list[Candidate], room: _Room) -> list[Candid
 def _steered(pool: list[Candidate], room: _Room, driven: Array) -> list[Candidate]:
     """Of a body's pose those in which some control shows most: all of its numbers are coupled by geometry.
 
-    A place adds up what the attitude did, so that the attitude goes before where the controls show in it at all. A
-    control counts for what it shows in at least half as clearly as where it shows most: of an aeroplane each surface
-    turns another axis. `driven` (1 + m, n): of all controls, and of each.
+    A place adds up what the attitude did, so that the attitude goes before where the controls show in it at all. Of
+    each control what it shows in half as clearly as where it shows most counts. `driven` (1 + m, n): as of `_driven`.
     """
     angles = [i for i, c in enumerate(pool) if "(" in c.path and driven[0, i] > FAINT]
     among, least = (angles, FAINT) if angles else (list(range(len(pool))), SHOWS)

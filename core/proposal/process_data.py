@@ -140,8 +140,7 @@ def _held_for(candidate: Candidate) -> int:
 def _set_or_analysed(measured: Sequence[Candidate]) -> list[Candidate]:
     """Of columns that hold each value for some rows those that are set; the others, which an analyser holds, go.
 
-    A set value shows in the next rows of what is measured, of which none tells before what it will be. Columns that
-    hold as long are of one analyser, unless most of them are set: a controller acts on some of what an analyser says.
+    A set value shows in the next rows, and nothing tells it before; of columns that hold as long most decide for all.
     """
     held = {c: rows for c in measured if (rows := _held_for(c))}
     rest, found = [c for c in measured if c not in held and np.ptp(c.finite) > 0], []

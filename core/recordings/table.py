@@ -447,10 +447,9 @@ def _goes_on(column: Column) -> bool:
 
 
 def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[str, str, dict[str, NDArray[np.intp]]]:
-    """The column that names the signal of each row's one number, as historians and logs of a bus write it, and that.
+    """The column that names the signal of each row's one number, as historians write it, that, and each name's rows.
 
-    And the rows of each name. Few names change from row to row, or the time begins anew with each, where the column is
-    called so. Nothing for other tables, whose rows have several numbers or none.
+    Few names change from row to row, or the time begins anew with each. Nothing for other tables.
     """
     numbers = [name for name, column in columns.items() if column.dtype.kind in "iuf" and column.ndim == 1]
     texts = [name for name, column in columns.items() if column.dtype.kind == "O"]

@@ -261,11 +261,7 @@ def _validation_reasons(model: UncertainLTI, validation: Mapping[str, Any] | Non
 
 
 def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> Reasons:
-    """Bounds about as wide as what the state does contain everything, and say nothing.
-
-    Widths and ranges are those of the fit, as the fit itself prints them; of a model that does not say them, those of
-    the recordings at hand: the least share, as a recording in which a state hardly moves says nothing.
-    """
+    """Bounds about as wide as what the state does say nothing; widths are of the fit, else of what is at hand."""
     span = (model.domain.x_max - model.domain.x_min).tolist()
     widths = numbers_of(model.fit_summary.get("mean_width"), model.n) or [math.nan] * model.n
     of = zip(model.state_names, widths, span, strict=True)
