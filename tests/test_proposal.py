@@ -1442,8 +1442,9 @@ def commanded(order, of=("positions", "velocities"), coupled=0.0, together=False
     """Joints of an arm that answer an array of commands in another order, and more than one of them may move as one."""
     rng = np.random.default_rng(3)
     names, still, empty = ["left", "right", "arm"], message("builtin_interfaces/msg/Duration", sec=0, nanosec=0), []
-    x, v, u, messages = np.zeros(3), np.zeros(3), np.zeros(3), []
+    x, v, u, messages, body = np.zeros(3), np.zeros(3), np.zeros(3), [], 0.0
     for k in range(1500):
+        body += 0.05 * (u.sum() - body) + 1e-3 * float(rng.normal())
         if k % 20 == 0:
             u = rng.uniform(-1.0, 1.0, 3)
             u[2] = -0.5 * u[0] if together else u[2]
@@ -1452,6 +1453,7 @@ def commanded(order, of=("positions", "velocities"), coupled=0.0, together=False
         t, seen = at(k), [values + 1e-4 * rng.normal(size=3) for values in seen]
         if named:
             state = cdr(JOINT, header=header(t), name=names, position=seen[0], velocity=seen[1], effort=np.empty(0))
+            messages += [f64("/gyro", t, body)]
         else:
             arrays = dict.fromkeys(("positions", "velocities", "accelerations", "effort"), np.array(empty))
             state = cdr(POINT, **arrays | dict(zip(of, seen, strict=True)), time_from_start=still)
@@ -1470,6 +1472,8 @@ def test_the_commands_of_an_array_without_names_are_of_the_joints_that_they_move
     )
     data = yaml.safe_load(proposal.text)
     assert data["structure"] == "own" and set(proposal.members) == {"left", "right", "arm"}
+    (told,) = (w for w in proposal.warnings if "nothing watches" in w)
+    assert told.startswith("/gyro is of none of the members, such as ") and told.endswith("--states /gyro")
     fields = {entry["for"][0]: entry["field"] for entry in data["controls"]}
     moved = {"arm": 0, "left": 1, "right": 2} if not together else {"left": 0, "arm": 1, "right": 2}  # in their order
     assert fields == {name: f"data[{k}]" for name, k in moved.items()}

@@ -119,7 +119,7 @@ class Source:
     can be used; `offset`: median of log time less header stamp, s; None without a stamp; `arrival` (messages,): log
     times per recording, ns; `stamp` (messages,): header stamps per recording, ns; negative for none; `candidates`: its
     numbers; `reason`: why none of them is proposed; empty otherwise; `halting`: its header stamps mostly repeat the one
-    before, or are not in every recording; `unreadable`: its messages cannot be read; `slower`: than the states.
+    before, or are not in every recording; `unreadable`: its messages cannot be read; `apart`: why no state is.
     """
 
     topic: str
@@ -133,7 +133,7 @@ class Source:
     reason: str = ""
     halting: bool = False
     unreadable: bool = False
-    slower: bool = False
+    apart: str = ""
 
     @property
     def count(self) -> int:

@@ -368,7 +368,7 @@ def choose(
         source.reason = "the controls do not show in it"
         if source in shown:
             source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
-            source.slower = True
+            source.apart = "slower than the states"
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
@@ -401,12 +401,15 @@ def choose(
     return keep, doubt
 
 
-def as_too_slow(sources: Sequence[Source]) -> list[str]:
-    """What is said of topics that no model watches as they are slower than the others."""
-    slower = [s.topic for s in sources if s.slower]
-    said = f"{shortlist(slower, 3)} {'is' if len(slower) == 1 else 'are'} slower than the states, so nothing watches"
-    remedy = f"for a second model `init` the same recordings with --states {' '.join(slower)}"
-    return [f"{said} {'it' if len(slower) == 1 else 'them'}; {remedy}"] * bool(slower)
+def as_unwatched(sources: Sequence[Source]) -> list[str]:
+    """What is said of topics of the machine of which no state is, as they are slower or of none of its members."""
+    found = []
+    for why in dict.fromkeys(s.apart for s in sources if s.apart):
+        topics = [s.topic for s in sources if s.apart == why]
+        verb, them = ("is", "it") if len(topics) == 1 else ("are", "them")
+        remedy = f"for a second model `init` the same recordings with --states {' '.join(topics)}"
+        found.append(f"{shortlist(topics, 3)} {verb} {why}, so nothing watches {them}; {remedy}")
+    return found
 
 
 def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:

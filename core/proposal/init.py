@@ -45,7 +45,7 @@ from uncertain_lti.proposal.candidates import (
     set_aside_labels,
     take_switches,
 )
-from uncertain_lti.proposal.choosing import as_too_slow, assign_roles, choose
+from uncertain_lti.proposal.choosing import as_unwatched, assign_roles, choose
 from uncertain_lti.proposal.members import all_of_them, moves_per
 from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
@@ -529,7 +529,7 @@ def propose(
     set_operating_point([c for c in chosen if c not in levels] or chosen, used)
     for candidate in [*ready, *levels]:
         set_own_scale(candidate)
-    warnings += [*[doubt] * bool(doubt), *as_too_slow(sources)]
+    warnings += [*[doubt] * bool(doubt), *as_unwatched(sources)]
     if not commands:
         unread = (s for s in sources if s.role == "control" and s.unreadable)
         warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]

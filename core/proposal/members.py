@@ -134,7 +134,11 @@ def one_of_them(pool: list[Candidate], used: list[Candidate], like: str) -> tupl
             other = f"another member than {best}, which does not move as {best} does"
             alone = f"none of the members, such as {best}, each of which is judged by its own numbers alone"
             candidate.reason = f"of {other if candidate.element else alone}"
-    return [c for c in pool if not c.reason], [c for c in used if not c.reason]
+    kept = [c for c in pool if not c.reason]
+    for candidate in pool:
+        if not candidate.element and all(c.source is not candidate.source for c in kept):
+            candidate.source.apart = f"of none of the members, such as {best}"
+    return kept, [c for c in used if not c.reason]
 
 
 def all_of_them(
