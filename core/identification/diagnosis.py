@@ -402,9 +402,7 @@ def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> li
 def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     """States that repeat their last value between samples of a slower topic."""
     messages = []
-    if len(successive(problem)) < 0.5 * problem.N:
-        return []
-    for i, signal in enumerate(signals[: problem.n]):
+    for i, signal in enumerate(signals[: problem.n] if len(successive(problem)) >= 0.5 * problem.N else ()):
         before, after = problem.z[i], problem.x_next[i]
         if rows := held_for(before, after):
             alone = len({other.topic for other in signals}) == 1
@@ -429,9 +427,9 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
             continue
         still[1:] &= problem.source[1:] == problem.source[:-1]
         for start, stop in (run for run in runs(still) if run[1] - run[0] >= FROZEN):
-            moving = (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread) & (spread > 0)
-            moving[i] = False
-            if moving.any() and low[i] < problem.z.T[start, i] < high[i]:
+            others = (spread > 0) & (np.arange(problem.p) != i)
+            moving = others & (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread)
+            if moving.any() and low[i] < problem.z[i, start] < high[i]:
                 where, other = _where(problem, [start], transients), names[int(np.argmax(moving))]
                 found.append((stop - start, names[i], f"({where}) while '{other}' moves"))
                 break
@@ -444,12 +442,15 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
 
 def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int]) -> list[str]:
     """Controls that explain the states better when taken some samples earlier."""
+    found: dict[tuple[int, int], dict[int, float]] = {}
+    for j, (best, share) in late_controls(problem, past).items():
+        if share >= 0.005:  # of many states, of which few follow it, less may be sure
+            found.setdefault((best, signals[problem.n + j].delay + best), {})[problem.n + j] = share
     return [
-        f"the states follow control '{signals[problem.n + j].name}' better when it is taken {plural(best, 'sample')} "
-        f"earlier (the unexplained part of a step falls by {share:.0%}): try "
-        f"`delay: {signals[problem.n + j].delay + best}` for it in the signals file"
-        for j, (best, share) in late_controls(problem, past).items()
-        if share >= 0.005  # of many states, of which few follow it, less may be sure
+        f"the states follow {_controls(of, [s.name for s in signals])} better when it is taken "
+        f"{plural(best, 'sample')} earlier (the unexplained part of a step falls by {max(of.values()):.0%}): try "
+        f"`delay: {delay}` for it in the signals file"
+        for (best, delay), of in found.items()
     ]
 
 
