@@ -32,6 +32,7 @@ from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, arrival_of
+from uncertain_lti.monitor.snapshot import BACK_NS
 from uncertain_lti.recordings.mcap_writer import McapWriter
 from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
 from uncertain_lti_ros.topics import CLOCK, POLL, MatchedSubscription, SimulatedTime, definition
@@ -40,7 +41,6 @@ _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
 _LONGEST = 6.0  # s that messages wait for others that were held up
 _CLOCK = 60.0  # s later than ever: no message was on its way for so long, a clock was set
-_BACK_NS = 10**9  # /clock went back by more: what follows would lie among what was recorded
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -185,7 +185,8 @@ class _InOrder:
         """Take one message, as the middleware gives it."""
         now, taken_ns = time.monotonic(), time.time_ns()
         log_ns = arrival_of(received_ns, taken_ns, self._logged_ns) if self.clock is None else self.clock()
-        if self.clock is not None and log_ns < self._logged_ns - _BACK_NS and not self.back:
+        # what follows would lie among what was recorded
+        if self.clock is not None and log_ns < self._logged_ns - BACK_NS and not self.back:
             to = f"from {self._logged_ns * 1e-9:.9g} to {log_ns * 1e-9:.9g} s"
             self.back = f"{CLOCK} went back {to}, so the recording ends there; record what follows to another file"
         if self.back or log_ns <= 0:  # no time has come on /clock

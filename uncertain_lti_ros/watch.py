@@ -38,6 +38,7 @@ from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.outputs import NODE
+from uncertain_lti.monitor.snapshot import BACK_NS
 from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
 from uncertain_lti_ros.process import living, seconds
 from uncertain_lti_ros.recorder import resolved_name
@@ -46,7 +47,6 @@ from uncertain_lti_ros.topics import stamp_ns
 _EVERY = 1000  # ms between two looks of the page
 _MOST = 100_000  # samples kept
 _SILENT = 2.0  # s without a message from which on the page says so
-_PASS = 10**9  # ns that stamps step back at least where a recording is played again
 _BEHIND = 200  # samples back at most to that of which a number is
 
 
@@ -137,7 +137,7 @@ class Watched:
             said, heard, reason = self._said, self._heard, self._reason
             statistic_names, (t_ns, *rows) = said.statistic_names, said.rows()
         shown = t_ns >= t_ns[-1:] - self._window * 1e9
-        shown[: max(np.flatnonzero(np.diff(t_ns) < -_PASS), default=-1) + 1] = False  # of the pass before, in a loop
+        shown[: max(np.flatnonzero(np.diff(t_ns) < -BACK_NS), default=-1) + 1] = False  # of the pass before, in a loop
         alarm, flags, utilisation, statistics = (row[shown] for row in rows)
         t = (t_ns[shown] - t_ns[-1:]) * 1e-9
         quiet, gone = time.monotonic() - heard, ""

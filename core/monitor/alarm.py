@@ -41,9 +41,8 @@ class Raised:
 
     `label`: of the rule, as of `alarm_rule.labels`; `kind`: of the rule; `horizon`: of the rule, in steps; `state`: the
     state; of a joint statistic the one that it points to, see `Statistic`, if there is one; empty where no state of
-    this verdict is to blame; `value`: the statistic over its threshold, with its sign; 1 of
-    containment; `span`: the window of the rule in words, if another rule of its kind and horizon has to be told from
-    it.
+    this verdict is to blame; `value`: the statistic over its threshold, with its sign; 1 of containment; `span`: the
+    window of the rule in words, if another rule of its kind and horizon has to be told from it.
     """
 
     label: str
@@ -54,16 +53,24 @@ class Raised:
     span: str = ""
 
     @property
-    def words(self) -> str:
-        """`energy of fan_speed over 40 steps at 1.3 times its threshold`, for example."""
+    def what(self) -> str:
+        """`energy of fan_speed over 40 steps`, for example."""
         state = f" of {self.state}" if self.state else ""
         if self.kind in JOINT:
             state = " of all states" + f" (points to {self.state})" * bool(self.state)
         over = f" over {self.horizon} steps" if self.horizon > 1 else ""
-        what = f"{self.kind}{state}{over}" + f" ({self.span})" * bool(self.span)
-        size = abs(self.value)
-        digits = 3 if abs(size - 1.0) >= 0.005 else 6  # none that rounds to the threshold
-        return what if self.kind == "containment" else f"{what} at {size:.{digits}g} times its threshold"
+        return f"{self.kind}{state}{over}" + f" ({self.span})" * bool(self.span)
+
+    @property
+    def words(self) -> str:
+        """What it is, and at how many times its threshold."""
+        return self.what + ("" if self.kind == "containment" else f" at {times_text(self.value)} times its threshold")
+
+
+def times_text(value: float) -> str:
+    """A statistic over its threshold; none is rounded to the threshold."""
+    size = abs(value)
+    return f"{size:.{3 if abs(size - 1.0) >= 0.005 else 6}g}"
 
 
 class Nearest(NamedTuple):

@@ -30,7 +30,7 @@ from uncertain_lti.recordings.mcap_writer import McapWriter
 
 _OVERHEAD = 800  # bytes that one kept message takes besides its data, a verdict on it included
 _PER_STATE = 200  # and for each state of a verdict
-_BACK_NS = 10**9  # of a clock that begins anew
+BACK_NS = 10**9  # a clock that goes back by more begins anew, as where a recording is played again
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,8 +66,8 @@ class Recent:
     def add(self, entry: Entry) -> None:
         """Keep one more; of what came before its clock went back the last values alone."""
         entries = self._entries
-        if entries and entry.arrival_ns < entries[-1].arrival_ns - _BACK_NS:  # log times of a file never do
-            last, at_ns = {old.topic: old for old in self.entries()}, max(0, entry.arrival_ns - _BACK_NS)
+        if entries and entry.arrival_ns < entries[-1].arrival_ns - BACK_NS:  # log times of a file never do
+            last, at_ns = {old.topic: old for old in self.entries()}, max(0, entry.arrival_ns - BACK_NS)
             self.clear()
             self._before = {topic: replace(old, arrival_ns=at_ns, verdicts=()) for topic, old in last.items()}
         entries.append(entry)

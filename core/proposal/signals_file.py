@@ -349,26 +349,25 @@ def _goes_round(candidate: Candidate) -> bool:
 def for_members(lines: Sequence[str], one: str, members: Mapping[str, Sequence[Candidate]]) -> list[str]:
     """The lines of one member of many alike as templates for all of them, or, where its place differs, for each."""
     found = []
+
+    def number_in_each(line: str) -> list[Candidate]:
+        for k, own in enumerate(members[one]):
+            if _in_yaml(own.path) in line and f" {_quoted(own.topic)}," in line:
+                return [of[k] for of in members.values()]
+        return []
+
     for line in lines:
         if line.startswith("states:"):
             alike = f"# {len(members)} that are alike: each depends on its own states and controls."
             found += [f"{alike} Shorten the lists to watch fewer.", "structure: own", ""]
         name = re.match(r"  - \{name: ([^,]+),", line)
-        at = next(
-            (
-                k
-                for k, c in enumerate(members[one])
-                if name and _in_yaml(c.path) in line and f" {_quoted(c.topic)}," in line
-            ),
-            None,
-        )
-        if name is None or at is None:
+        if name is None or not (of := number_in_each(line)):
             found.append(line)
             continue
         if not re.search(r'field: "(rate|diff)\(', line):
             line = re.sub(r"steady: [^,}]+, scale: [^,}]+", "steady: auto, scale: auto", line)
-        mine, rest = _in_yaml(members[one][at].path), line[name.end() :]
-        paths = {member: _in_yaml(of[at].path) for member, of in members.items()}
+        paths = {member: _in_yaml(candidate.path) for member, candidate in zip(members, of, strict=True)}
+        mine, rest = paths[one], line[name.end() :]
         place = mine.replace(f"[{one}]", "[{}]")
         if all(path == place.replace("{}", member) for member, path in paths.items()):
             paths = {", ".join(map(_quoted, members)): place}

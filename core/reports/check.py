@@ -40,7 +40,7 @@ from uncertain_lti.model.domain import STRANGE, jump_words, jumps, outside_in_wo
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Raised, back_and_restarts
+from uncertain_lti.monitor.alarm import Raised, back_and_restarts, times_text
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import NUMBERS, Verdicts
@@ -58,6 +58,7 @@ APART = 10
 """Verdicts without a violation that end an episode."""
 MOST_EPISODES, MOST_EXPLAINED = 1000, 100
 """Episodes, and patterns of alarms, in the data."""
+_TOGETHER = 1000  # samples whose verdicts are made into plain data at once
 MOST_SHOWN = 5
 """Frozen repeats, patterns and rules that the text names."""
 _REMEDIES = {
@@ -140,8 +141,10 @@ def _jitter(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
 
 def _farthest(verdicts: Verdicts) -> dict[str, Any] | None:
     """Where the alarm's statistics came nearest to their thresholds, or farthest beyond; None where it has none."""
-    found = verdicts.alarms.farthest(verdicts.statistics)
-    return None if found is None else {**_instant(verdicts.transient, found[0]), **_raised(found[1])}
+    found = verdicts.alarms.farthest(verdicts.statistics) if verdicts.statistic_names else None
+    if found is None:
+        return None
+    return {**_instant(verdicts.transient, found[0]), **_raised(found[1]), "what": found[1].what}
 
 
 def _raised(r: Raised) -> dict[str, Any]:
@@ -315,8 +318,8 @@ class PerSample:
         return self._of(slice(k, k + 1))[0]
 
     def __iter__(self) -> Iterator[dict[str, Any]]:
-        for k in range(0, len(self), MOST_EPISODES):
-            yield from self._of(slice(k, k + MOST_EPISODES))
+        for k in range(0, len(self), _TOGETHER):
+            yield from self._of(slice(k, k + _TOGETHER))
 
     def _of(self, on: slice) -> list[dict[str, Any]]:
         verdicts = self._verdicts
@@ -558,11 +561,9 @@ def overview(recordings: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     for r in recordings:
         first = instant_text(r["alarms"][0]) if r["alarms"] else "-"
-        of, _, size = (r["farthest"] or {"words": ""})["words"].partition(" at ")
+        size, of = (times_text(far["value"]), far["what"]) if (far := r["farthest"]) else ("", "")
         came = "ALARM" if r["alarm"] else "UNKNOWN" if r["reason"] else "no alarm"
-        rows.append(
-            [r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size.partition(" ")[0], of]
-        )
+        rows.append([r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size, of])
     header = ("recording", "outcome", "first alarm", "largest", "times the threshold of")
     return Table(header, rows, left=(1, 4), most=1000)
 

@@ -200,8 +200,7 @@ class Panel:
     ten times, the threshold above twice the median size, or that alone brings chi2 to its threshold, recorded units;
     `figure`: what ways to fit are compared by, the geometric mean over the states of the lasting offset that the energy
     over a window shows; `evidence`: what all of it follows from; `unlike`: names of left-out stretches that the others
-    do not cover; `asked`: rate that was asked for; `residuals`: of the model, in the form that the joint rules take;
-    `names`: of what was left out, where they are known.
+    do not cover; `asked`: rate asked for; `residuals`: as the joint rules take them; `names`: of what was left out.
     """
 
     rules: tuple[Rule, ...]
