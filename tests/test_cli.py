@@ -332,21 +332,23 @@ def test_a_quiet_recording_says_how_near_to_an_alarm_it_came():
 
 
 def test_the_longest_alarm_is_told_beside_the_first():
-    """What raised the first, of a moment, is not what matters."""
+    """What raised the first, of a moment, is not what matters, nor how far it was beyond its threshold there."""
     x = np.zeros((300, 2))
-    x[20:, 0] = 1.0  # a step of one verdict, and later a ramp
+    x[20:, 0] = 1.0  # a step of one verdict, and later a ramp with a step in it
     x[100:140, 1] = np.arange(1.0, 41.0)
     x[140:, 1] = 40.0
+    x[120:, 1] += 1.0
     rule = StatisticRule("energy", 0.0, 1.5)
     model = UncertainLTI(
         np.zeros((2, 2)), np.zeros((2, 0)), np.zeros((2, 2)), np.zeros((2, 0)), v=[0.5, 0.5], alarm=[rule]
     )
     verdicts = EnvelopeMonitor(model).check(Transient(np.arange(300.0), x, np.zeros((300, 0))))
-    first, by, longest, by_then = check_text(check_data(model, verdicts)).splitlines()[-4:]
+    first, by, longest, by_then, most = check_text(check_data(model, verdicts)).splitlines()[-5:]
     assert first == "ALARM: raised 2 times, first at 20.0000 s for one verdict" and by.startswith(
         "  raised by energy of x1"
     )
     assert longest == "  the longest at 100.0000 s for 39 s" and by_then.startswith("  raised by energy of x2")
+    assert most == "  the largest: energy of x2 at 10.7 times its threshold, at 120.0000 s"
 
 
 def test_a_model_is_written_over_with_force_alone(folder, cli):

@@ -554,7 +554,8 @@ def test_reports_name_what_is_frozen(model: UncertainLTI, tmp_path: Path) -> Non
     assert any(said.endswith(" frozen") for said in data["no_verdict"])
     assert data["verdict_per_sample"][340]["status"] == "frozen" and data["verdict_per_sample"][340]["alarm"]
     line = "FROZEN: position repeats exactly for 1.49 s (at most 0.99 s in the fit) from 2.0000 s, told after "
-    assert line in check_text(data)
+    assert line in check_text(data) and data["alarms"][0]["frozen"] == ["position"]
+    assert "  raised by a frozen position" in check_text(data).splitlines()
     facts = findings(model, "m", checked)
     assert facts["alarm"] and " frozen: position repeats exactly for 1.49 s" in facts["happened"][0]["text"]
     assert line in html_report(model, checked, facts)

@@ -106,7 +106,11 @@ def check_data(model: UncertainLTI, verdicts: Verdicts, samples: bool = True) ->
         "horizons": _horizons(model, verdicts),
         "alarm": bool(verdicts.alarm.any()),
         "alarms": [
-            {**_span(transient, start, stop), "raised": [_raised(r) for r in verdicts.raised(start)]}
+            {
+                **_span(transient, start, stop),
+                "raised": [_raised(r) for r in verdicts.raised(start)],
+                "frozen": [name for name, held in zip(model.state_names, verdicts.frozen[start], strict=True) if held],
+            }
             for start, stop in runs(verdicts.alarm)
         ],
         "farthest": _farthest(verdicts),
@@ -142,9 +146,7 @@ def _jitter(model: UncertainLTI, verdicts: Verdicts) -> list[str]:
 def _farthest(verdicts: Verdicts) -> dict[str, Any] | None:
     """Where the alarm's statistics came nearest to their thresholds, or farthest beyond; None where it has none."""
     found = verdicts.alarms.farthest(verdicts.statistics) if verdicts.statistic_names else None
-    if found is None:
-        return None
-    return {**_instant(verdicts.transient, found[0]), **_raised(found[1]), "what": found[1].what}
+    return found and {**_instant(verdicts.transient, found[0]), **_raised(found[1]), "what": found[1].what}
 
 
 def _raised(r: Raised) -> dict[str, Any]:
@@ -544,10 +546,13 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     told = [f"the alarm from {instant_text(like)} {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
     if alarms := data["alarms"]:
-        first, longest_alarm = alarms[0], max(alarms, key=lambda alarm: alarm["seconds"])
-        blocks += [f"ALARM: raised {times(len(alarms))}, first at {_when(first)}", *_raised_by(first)]
-        if longest_alarm is not first:
-            blocks += [f"  the longest at {_when(longest_alarm)}", *_raised_by(longest_alarm)]
+        longest_alarm = max(alarms, key=lambda alarm: alarm["seconds"])
+        heads = [(f"ALARM: raised {times(len(alarms))}, first at", alarms[0]), ("  the longest at", longest_alarm)]
+        for head, alarm in heads[: 1 + (longest_alarm is not alarms[0])]:
+            by = ", ".join(raised_by(alarm)[:MOST_SHOWN])
+            blocks += [f"{head} {_when(alarm)}", *[f"  raised by {by}"] * bool(by)]
+        if (far := data["farthest"]) and far["k"] not in {alarm["k"] for _, alarm in heads}:
+            blocks.append(f"  the largest: {far['words']}, at {instant_text(far)}")
         blocks += [f"  {text}, and fit again" for text in data["jitter"]]
     elif data["verdicts"]:
         near = data["farthest"]
@@ -586,12 +591,8 @@ def instant_text(instant: Mapping[str, Any], form: str = ".4f") -> str:
 def raised_by(alarm: Mapping[str, Any]) -> list[str]:
     """What raised it, farthest beyond its threshold first; none where containment alone did."""
     by = [r for r in alarm["raised"] if r["rule"] != "containment"]
-    return [r["words"] for r in sorted(by, key=lambda r: -abs(r["value"]))]
-
-
-def _raised_by(alarm: Mapping[str, Any]) -> list[str]:
-    by = raised_by(alarm)
-    return [f"  raised by {', '.join(by[:MOST_SHOWN])}"] * bool(by)
+    words = [r["words"] for r in sorted(by, key=lambda r: -abs(r["value"]))]
+    return words + [f"a frozen {name}" for name in alarm["frozen"]]
 
 
 def _first(lines: list[str], word: str) -> list[str]:

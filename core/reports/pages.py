@@ -34,13 +34,13 @@ from markupsafe import Markup, escape
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, written
-from uncertain_lti.base.text import Block, Table, beyond, number, plural, share, shortened, shortlist
+from uncertain_lti.base.text import Block, Table, beyond, number, plural, shortened, shortlist
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Spans
-from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks
+from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, overview
 from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
 from uncertain_lti.reports.model_text import model_blocks, validation_blocks
 from uncertain_lti.sampling.transient import Transient
@@ -194,19 +194,13 @@ def _episodes(data: Mapping[str, Any]) -> Table:
 
 
 def _what_happened(recordings: Sequence[Mapping[str, Any]], drawn: Sequence[int]) -> list[Any]:
-    blocks: list[Any] = []
+    named = [{**r, "recording": charts.base_name(r["recording"])} for r in recordings]
+    blocks: list[Any] = [("All recordings",), overview(named)] if len(named) > 1 else []
     for r in (recordings[i] for i in drawn):
         blocks += [(charts.base_name(r["recording"]),), *check_blocks(r), *r["notes"][:5]]
         if r["episodes"]:
             apart = f"violations with fewer than {APART} verdicts between them"
             blocks += [f"{plural(r['episode_count'], 'episode')} ({apart}):", _episodes(r)]
-    if len(recordings) > 1:
-        rows = []
-        for r in recordings:
-            counts = [str(r[key]) for key in ("verdicts", "violated", "episode_count")]
-            rows.append([charts.base_name(r["recording"]), *counts, share(r["inside"]), r["outcome"]])
-        header = ("recording", "verdicts", "violated", "episodes", "inside", "outcome")
-        blocks += [("All recordings",), Table(header, rows, most=200)]
     return blocks
 
 
