@@ -256,6 +256,7 @@ def test_log_times_are_those_of_a_simulated_clock_until_it_goes_back(world: Worl
     wall = recorder(world, ["/state"], tmp_path / "wall.mcap")
     wall.says("note: log times are not those of /clock; --use-sim-time takes")
     world.subscribed(clock, *pair)
+    process.says("nothing is recorded before a time comes on /clock; is the simulation paused?")
     for second in (None, 5, 6, 6, 4):  # before the first tick it is no time
         if second is not None:
             clock.publish(Clock(clock=Time(sec=second)))

@@ -39,6 +39,7 @@ from uncertain_lti_ros.topics import CLOCK, POLL, MatchedSubscription, Simulated
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
 _LOOK = 0.5  # s between two looks at the graph
+_PAUSED = 2.0  # s without a tick of /clock
 _LONGEST = 6.0  # s that messages wait for others that were held up
 _CLOCK = 60.0  # s later than ever: no message was on its way for so long, a clock was set
 
@@ -135,12 +136,16 @@ def _record(
     life: Life, subscriptions: list[MatchedSubscription], file: _File, taken: _InOrder, duration: float | None,
     step: Callable[[str], None], note: Callable[..., None],
 ) -> None:  # fmt: skip
+    patient = time.monotonic() + _PAUSED
+
     def look() -> None:
         for subscription in subscriptions:
             subscription.look()
             note(*subscription.problems)
         if taken.clock is None and life.node.count_publishers(CLOCK):
             note(f"log times are not those of {CLOCK}; --use-sim-time takes them from it")
+        if taken.clock is not None and not taken.clock() and time.monotonic() >= patient:
+            note(f"nothing is recorded before a time comes on {CLOCK}; is the simulation paused?")
 
     def poll() -> None:
         taken.release()
