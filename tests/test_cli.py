@@ -11,6 +11,7 @@
 
 import json
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -54,6 +55,17 @@ def test_check_tells_when_and_how_long(folder, cli):
     # an alarm rule of the command line in place of the model's: 250 of 250 never comes true
     rule = ["--violations", "250", "--window", "250"]
     assert main(["check", str(folder / "m.model.json"), str(bad), *rule]) == 0
+
+
+def test_check_ends_with_how_to_take_a_healthy_recording_into_the_model(folder, tmp_path, cli):
+    model = shutil.copy(folder / "m.model.json", tmp_path / "m.model.json")
+    last = cli("check", model, folder / "bad.mcap", status=1).out.splitlines()[-1]
+    said, _, command = last.partition("uncertain-lti ")
+    assert said == "if the machine was healthy: "
+    cli(*shlex.split(command))
+    assert "healthy" not in cli("check", model, folder / "bad.mcap").out
+    UncertainLTI.load(model).replace(memory=None).save(model)
+    assert "healthy" not in cli("check", model, folder / "bad.mcap", "--margin", "0.5", status=1).out, "it keeps nothing"
 
 
 @pytest.mark.parametrize("after", [1, 6])

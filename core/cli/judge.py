@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -175,6 +176,10 @@ def check(options: argparse.Namespace) -> Result:
     drift = drift_in_words(model, results)
     for text in drift:
         options.say(text)
+    loud = [shlex.quote(r["recording"]) for r in results if r["alarm"] and not r["reason"]]
+    if loud and model.memory and not deployed.words():
+        name, those = shlex.quote(options.model), " ".join(loud[:3]) + " ..." * (len(loud) > 3)
+        options.say(f"if the machine was healthy: uncertain-lti fit --update {name} --output {name} --force {those}")
     of_all = "unknown" if status == BAD_INPUT else outcome(results)
     ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
     about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **ended}
