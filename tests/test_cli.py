@@ -65,7 +65,9 @@ def test_check_ends_with_how_to_take_a_healthy_recording_into_the_model(folder, 
     cli(*shlex.split(command))
     assert "healthy" not in cli("check", model, folder / "bad.mcap").out
     UncertainLTI.load(model).replace(memory=None).save(model)
-    assert "healthy" not in cli("check", model, folder / "bad.mcap", "--margin", "0.5", status=1).out, "it keeps nothing"
+    assert "healthy" not in cli("check", model, folder / "bad.mcap", "--margin", "0.5", status=1).out, (
+        "it keeps nothing"
+    )
 
 
 @pytest.mark.parametrize("after", [1, 6])

@@ -63,6 +63,11 @@ _YEAR_FIRST = re.compile(r"(\d{4})([-/.])(\d{1,2})\2(\d{1,2})(?:[T,\s]+(\d{1,2})
 _DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
 _COMPACT = re.compile(r"((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
+_ZONES = dict(
+    UTC="Z", CET="+01:00", CEST="+02:00", MEZ="+01:00", MESZ="+02:00", BST="+01:00", JST="+09:00", EST="-05:00",
+    EDT="-04:00", CST="-06:00", CDT="-05:00", MST="-07:00", MDT="-06:00", PST="-08:00", PDT="-07:00",
+)  # fmt: skip
+_ZONE = re.compile(rf"(?<=\S)\s+([+-]\d\d:?\d\d|{'|'.join(_ZONES)})$")  # as .NET, Python and date(1) write it
 _LARGEST_ZONE = 14  # hours
 _CALENDARS = (20_000, 80_000, 25_569), (690_000, 800_000, 719_529)  # days of these decades: Excel, MATLAB; 1970-01-01
 _HARDLY = 1e-4  # s from row to row, below which numbers such as days of a spreadsheet hardly are s
@@ -361,8 +366,8 @@ def _spelt(text: str) -> str:
         return text.replace(".", ":")
     if _ISO.match(text) or _CLOCK.match(text):
         return text
-    zone = found[1] if (found := re.search(r"\s([+-]\d\d:?\d\d)$", text)) else ""  # as .NET writes it
-    text = text.removesuffix(zone).rstrip()
+    zone = found[1] if (found := _ZONE.search(re.sub(r"\s([A-Z]{3,4})\s(\d{4})$", r" \2 \1", text))) else ""
+    text, zone = found.string[: found.start()] if found else text, _ZONES.get(zone, zone)
     if half := _HALF.fullmatch(text):
         day, hour, minutes, seconds, letter = half.groups("00")
         of = int(hour) % 12 + 12 * (letter in "Pp") if int(hour) <= 12 else int(hour)
@@ -380,7 +385,8 @@ def _spelt(text: str) -> str:
         year, _, month, day, hour, minutes, rest = dated.groups()
         clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
         text = f"{year}-{int(month):02}-{int(day):02}{clock}"
-    return re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda gmt: gmt[1] or "Z", text) + zone  # as browsers write it
+    text = re.sub(r"\s+GMT([+-]\d{4})?(\s\(.*\))?$", lambda gmt: gmt[1] or "Z", text)  # as browsers write it
+    return text if _CLOCK.match(text) else text + zone
 
 
 def _unit(name: str, values: Column, stated: str = "") -> str:
