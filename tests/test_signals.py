@@ -288,7 +288,7 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
         ("sensor_msgs/msg/JointState", "roll(position[0])", "wants a quaternion with x, y, z, w"),
         ("sensor_msgs/msg/JointState", "norm(position[0])", "wants a vector with x, y, z or an array of numbers"),
         ("geometry_msgs/msg/Polygon", "norm(points)", "wants a vector"),
-        ("std_msgs/msg/Float64MultiArray", "data[fan]", "needs an array of strings called 'name' in the same message"),
+        ("std_msgs/msg/Float64MultiArray", "data[fan]", "needs an array of strings called 'name' or 'joint_names' in the same message"),
         ("std_msgs/msg/Float64MultiArray", "data[1:3]", "give an index instead, for example \\[0\\]"),
         ("geometry_msgs/msg/Twist", "twist.linear.x", "no 'twist' in geometry_msgs/msg/Twist; .*: linear.x, linear.y"),
         ("sensor_msgs/msg/Imu", "orientation_covariance[9]", "index 9 is past the end of an array of 9"),

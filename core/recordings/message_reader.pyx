@@ -28,7 +28,7 @@ from libc.stdint cimport int8_t, int16_t, int32_t, int64_t, uint8_t, uint16_t, u
 from libc.string cimport memchr, memcmp, memcpy
 
 from uncertain_lti.base.errors import SignalError
-from uncertain_lti.signals.field_path import FieldType
+from uncertain_lti.signals.field_path import FieldType, names_in
 
 CODES = {
     "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
@@ -90,12 +90,13 @@ cdef class _Node:
     `array`: -1 for a single value, 0 for a sequence, n for n elements; `fields`: of a message; `element`: of an array
     of messages that nobody wants; `slot`: where a single number goes; `indexed, named`: wanted elements by position or
     by name, each with its slot or node; `every`: where the place of an array goes that is wanted as a whole;
-    `name_at`: which field of a message holds the names; `ahead`: that field stands behind what it names.
+    `name_at`: which field of a message holds the names; `ahead`: that field stands behind what it names; `asks`:
+    something in it is looked up by names that stand outside of it.
     """
 
     cdef int kind, code
     cdef Py_ssize_t size, array, slot, every, name_at
-    cdef bint ahead
+    cdef bint ahead, asks
     cdef list fields, indexed, named
     cdef _Node element
 
@@ -248,6 +249,7 @@ cdef class Plan:
                 if "\ufffd" in key:  # in its place there may be anything that is no text
                     self.able = False
                 node.named.append((key.encode(errors="surrogatepass"), what))
+            node.asks |= how == "name" or (node.kind == MESSAGE and (<_Node>what).asks)
 
     def inside(self, _Node node, fields, wants):
         """What is wanted of the fields of a message."""
@@ -259,12 +261,12 @@ cdef class Plan:
             else:
                 for position, name in enumerate(self.functions[number].takes.parts(fields)):
                     groups.setdefault(name, []).append(((), number, position))
-        named = -1  # the first field whose elements are looked up by name
+        named, own = -1, names_in(fields)  # the first field in which something is looked up by name
         for name, kind in fields.items():
             child = self.node(kind, groups.get(name, []))
-            if name == "name":
+            if name == own:
                 node.name_at = len(node.fields)
-            elif child.named and named < 0:
+            elif child.asks and named < 0:
                 named = len(node.fields)
             together = _together(node.fields[len(node.fields) - 1], child) if node.fields else None
             if together is not None:
@@ -273,6 +275,7 @@ cdef class Plan:
         if named < 0:
             node.name_at = -1
         node.ahead = node.name_at > named
+        node.asks = named >= 0 and node.name_at < 0
 
     # --- one message ----------------------------------------------------------------------------------------
 
@@ -283,14 +286,15 @@ cdef class Plan:
         self.big = data[1] == 0
         self.data, self.size, self.at = data + ENCAPSULATION, size - ENCAPSULATION, 0
         self.reserved, self.untrue, self.met = 0, False, not self.named
-        if not self.message(self.top):
+        if not self.message(self.top, -1, 0):
             return CUT
         if self.size - self.at > PADDING + self.reserved:
             return LONGER + self.size - self.at
         return UNTRUE if self.untrue else WHOLE if self.met else STRANGE
 
-    cdef bint message(self, _Node node) except? False:
-        cdef Py_ssize_t names = -1, number = 0, at = self.at, reserved = self.reserved, position
+    cdef bint message(self, _Node node, Py_ssize_t names, Py_ssize_t number) except? False:
+        """Fill what is wanted of a message; `names`, `number`: where the names of one around it begin, how many."""
+        cdef Py_ssize_t at = self.at, reserved = self.reserved, position
         if not node.fields:
             self.at += 1  # an empty message is one byte long
             return self.at <= self.size
@@ -331,7 +335,7 @@ cdef class Plan:
         if count < 0:
             return False
         if node.kind == MESSAGE:
-            return self.message(node) if node.array < 0 else self.messages(node, count, names, number)
+            return self.message(node, names, number) if node.array < 0 else self.messages(node, count, names, number)
         if node.kind == TEXT:
             for i in range(count):
                 length = self.length()
@@ -378,9 +382,9 @@ cdef class Plan:
             for index, what in wanted:
                 if index == i:
                     self.at, self.reserved, met = at, reserved, True
-                    if not self.message(<_Node>what):
+                    if not self.message(<_Node>what, names, number):
                         return False
-            if not met and not self.message(node.element):
+            if not met and not self.message(node.element, -1, 0):
                 return False
         return True
 

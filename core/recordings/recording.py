@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import Definition, RawMessage
-from uncertain_lti.signals.field_path import FieldPath, TypeFields, has_names, signal_paths
+from uncertain_lti.signals.field_path import FieldPath, TypeFields, names_in, signal_paths
 
 DATED_NS = 10**17
 """Since 1970, from which on a time is one of a calendar, and not of a run."""
@@ -179,7 +179,7 @@ def topic_facts(topics: Mapping[str, TopicInfo], messages: Iterable[RawMessage])
         if definition.reason:
             continue
         if seen.longest is None:
-            seen.most = _FIRST * has_names(definition.fields, definition.type_name)
+            seen.most = _FIRST * bool(names_in(definition.fields(definition.type_name)))
         if seen.longest is None or len(raw.data) > len(seen.longest.data):
             seen.longest = raw
         if len(seen.first) < seen.most:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Literal, NamedTuple
@@ -216,8 +216,8 @@ _STEP = re.compile(
 class FieldPath:
     """One scalar of a message: `a.b[3]`, `position[fan]`, `yaw(pose.orientation)`, `unwrap(...)`, `lag(..., 1)`.
 
-    Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` array of the message that
-    holds the array (as in sensor_msgs/JointState), `["3"]` a name that looks like an index. Derived: roll,
+    Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` or `joint_names` of the message
+    that holds the array, or of one around it (JointState, JointTrajectory), `["3"]` a name like an index. Derived: roll,
     pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle in rad
     or of a stated turn (`unwrap(heading, 360)`), and, outermost, lag(field, k), diff(field) and rate(field) of earlier
     samples (the sampler does these two, as it knows where a stream restarts).
@@ -303,12 +303,14 @@ class FieldPath:
 
     def _look_up(self, message: Any) -> tuple[Any, tuple[str, str | int, list[str]] | None]:
         """The value; or the array that lacks an entry, with its name, the key and the names of the message."""
-        value, parent, name = message, message, ""
+        value, named, name = message, [], ""
         for kind, key in self.steps:
             if kind == "attribute":
-                parent, value, name = value, getattr(value, str(key)), str(key)
+                own = (getattr(value, of, "") for of in _NAMES)
+                named = next((one for one in own if not isinstance(one, str)), named)
+                value, name = getattr(value, str(key)), str(key)
                 continue
-            names = [str(one) for one in parent.name] if kind == "name" else []
+            names = [str(one) for one in named] if kind == "name" else []
             index = int(key) if kind == "index" else names.index(str(key)) if key in names else len(value)
             if index >= len(value):
                 return value, (name, key, names)
@@ -319,7 +321,7 @@ class FieldPath:
         """Check the path against a message type."""
         here = f"field '{self.text}' of {topic} ({type_name})"
         current: FieldType = FieldType("message", type_name)
-        parent: Mapping[str, FieldType] = {}
+        named = False
         for kind, key in self.steps:
             if kind == "attribute":
                 if current.array is not None:
@@ -332,14 +334,14 @@ class FieldPath:
                         f"{here}: there is no '{key}' in {current.type_name}{meant(key, parent)}; fields there: "
                         f"{', '.join(parent) or 'none'}; {_instead(topic, type_name, type_fields)}"
                     )
-                current = parent[str(key)]
+                current, named = parent[str(key)], named or names_in(parent) != ""
                 continue
             if current.array is None:
                 raise SignalError(f"{here}: '[{key}]' follows something that is not an array; leave it out")
             if kind == "index" and current.array and int(key) >= current.array:
                 raise SignalError(f"{here}: index {key} is past the end of an array of {current.array}")
-            if kind == "name" and not _are_names(parent.get("name")):
-                needs = "needs an array of strings called 'name' in the same message"
+            if kind == "name" and not named:
+                needs = f"needs an array of strings called {' or '.join(map(repr, _NAMES))} in the same message"
                 raise SignalError(f"{here}: '[{key}]' {needs}; give an index instead, for example [0]")
             current = replace(current, array=None)
         self._check_leaf(here, current, type_name, topic, type_fields)
@@ -384,14 +386,21 @@ def numeric_paths(type_name: str, type_fields: TypeFields, depth: int = 6) -> It
 
 
 def signal_paths(
-    type_fields: TypeFields, type_name: str, message: Any, before: str = "", depth: int = _DEPTH
+    type_fields: TypeFields,
+    type_name: str,
+    message: Any,
+    before: str = "",
+    depth: int = _DEPTH,
+    around: Sequence[str] = (),
 ) -> Iterator[str]:
     """Paths in a decoded message that can be signals, as `FieldPath` reads them; header stamps are left out.
 
     The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as
-    `position[fan]` each where the message names them; a quaternion is also offered as roll(...) and the like.
+    `position[fan]` each where the message, or the one `around` it, names them; a quaternion is also offered as
+    roll(...) and the like.
     """
     fields = type_fields(type_name)
+    names = _names(fields, message, around)
     for name, field in fields.items():
         if field.type_name in _NO_SIGNALS or depth == 0:
             continue
@@ -401,39 +410,45 @@ def signal_paths(
                 continue
             every = f"{path}[0..{len(value) - 1}]" if len(value) > 1 else f"{path}[0]"
             if field.kind == "message":
-                yield from _inside(type_fields, field, value[0], every, depth)
+                yield from _inside(type_fields, field, value[0], every, depth, names)
             elif field.kind in ("number", "bool"):
                 if name in QUATERNION_ARRAYS and field.kind == "number" and field.array == len(QUATERNION.array):
                     yield from (f"{function}({path})" for function in of_quaternion())
-                names = _names(type_fields, type_name, message) if field.kind == "number" else []
-                yield from [f"{path}[{n}]" for n in names] if len(names) == len(value) else [every]
+                by_name = field.kind == "number" and len(names) == len(value)
+                yield from [f"{path}[{n}]" for n in names] if by_name else [every]
         elif field.kind == "message":
-            yield from _inside(type_fields, field, value, path, depth)
+            yield from _inside(type_fields, field, value, path, depth, names)
         elif field.kind in ("number", "bool"):
             yield path
 
 
-def _inside(type_fields: TypeFields, field: FieldType, value: Any, path: str, depth: int) -> Iterator[str]:
+def _inside(
+    type_fields: TypeFields, field: FieldType, value: Any, path: str, depth: int, around: Sequence[str]
+) -> Iterator[str]:
     inner = type_fields(field.type_name)
     if set(inner) == set("xyzw") and all(part.kind == "number" for part in inner.values()):
         yield from (f"{name}({path})" for name in of_quaternion())
-    yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1)
+    yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1, around)
 
 
-def has_names(type_fields: TypeFields, type_name: str) -> bool:
-    """Whether messages of a type name the entries of their arrays, as a JointState does."""
-    return _are_names(type_fields(type_name).get("name"))
+_NAMES = ("name", "joint_names")
+"""Fields that name the entries of the arrays beside them, and of those in the messages there."""
 
 
-def _are_names(field: FieldType | None) -> bool:
-    return field is not None and field.kind == "string" and field.array is not None
+def names_in(fields: Mapping[str, FieldType]) -> str:
+    """Which field of a message names the entries of its arrays; empty if none does."""
+    return next((name for name in _NAMES if name in fields and _are_texts(fields[name])), "")
 
 
-def _names(type_fields: TypeFields, type_name: str, message: Any) -> list[str]:
-    """Entries of a message's own `name` array, quoted where they would read as an index; [] without a usable one."""
-    if not has_names(type_fields, type_name):
-        return []
-    names = [str(name) for name in message.name]
+def _are_texts(field: FieldType) -> bool:
+    return field.kind == "string" and field.array is not None
+
+
+def _names(fields: Mapping[str, FieldType], message: Any, around: Sequence[str]) -> Sequence[str]:
+    """Names of the entries of a message's arrays, quoted where they would read as an index; [] without usable ones."""
+    if not (own := names_in(fields)):
+        return [] if any(map(_are_texts, fields.values())) else around  # others are of something else
+    names = [str(name) for name in getattr(message, own)]
     if len(set(names)) < len(names) or len(names) > _MOST_NAMES or any('"' in n or not n.strip() for n in names):
         return []
     return [f'"{n}"' if n.strip().isdigit() or n != n.strip() or "[" in n or "]" in n else n for n in names]
