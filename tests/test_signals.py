@@ -96,7 +96,13 @@ ODOMETRY = {
 POSES = {"poses": [{"position": {"x": 7.0}}, {"position": {"x": 8.0}, "orientation": QUARTER}]}
 LAYOUT = {"layout": {"dim": [{"label": "x", "size": 3, "stride": 3}], "data_offset": 2}, "data": [3.0, -4.0, 12.0]}
 
+TRAJECTORY = {"joint_names": ["tilt", "pan"], "points": [{"positions": [0.5, -1.5]}, {"positions": [1.0, 2.0]}]}
+
 READ = [
+    ("trajectory_msgs/msg/JointTrajectory", TRAJECTORY, "points[0].positions[pan]", -1.5),
+    ("trajectory_msgs/msg/JointTrajectory", TRAJECTORY, "points[1].positions[tilt]", 1.0),
+    ("trajectory_msgs/msg/JointTrajectory", TRAJECTORY, "points[1].positions[roll]", NAN),
+    ("trajectory_msgs/msg/JointTrajectory", TRAJECTORY, "points[1].velocities[pan]", NAN),
     ("sensor_msgs/msg/JointState", JOINTS, "position[fan]", 1.5),
     ("sensor_msgs/msg/JointState", JOINTS, " position[ core ] ", -2.0),
     ("sensor_msgs/msg/JointState", JOINTS, "position[3]", 4.0),
@@ -288,7 +294,11 @@ def test_any_text_is_a_path_or_a_signal_error(text: str) -> None:
         ("sensor_msgs/msg/JointState", "roll(position[0])", "wants a quaternion with x, y, z, w"),
         ("sensor_msgs/msg/JointState", "norm(position[0])", "wants a vector with x, y, z or an array of numbers"),
         ("geometry_msgs/msg/Polygon", "norm(points)", "wants a vector"),
-        ("std_msgs/msg/Float64MultiArray", "data[fan]", "needs an array of strings called 'name' or 'joint_names' in the same message"),
+        (
+            "std_msgs/msg/Float64MultiArray",
+            "data[fan]",
+            "needs an array of strings called 'name' or 'joint_names' in the same message",
+        ),
         ("std_msgs/msg/Float64MultiArray", "data[1:3]", "give an index instead, for example \\[0\\]"),
         ("geometry_msgs/msg/Twist", "twist.linear.x", "no 'twist' in geometry_msgs/msg/Twist; .*: linear.x, linear.y"),
         ("sensor_msgs/msg/Imu", "orientation_covariance[9]", "index 9 is past the end of an array of 9"),

@@ -39,7 +39,7 @@ cdef enum:
     ENCAPSULATION = 4  # bytes before the first field
     MOST = 1 << 30  # elements; no message has as many
     PADDING = 3  # bytes that may stand behind any message: some senders fill up to a multiple of four
-    RESERVED = 4  # bytes that rclpy leaves behind a message for each empty sequence of 8-byte numbers in it
+    RESERVED = 4  # bytes that rclpy leaves behind a message for an empty sequence of 8-byte numbers, and others behind it
 cdef enum:  # what a node is
     NUMBER, TRUTH, TEXT, MESSAGE
 cdef enum:  # what a message is; from LONGER on by how many bytes
@@ -90,8 +90,7 @@ cdef class _Node:
     `array`: -1 for a single value, 0 for a sequence, n for n elements; `fields`: of a message; `element`: of an array
     of messages that nobody wants; `slot`: where a single number goes; `indexed, named`: wanted elements by position or
     by name, each with its slot or node; `every`: where the place of an array goes that is wanted as a whole;
-    `name_at`: which field of a message holds the names; `ahead`: that field stands behind what it names; `asks`:
-    something in it is looked up by names that stand outside of it.
+    `name_at`: which field of a message holds the names; `ahead`: it is behind what it names; `asks`: for such outside.
     """
 
     cdef int kind, code
@@ -293,7 +292,7 @@ cdef class Plan:
         return UNTRUE if self.untrue else WHOLE if self.met else STRANGE
 
     cdef bint message(self, _Node node, Py_ssize_t names, Py_ssize_t number) except? False:
-        """Fill what is wanted of a message; `names`, `number`: where the names of one around it begin, how many."""
+        # names, number: where the names of the message around it begin, and how many
         cdef Py_ssize_t at = self.at, reserved = self.reserved, position
         if not node.fields:
             self.at += 1  # an empty message is one byte long
@@ -354,7 +353,7 @@ cdef class Plan:
             self.at = start + count * node.size
             if self.at > self.size:
                 return False
-        elif node.size == 8:
+        if node.size == 8 and (not count or self.reserved):
             self.reserved += RESERVED
         if node.kind == TRUTH:
             for i in range(start, self.at if count else start):
