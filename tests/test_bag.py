@@ -732,6 +732,9 @@ def test_folders_and_files_in_the_order_given(tmp_path: Path) -> None:
 # --- what could be a signal ---------------------------------------------------------------------------------
 
 
+POINT, TRAJECTORY = "trajectory_msgs/msg/JointTrajectoryPoint", "trajectory_msgs/msg/JointTrajectory"
+
+
 def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
     odd_names, joint_state, more = ["fan", "3", " spaced ", "a[b]"], "sensor_msgs/msg/JointState", np.arange(3.0)
     joints = cdr(joint_state, header=header(5), name=odd_names, position=np.arange(4.0), velocity=more, effort=more[:0])
@@ -740,8 +743,13 @@ def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
     turned = message("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.6, w=0.8)
     pose = message("geometry_msgs/msg/Pose", position=point, orientation=turned)
     poses = cdr("geometry_msgs/msg/PoseArray", header=header(0), poses=[pose] * 2)
+    empty = dict.fromkeys(("accelerations", "effort"), np.empty(0))
+    still = message("builtin_interfaces/msg/Duration", sec=1, nanosec=0)
+    to = message(POINT, positions=np.arange(2.0), velocities=np.arange(3.0), **empty, time_from_start=still)
+    goal = cdr(TRAJECTORY, header=header(0), joint_names=["pan", "tilt"], points=[to])
     kinds = {
         "/joints": (joint_state, joints),
+        "/goal": (TRAJECTORY, goal),
         "/array": ("std_msgs/msg/Float64MultiArray", many),
         "/single": ("std_msgs/msg/Float64MultiArray", single),
         "/poses": ("geometry_msgs/msg/PoseArray", poses),
@@ -752,6 +760,8 @@ def test_describe_offers_paths_that_can_be_read(tmp_path: Path) -> None:
     found = {item.info.topic: item for item in bag.facts()}
     names = "position[fan]", 'position["3"]', 'position[" spaced "]', 'position["a[b]"]'
     assert found["/joints"].fields == (*names, "velocity[0..2]")
+    of_goal = "points[0].positions[pan]", "points[0].positions[tilt]", "points[0].velocities[0..2]"
+    assert found["/goal"].fields == of_goal
     assert found["/array"].fields == ("layout.data_offset", "data[0..99]")
     assert found["/single"].fields == ("layout.data_offset", "data[0]")
     assert found["/text"].fields == ()

@@ -1502,6 +1502,68 @@ def test_entries_of_arrays_without_names_are_of_one_joint_if_nothing_else_moves_
         assert [e["field"] for e in data["controls"]] == ["data[{}]"] and data["controls"][0]["for"] == ["0", "1", "2"]
 
 
+def pointed(angles=("pan", "tilt"), wheels=(), amount=1.0):
+    """Joints of which an angle alone is told, which come to where a trajectory or an array sends them; and wheels."""
+    rng = np.random.default_rng(3)
+    names, n, messages, x = [*angles, *wheels], len(angles), [], np.zeros(len(angles))
+    u, v, speed = np.zeros(n), *np.zeros((2, len(wheels)))
+    still = message("builtin_interfaces/msg/Duration", sec=0, nanosec=0)
+    empty = dict.fromkeys(("velocities", "accelerations", "effort"), np.empty(0))
+    for k in range(2000):
+        t = at(k)
+        if k % 40 == 0:
+            u, speed = (rng.uniform(-1.0, 1.0, len(some)) for some in (u, v))
+            to = message(POINT, positions=amount * u[::-1].copy(), **empty, time_from_start=still)
+            goal = cdr("trajectory_msgs/msg/JointTrajectory", header=header(t), joint_names=angles[::-1], points=[to])
+            messages += [
+                Message("/arm_controller/joint_trajectory", t, goal, t),
+                Message("/pan_tilt/commands", t, array(amount * u[::-1]), t),
+            ]
+        x = x + 0.15 * (u - x)
+        v = v + 0.1 * (speed - v)
+        seen = [values + 1e-3 * rng.normal(size=len(values)) for values in (x, v)]
+        of = {"name": names, "position": [*seen[0], *np.zeros(len(wheels))], "velocity": np.empty(0)}
+        of["velocity"] = [*np.zeros(n), *seen[1]] if wheels else np.empty(0)
+        of = {key: np.array(value) if key != "name" else value for key, value in of.items()}
+        messages += [Message("/joint_states", t, cdr(JOINT, header=header(t), **of, effort=np.empty(0)), t)]
+        messages += [Message("/wheel/commands", t, array(speed), t)] if wheels else []
+    return messages
+
+
+GOAL = {"/joint_states": JOINT, "/arm_controller/joint_trajectory": "trajectory_msgs/msg/JointTrajectory"}
+
+
+def test_the_commands_of_a_trajectory_are_of_the_joints_that_it_names(tmp_path):
+    messages = [m for m in pointed() if m.topic in GOAL]
+    _, proposal = proposed(tmp_path, messages, GOAL)
+    data = yaml.safe_load(proposal.text)
+    assert data["structure"] == "own" and set(proposal.members) == {"pan", "tilt"}
+    assert [e["field"] for e in data["controls"]] == ["points[0].positions[{}]"]
+
+
+@pytest.mark.parametrize(("amount", "own"), [(1.0, True), (3.0, False)])
+def test_an_angle_alone_is_of_the_command_that_it_comes_to(tmp_path, amount, own):
+    """Of two joints without a rate the commands of an array were those of both; in another unit they may be a pull."""
+    topics = {"/joint_states": JOINT, "/pan_tilt/commands": ARRAY}
+    _, proposal = proposed(tmp_path, [m for m in pointed(amount=amount) if m.topic in topics], topics)
+    data = yaml.safe_load(proposal.text)
+    assert (data.get("structure") == "own") == own, proposal.text
+    if own:
+        assert {e["for"][0]: e["field"] for e in data["controls"]} == {"pan": "data[1]", "tilt": "data[0]"}
+
+
+@pytest.mark.parametrize(("wheels", "own"), [(0, True), (2, True), (3, False)])
+def test_a_machine_of_which_commands_without_names_move_most_is_one(tmp_path, wheels, own):
+    """Of a rover whose steering is a trajectory, and whose wheels are an array, the steering alone was watched."""
+    names = [f"wheel_{i}" for i in range(wheels)]
+    topics = GOAL | ({"/wheel/commands": ARRAY} if wheels else {})
+    _, proposal = proposed(tmp_path, [m for m in pointed(wheels=names) if m.topic in topics], topics)
+    data = yaml.safe_load(proposal.text)
+    assert (data.get("structure") == "own") == own, proposal.text
+    if not own:
+        assert {f"velocity[{name}]" for name in names} < {entry["field"] for entry in data["states"]}
+
+
 @pytest.mark.parametrize(("still", "members"), [("", ("left", "right", "arm")), ("right", ("left", "arm"))])
 def test_the_file_is_for_all_that_move_alike(tmp_path, still, members):
     path, proposal = proposed(tmp_path, joints(still), {"/joint_states": JOINT, "/joint_commands": JOINT})

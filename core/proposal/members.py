@@ -25,10 +25,10 @@ from uncertain_lti.proposal.candidates import FEWEST, SHOWS, Candidate, most_sho
 _INDEXED = re.compile(r"([^\[]*)\[(\d+)\](.*)")
 SHORT_DELAY = 3
 """Samples within which a control shows that keeps a state from being noise, or that makes it that of a joint."""
-TOGETHER = 0.9999
-"""Correlation from which on commands cannot be told apart by what they do."""
-ALONE = 2.0
-"""Times what all commands leave unknown of a joint that its own one may leave."""
+TOGETHER = 0.9999  # correlation from which on commands cannot be told apart by what they do
+ALONE = 2.0  # times what all commands leave unknown of a joint that its own one may leave
+_ANGLE = re.compile(r"pos(ition)?s?$|angle")
+_NEAR = 0.1  # share of its command by which an angle may come to rest elsewhere
 Members = dict[str, list[Candidate]]
 
 
@@ -43,13 +43,13 @@ def _indexed(group: Sequence[Candidate]) -> list[Members]:
 
 
 def pair_entries(pool: Sequence[Candidate], used: Sequence[Candidate]) -> None:
-    """Say whose the commands of an array without names are: of a joint, an angle with a rate, that they alone move."""
+    """Say whose the commands of an array without names are: of a joint that they alone move."""
     named: Members = defaultdict(list)
     for candidate in (c for c in pool if c.element):
         named[candidate.element].append(candidate)
     for commands in _indexed(used):
         for every in [named, *_indexed(pool)]:
-            members = {name: its for name, its in every.items() if _turns(its)}
+            members = {name: its for name, its in every.items() if _turns(its) or _comes_to(its, used)}
             if whose := _whose([*commands.values()], members):
                 for name, its in [*zip(whose, commands.values(), strict=True), *members.items()]:
                     for candidate in its:
@@ -60,6 +60,18 @@ def pair_entries(pool: Sequence[Candidate], used: Sequence[Candidate]) -> None:
 def _turns(numbers: Sequence[Candidate]) -> bool:
     """Whether one of some numbers is the rate of another one, in its unit per second."""
     return any(0.5 < moves_per(b, a) * a.source.rate < 2.0 for a, b in permutations(numbers, 2))
+
+
+def _comes_to(numbers: Sequence[Candidate], used: Sequence[Candidate]) -> bool:
+    # an angle alone, which comes to rest where one of the commands, in its unit, is
+    if len(numbers) > 1 or not _ANGLE.search(numbers[0].kind):
+        return False
+    steps = steps_of(numbers, used)
+    if len(steps.X) < FEWEST:
+        return False
+    Z = np.column_stack([steps.X, steps.U, np.ones(len(steps.X))])
+    back, *pulls, _ = np.linalg.lstsq(Z, steps.dX[:, 0], rcond=None)[0].tolist()
+    return any(abs(pull + back) < abs(back) * _NEAR for pull in pulls)
 
 
 def moves_per(rate: Candidate, place: Candidate) -> float:
@@ -121,7 +133,7 @@ def _told(gram: Array, cross: Array) -> Array:
 def one_of_them(pool: list[Candidate], used: list[Candidate], like: str) -> tuple[list[Candidate], list[Candidate]]:
     """Where states and commands are of the same members, those of the member whose command shows most."""
     shared = [e for e in dict.fromkeys(c.element for c in used) if e and any(s.element == e for s in pool)]
-    if len(shared) < 2:
+    if len(shared) < 2 or (not like and _most_are_others(pool, used, shared)):
         return pool, used
 
     def effect(element: str) -> float:
@@ -139,6 +151,13 @@ def one_of_them(pool: list[Candidate], used: list[Candidate], like: str) -> tupl
         if not candidate.element and all(c.source is not candidate.source for c in kept):
             candidate.source.apart = f"of none of the members, such as {best}"
     return kept, [c for c in used if not c.reason]
+
+
+def _most_are_others(pool: Sequence[Candidate], used: Sequence[Candidate], shared: Sequence[str]) -> bool:
+    # more members than those with commands of their own move by commands of none: wheels of a rover
+    others = [c for c in pool if c.element and c.element not in shared]
+    rest = [c for c in used if c.element not in shared]
+    return bool(len({c.element for c in others}) > len(shared) and rest and most_shown(others, rest) > SHOWS)
 
 
 def all_of_them(

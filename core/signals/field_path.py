@@ -217,10 +217,10 @@ class FieldPath:
     """One scalar of a message: `a.b[3]`, `position[fan]`, `yaw(pose.orientation)`, `unwrap(...)`, `lag(..., 1)`.
 
     Dotted attributes; `[3]` is an index, `[fan]` the position of `fan` in the `name` or `joint_names` of the message
-    that holds the array, or of one around it (JointState, JointTrajectory), `["3"]` a name like an index. Derived: roll,
-    pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle in rad
-    or of a stated turn (`unwrap(heading, 360)`), and, outermost, lag(field, k), diff(field) and rate(field) of earlier
-    samples (the sampler does these two, as it knows where a stream restarts).
+    that holds the array, or of one around it (JointState, JointTrajectory), `["3"]` a name like an index. Derived:
+    roll, pitch, yaw of a quaternion (any norm but 0), norm of a vector, a quaternion or an array, unwrap of an angle
+    in rad or of a stated turn (`unwrap(heading, 360)`), and, outermost, lag(field, k), diff(field) and rate(field) of
+    earlier samples (the sampler does these two, as it knows where a stream restarts).
 
     `text`: the path as a signals file writes it; `unwrap`: the turn by which the sampler is to unwrap it, 0 for none;
     `memory`: what the sampler is to take from earlier samples; `inner`: the path without that: whose earlier samples
@@ -303,7 +303,8 @@ class FieldPath:
 
     def _look_up(self, message: Any) -> tuple[Any, tuple[str, str | int, list[str]] | None]:
         """The value; or the array that lacks an entry, with its name, the key and the names of the message."""
-        value, named, name = message, [], ""
+        value, name = message, ""
+        named: Sequence[object] = ()
         for kind, key in self.steps:
             if kind == "attribute":
                 own = (getattr(value, of, "") for of in _NAMES)
@@ -395,9 +396,8 @@ def signal_paths(
 ) -> Iterator[str]:
     """Paths in a decoded message that can be signals, as `FieldPath` reads them; header stamps are left out.
 
-    The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as
-    `position[fan]` each where the message, or the one `around` it, names them; a quaternion is also offered as
-    roll(...) and the like.
+    The entries of an array stand as one path, `data[0..99]` for `data[0]` to `data[99]`, or as `position[fan]` each
+    where the message, or the one `around` it, names them; a quaternion is also offered as roll(...) and the like.
     """
     fields = type_fields(type_name)
     names = _names(fields, message, around)
@@ -431,8 +431,7 @@ def _inside(
     yield from signal_paths(type_fields, field.type_name, value, f"{path}.", depth - 1, around)
 
 
-_NAMES = ("name", "joint_names")
-"""Fields that name the entries of the arrays beside them, and of those in the messages there."""
+_NAMES = "name", "joint_names"  # name the entries of the arrays beside them, and of those in the messages there
 
 
 def names_in(fields: Mapping[str, FieldType]) -> str:
