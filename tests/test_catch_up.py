@@ -282,14 +282,15 @@ def test_in_a_burst_controls_that_were_late_themselves_stay_late() -> None:
 def test_a_lag_of_more_than_a_step_is_said_live_and_when_a_recording_is_read(engine, tmp_path):
     model, bag = engine
     kinds = {topic: bag.topics[topic].type for topic in (STATE_TOPIC, CONTROL_TOPIC)}
-    for steps, said in ((0.9, 0), (2.4, 1)):
+    for steps, said in ((0.9, 0), (2.4, 1), (-2.4, 1)):
         live, session = lagging(sent(bag), steps * STEP), session_of(model, Rule())
         run(session, live)
         assert session.lags == ({CONTROL_TOPIC: pytest.approx(steps * STEP, abs=0.1 * STEP)} if said else {})
         came = [Message_(topic, log, data) for _, topic, log, data, _ in live]
-        path = write([Topic(name, kind) for name, kind in kinds.items()], came).save(tmp_path / f"{said}.mcap")
+        path = write([Topic(name, kind) for name, kind in kinds.items()], came).save(tmp_path / f"{steps}.mcap")
         notes = read_as_fitted(Bag(path), model.signals).notes
-        assert len([note for note in notes if f"stamps on {CONTROL_TOPIC} lag" in note and "2.4 steps" in note]) == said
+        begin = f"stamps on {CONTROL_TOPIC} {'lag' if steps > 0 else 'lead'} those"
+        assert len([note for note in notes if begin in note and "2.4 steps" in note]) == said
 
 
 @pytest.mark.parametrize("rate", [0.2, 5.0])

@@ -178,7 +178,7 @@ def sample(stream: Stream, signals: SignalMap) -> tuple[Transient, Decisions]:
 
 
 def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
-    """Topics whose stamps usually lag those of the clock topic by more than a step, a sentence each."""
+    """Topics whose stamps usually lag or lead those of the clock topic by more than a step, a sentence each."""
     clock = signals.clock or ""
     of_clock = np.flatnonzero((stream.topic == signals.topics.index(clock)) & (stream.stamp > 0))
     if signals.time[clock] != "header" or len(of_clock) < 2:
@@ -192,10 +192,12 @@ def lags_in_words(stream: Stream, signals: SignalMap) -> list[str]:
         before = of_clock[np.searchsorted(of_clock, own) - 1]  # the clock message that came last
         since = np.minimum(stream.arrival[own] - stream.arrival[before], step)
         lag = float(np.median(stream.stamp[before] + since - stream.stamp[own]))
-        if lag > step > 0:
-            by = f"{lag * 1e-9:.3g} s, {lag / step:.3g} steps"
-            of = "each sample has the control that had come, not the one of its instant"
-            said.append(f"{stream.bag.path}: stamps on {topic} lag those on {clock} by {by}: {of}")
+        if abs(lag) > step > 0:
+            by = f"{abs(lag) * 1e-9:.3g} s, {abs(lag) / step:.3g} steps"
+            way, so = "lag", "each sample has the control that had come, not the one of its instant"
+            if lag < 0:
+                way, so = "lead", f"right if {clock} comes so late, otherwise their clocks differ"
+            said.append(f"{stream.bag.path}: stamps on {topic} {way} those on {clock} by {by}: {so}")
     return said
 
 
