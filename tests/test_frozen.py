@@ -243,6 +243,14 @@ def test_at_a_sample_a_second_two_equal_ones_are_no_repeat_and_three_a_rest(
     assert np.flatnonzero(verdicts.frozen).tolist() == ([] if steps is None else list(range(19 + steps, 30)))
 
 
+@pytest.mark.parametrize(("longest", "longer"), [(0.956, []), (0.944, [20])])
+def test_a_repeat_is_longer_than_those_of_the_fit_if_it_is_by_half_a_step(longest: float, longer: list[int]) -> None:
+    model = UncertainLTI([[0.0]], [[0.0]], [[0.0]], [[0.0]], v=[0.5], repeats=Repeats([longest]))
+    x = np.concatenate([np.linspace(5.0, 4.0, 11), np.full(10, 4.0)])[:, None]
+    verdicts = EnvelopeMonitor(model).check(Transient(0.1 * np.arange(21), x, np.ones((21, 1))))
+    assert np.flatnonzero(verdicts.repeating).tolist() == longer
+
+
 def test_a_sum_counts_where_another_state_has_moved_by_more_than_its_half_width() -> None:
     """The run rests at half a half-width; the sum adds as much at each step, and the other moves by a quarter."""
     zeros, A, B = np.zeros((2, 2)), np.array([[-4.0, 0.0], [0.0, 0.0]]), np.array([[1.0], [0.0]])
@@ -296,7 +304,7 @@ def test_the_run_of_a_row_that_grows_by_itself_is_its_sum() -> None:
 
 def test_the_run_of_a_row_that_overshoots_goes_to_its_rest_in_a_step() -> None:
     """Followed freely, an own element below -2 a step would multiply the least step beyond all numbers, too."""
-    t, u = 0.1 * np.arange(100), np.full((100, 1), 1e-3)
+    t, u = 0.1 * np.arange(100), 1e-3 * (-1.0) ** np.arange(100)[:, None]
     model = UncertainLTI([[-50.0]], [[1.0]], [[0.0]], [[0.0]], v=[0.5])
     assert repeats_of(model, [Transient(t, np.zeros((100, 1)), u)]).largest_run[0] == pytest.approx(1e-4 / 0.5)
 

@@ -16,10 +16,12 @@ import numpy as np
 import pytest
 from refusals import refuses
 
-from uncertain_lti import SignalMap, UncertainLTI
+from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION, Repeating
+from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.model.domain import Domain
+from uncertain_lti.model.horizon import Residuals, Run
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.signals.signal_map import Signal
 
@@ -159,6 +161,9 @@ def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(n
         assert same(lower, numbers[LOWER]) and same(upper, numbers[UPPER])
         assert found.contained == (not numbers[FLAGS].any())
         assert found.unknown_regime == strange == model.unknown(z[:, None])[0]
+        assert found.outside_domain or not strange
+        found.reach(largest := np.zeros(n))
+        assert same(largest, np.fmax(np.abs(numbers[UTILISATION]), 0.0))
         assert found.violation == bool((numbers[FLAGS] * counted).any())
         flags |= set(numbers[FLAGS])
         unknown += strange
@@ -166,10 +171,35 @@ def test_a_transition_and_many_are_judged_as_the_equations_say_to_the_last_bit(n
     assert (unlisted > 0 or not gear) and (unknown > 0) == (schedule is not None)
 
 
+def test_a_law_of_the_residuals_changes_no_bound_and_no_utilisation() -> None:
+    rng = np.random.default_rng(0)
+    model, law = some_model(3, 2, None, rng), [rng.normal(size=shape) for shape in ((3, 3), (3, 2), 3)]
+    other = model.replace(
+        residuals=Residuals(np.zeros(3), np.eye(3), False, Run(*law)), alarm=[StatisticRule("chi2", 0.0, 1.0)]
+    )
+    run = Transient(0.1 * np.arange(200), rng.normal(size=(200, 3)), rng.normal(size=(200, 2)))
+    one, two = EnvelopeMonitor(model).check(run), EnvelopeMonitor(other).check(run)
+    for name in ("flags", "lower", "upper", "utilisation"):
+        assert same(getattr(one, name), getattr(two, name)), name
+    z = (np.column_stack([run.x, run.u]) - model.operating_point.steady) / model.operating_point.scale
+    x, u = z[:, :3], z[:, 3:]
+    expected = x[1:] - x[:-1] - 0.1 * (x[:-1] @ law[0].T + u[:-1] @ law[1].T + law[2])
+    np.testing.assert_allclose(two.residual[1:], expected, atol=1e-9)
+
+
 def test_on_the_edge_of_a_horizon_the_comparison_decides_and_a_run_beyond_all_numbers_is_outside() -> None:
-    quotient, inside = np.array([1.0, -1.0, -1.5, np.nan, np.nan]), np.array([False, False, True, False, True])
+    quotient = np.array([1.0, -1.0, 0.0, -1.5, np.nan, np.nan])
+    inside = np.array([False, False, False, True, False, True])
     beyond = np.nextafter(1.0, 2.0)
-    np.testing.assert_array_equal(arithmetic.settled(quotient, inside), [beyond, -beyond, -1.0, np.inf, np.nan])
+    found = arithmetic.settled(quotient, inside)
+    np.testing.assert_array_equal(found, [beyond, -beyond, beyond, -1.0, np.inf, np.nan])
+
+
+def test_what_is_beyond_all_numbers_is_looked_up_in_no_cell_that_is_none() -> None:
+    """Of a signal that never moved, whose cells have no width, its place would be no number."""
+    z, least, greatest = np.array([[np.inf, 0.7], [0.5, 0.5]]), np.array([0.7, 0.0]), np.array([0.7, 1.0])
+    found = arithmetic.outside_domain(z, least, greatest, np.ones((1, 4, 4), dtype=bool))
+    assert found.tolist() == [True, False]
 
 
 def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
