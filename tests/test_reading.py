@@ -402,6 +402,9 @@ def test_recordings_of_other_types_are_neither_fitted_together_nor_judged(tmp_pa
         read_as_fitted(two, fitted.signals)
     three = save(tmp_path, {"/y": FLOAT64}, [("/y", 1, float64(1.0))], "c.mcap")
     refuses(BagError, "there is no topic /x; topics there: /y", read_as_fitted, three, fitted.signals)
+    sent = [Message(topic, 1, float64(1.0)) for topic in ("/x", "/u")]
+    bare = write([Topic("/x", schema_encoding=""), Topic("/u")], sent).save(tmp_path / "d.mcap")
+    refuses(BagError, "/x is of no stated type, and the model was fitted to", read_as_fitted, bare, fitted.signals)
 
 
 def test_no_recording_is_an_error() -> None:

@@ -281,7 +281,7 @@ def _channels(contents: Contents) -> dict[int, RecordedChannel]:
             remedy = "take the .bag that it was made of" if encoding == "ros1" else "write its numbers into a CSV file"
             why = f"its messages are in {encoding}, and cdr is what can be decoded: {remedy}"
             definition = undefined(type_name, why)
-        elif schema is None:
+        elif schema is None or not type_name:
             definition = undefined(type_name, "the file does not say what type it has")
         else:
             if schema.id not in seen:

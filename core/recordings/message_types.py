@@ -375,7 +375,7 @@ def _field_type(description: Any) -> FieldType:
 def _one_line(error: Exception) -> str:
     lines = str(error).splitlines()
     if len(lines) > 3 and lines[0].startswith("Could not parse"):  # the text, the position, what is there
-        return f"it cannot be parsed from '{lines[3].strip()[:40]}' on"
+        return f"it cannot be parsed from '{lines[3].strip()[:40]}' on" if lines[3].strip() else "it cannot be parsed"
     return one_line(error)
 
 

@@ -342,6 +342,7 @@ def read_as_fitted_with_decisions(
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
             remedy = "check a recording of the same topics"
+            found = found or "of no stated type"
             raise BagError(f"{bag.path}: {topic} is {found}, and the model was fitted to {expected}; {remedy}")
     if signals.clock is None or signals.max_gap is None or any(t not in signals.time for t in signals.topics):
         unsaid = "it does not say clock, max_gap and time of every topic, so not how to cut samples"
