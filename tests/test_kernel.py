@@ -363,3 +363,6 @@ def test_what_a_tile_is_filled_up_with_counts_nowhere_and_on_a_bound_is_not_outs
     given = z, dt, after, z[:1], None, None, 0, (False,), np.zeros((2, 1)), np.array([[0.0], [0.0], [0.5]])
     at, distance = arithmetic.near_bounds(1, *given, None, None, [0])
     assert (at.tolist(), distance.tolist()) == ([2], [2.0])
+    given = z, np.array([0.5, 1.0, 2.0]), z[:1], z[:1], None, None, 0, (True,), np.zeros((2, 1)), given[-1]
+    at, _ = arithmetic.near_bounds(1, *given, None, np.array([1.5]), [0])
+    assert at.tolist() == [2], "by its width at its step, which alone is over the limit"

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -115,6 +115,7 @@ def recorded(draw: st.DrawFn) -> np.ndarray:
 
 
 @given(recorded(), st.sampled_from([0.0, STILL_BAND, 0.3, 1.0]))
+@example(np.repeat([[0.0], [1.0]], STILL_SAMPLES, axis=0), 0.0)
 def test_still_stretches_are_those_of_the_naive_search(values: np.ndarray, band: float) -> None:
     seen = np.isfinite(values)
     span = np.max(values, axis=0, where=seen, initial=-9.0) - np.min(values, axis=0, where=seen, initial=9.0)

@@ -384,6 +384,12 @@ def test_what_is_not_worth_having_is_said_first():
     assert still.fit_summary["alarm"]["headline"].startswith("not worth having: nothing that is judged moves")
 
 
+def test_what_was_left_out_vouches_unless_more_than_a_third_stand_alone(learnt):
+    _, _, panel = learnt
+    three = replace(panel, evidence=replace(panel.evidence, peaks=panel.evidence.peaks[:3]))
+    assert [replace(three, unlike=("a",) * count).vouched for count in range(3)] == [True, True, False]
+
+
 @pytest.mark.parametrize(
     ("shares", "kind", "words"),
     [
