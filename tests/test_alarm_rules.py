@@ -22,7 +22,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import Window
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon, Residuals
-from uncertain_lti.monitor.alarm import Alarm, Arming, Condition, Nearest, back_and_restarts, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Arming, Condition, Nearest, back_and_restarts, row_of, steps_back
 
 ZEROS = np.zeros((2, 2))
 RULES = (
@@ -212,3 +212,12 @@ PATHS = [("unwrap(data)", "unwrapping"), ("lag(data, 1)", "lag"), ("rate(data)",
 @pytest.mark.parametrize(("field", "what"), PATHS)
 def test_a_condition_on_what_needs_a_history_is_refused(field: str, what: str) -> None:
     refuses(ModelError, f"cannot be compared, as {what} needs a history", Condition.parse, f"/machine/mode {field} > 1")
+
+
+@pytest.mark.parametrize(("relative", "rows"), [((True, False), [0, 3]), ((False, True), [2, 1])])
+def test_a_rule_of_all_states_looks_at_residuals_of_the_form_of_its_horizon(relative, rows) -> None:
+    """Of the table, which has the utilisation of one step and of each horizon, and then the residuals likewise."""
+    one, four = (Residuals([0, 0], np.eye(2), form) for form in relative)
+    arrays = ZEROS, ZEROS[:, :1], ZEROS, ZEROS[:, :1]
+    model = UncertainLTI(*arrays, v=[0.3, 0.3], residuals=one, horizons=[Horizon(4, *arrays, v=[1, 1], residuals=four)])
+    assert [row_of(StatisticRule("chi2", 0.0, 1.0, horizon), model) for horizon in (1, 4)] == rows

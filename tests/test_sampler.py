@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from refusals import refuses
 from steps import OPENING
@@ -499,8 +499,19 @@ def loops(draw: st.DrawFn) -> tuple[SignalMap, list[Sent]]:
     return signals, first[: len(first) - overlap] + mixed + second[overlap:]
 
 
+STATE_AND_CONTROL = SignalMap(
+    (Signal("x", "/c", "data", steady=0.0),),
+    (Signal("u", "/c", "level"),),
+    clock="/c",
+    max_gap=0.05,
+    time={"/c": "header"},
+)
+TWO_PASSES = [Sent("/c", k * TICK, at * TICK, (0.0, float(k))) for k, at in enumerate((100, 101, 102, 1, 2))]
+
+
 @settings(max_examples=80)
 @given(cases() | cases(tame=True) | loops())
+@example((STATE_AND_CONTROL, TWO_PASSES))
 def test_all_at_once_is_what_one_after_the_other_is(case: tuple[SignalMap, list[Sent]]) -> None:
     """Samples, which message decided each, and counts; the last sample of a pass has what it knows of itself."""
     signals, messages = case
