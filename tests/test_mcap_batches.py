@@ -17,13 +17,14 @@ from pathlib import Path
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import pytest
-from bag_writer import Layout, float64
+from bag_writer import Layout, float64, record
 from by_message import read_stream_by_message
 from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 
 import uncertain_lti.recordings.bag_arrays
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.bag import Bag
+from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.sampling.reading import Stream, read_stream
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -56,6 +57,11 @@ def outcome(path: Path, by_message: bool) -> tuple[bytes, ...] | str:
         return plain((read_stream_by_message if by_message else read_stream)(Bag(path, indexed=not by_message), XU))
     except BagError as error:
         return str(error)
+
+
+def test_a_record_without_content_at_the_end_of_a_block_is_whole() -> None:
+    block = record(0x80, b"\0") + record(0x80, b"")
+    assert walk_records(block, 0, len(block), 9)[-2:] == (2, len(block))
 
 
 def test_lz4_frames_without_their_end_mark(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -195,6 +195,12 @@ def test_silence_is_never_contained_and_ends_no_alarm() -> None:
     assert not monitor.judge(Step(Status.OK, 1 - 10**10, 0, 1.0, [0.0], [0.5])).alarm
 
 
+def test_a_verdict_is_ordinary_where_nothing_is_to_be_said_of_it() -> None:
+    monitor = EnvelopeMonitor(scalar(v=1.0))
+    said = [monitor.judge(a_step(0.0, x), armed).ordinary for x in (0.5, 1.5) for armed in (True, False)]
+    assert said == [True, False, False, False], "inside, and the alarm could be raised"
+
+
 def test_verdicts_do_not_share_what_they_hold() -> None:
     monitor = EnvelopeMonitor(scalar(v=1.0))
     first, second = (monitor.judge(a_step(0.0, 0.0, Status.GAP)) for _ in range(2))

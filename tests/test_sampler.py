@@ -25,7 +25,7 @@ from steps import OPENING
 from uncertain_lti.base.errors import SignalError
 from uncertain_lti.sampling import sampler as sampler_module
 from uncertain_lti.sampling.clock import Status, median_step_ns, resolve, to_ns
-from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, Sampler, Step
+from uncertain_lti.sampling.sampler import BUFFERED_MESSAGES, KEPT_OVER_A_JUMP, Sampler, Step
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -638,6 +638,15 @@ def test_nothing_of_a_step_back_of_time_stays_once_it_is_over(control_first: boo
                 sampler.push(*message)
         assert len(sampler.kept("/u")) <= 2
     assert sampler.counters["resets"] == 2
+
+
+def test_of_a_topic_whose_time_alone_stepped_back_a_hundred_messages_are_kept() -> None:
+    sampler = Sampler(two_topics())
+    for k in range(400):
+        for message in (at("/u", 100 + k, k or 1000), at("/c", 100 + k, 1000 + k)):
+            sampler.push(*message)
+        assert len(sampler.kept("/u")) <= KEPT_OVER_A_JUMP
+    assert sampler.counters["late /u"] == 397
     sampler = Sampler(two_topics())
     for message in (at("/c", 100, 100), at("/c", 101, 101), at("/c", 102, 1), at("/u", 103, 1), at("/c", 104, 2)):
         sampler.push(*message)
