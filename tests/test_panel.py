@@ -201,6 +201,8 @@ def test_thresholds_are_the_largest_sizes_with_an_allowance(learnt, runs):
         assert energy.thresholds(2)[i] > max(window) * (1 - 0.06)  # a window of 10.5 steps
     rules, evidence = [replace(rule, threshold=1.0) for rule in panel.rules], panel.evidence
     limits = np.concatenate(evidence.thresholds(rules, 2, "recording"))
+    few = (np.concatenate(replace(evidence, verdicts=v).thresholds(rules, 2, "recording")) for v in (2.0, 6.0))
+    assert np.array_equal(*few), "three windows are the fewest that an allowance is for"
     levels = [(sizes_of(rules, part) / limits).max(axis=1) for part in parts]
     near = min(1.0, max(0.95 * sorted(each.max() for each in levels)[-3], 0.75))  # just below the third largest
     assert evidence.near.tolist() == [rising(v > near, p.starts) for v, p in zip(levels, parts, strict=True)]
