@@ -12,6 +12,7 @@
 import math
 import random
 import re
+import warnings
 from datetime import datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
@@ -801,6 +802,9 @@ def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
     bag = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}" for k in range(90)))
     assert set(np.diff(bag.times).tolist()) == {10**9}
     assert "column 'Time': '09/04/2021 11:00:00' is taken for day, month, year" in " ".join(bag.warnings)
+    with warnings.catch_warnings(action="error"):  # numpy knows no zones
+        zoned = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02} +01:00,{k}" for k in range(90)))
+    assert (bag.times - zoned.times == 3600 * 10**9).all() and len(zoned.warnings) == len(bag.warnings)
     for order, first, second in (("day, month", "09/10/16", "10/10/16"), ("month, day", "10/09/16", "10/10/16")):
         bag = read_csv(tmp_path, "Time,x", (f"{first if k < 24 else second} {k % 24:02},{k}" for k in range(48)))
         assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}

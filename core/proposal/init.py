@@ -95,6 +95,8 @@ _COMPUTER = re.compile(
 _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
+_QUALITY = re.compile(r"(^|_)(q|qc|qual|quality)\d*$")  # column of what OPC thinks of the value beside it
+_QUALITIES = (0, 4, 8, 12, 16, 20, 24, 28, 64, 68, 80, 84, 88, 192, 216)  # bad, uncertain, good
 _APART = "not in every recording"
 MOST_WORDS = 8
 """Words of a column that is switched, at most."""
@@ -299,6 +301,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
         what = f"rows only, so {_FILL}" if source.type == TABLE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
+    name = "_".join(words_of(candidate.path))
+    if source.type == TABLE and _QUALITY.search(name) and np.isin(finite, _QUALITIES).all() and finite.max() >= 192:
+        return "a quality code, by its name and values"
     if finite.min() == finite.max():
         return f"always {finite[0] + 0.0:.6g}"
     if source.type != TABLE and np.ptp(finite) < DUST:
@@ -312,7 +317,6 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    name = "_".join(words_of(candidate.path))
     if _COMPUTER.search(name):
         return "of a computer, by its name, and no signal of the machine"
     if source.type == TABLE and _PLACE.search(name):

@@ -572,7 +572,8 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
 def _is_even(texts: Sequence[str]) -> bool:
     """Whether no step between these instants is much longer than the usual one."""
     try:
-        steps = np.diff(np.array(texts, dtype="datetime64[ms]").astype(np.int64))
-    except ValueError:
+        plain, shifts = zip(*(_of_iso("", *match.groups()) for match in map(_ISO.match, texts) if match), strict=True)
+        steps = np.diff(_parsed("", plain) - np.array(shifts))
+    except (BagError, ValueError):
         return False
     return len(steps) > 1 and bool(steps.max() <= 2 * np.median(steps))
