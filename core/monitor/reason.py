@@ -33,7 +33,7 @@ WHY = {
     Status.RESET: "time stepped back",
     Status.MISSING: "a signal is missing, stale or not finite",
     Status.MODE: "the scheduling signal has a value that the model does not list",
-    Status.STEP: "the step is shorter or longer than those that the model was fitted to",
+    Status.STEP: "the step is under half or over twice those that the model was fitted to",
     Status.FROZEN: "every state needs one that is frozen",
     Status.UNASKED: "outside the time asked for",
 }
