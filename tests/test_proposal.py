@@ -533,10 +533,11 @@ def test_words_of_a_switch_are_read_where_they_are_truths_and_told_where_not(tmp
     rows, heat = [], 20.0
     for k in range(600):
         on, fan = k // 40 % 2, ("low", "high", "off")[k // 70 % 3]
-        rows.append([0.1 * k, f"{heat:.4f}", ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3]])
-        heat += 0.05 * (20 + 30 * on - heat)
-    proposal = propose([csv(tmp_path / "a.csv", ["time", "heat", "heater", "fan", "fault_label"], rows)])
-    assert signals_of(proposal) == ([("/table", "heat")], [("/table", "heater")]), proposal.text
+        pump = k // 55 % 2
+        rows.append([0.1 * k, f"{heat:.4f}", ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3], ("STOP", "RUN")[pump]])
+        heat += 0.05 * (20 + 30 * on - 20 * pump - heat)
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "heat", "heater", "fan", "fault_label", "pump"], rows)])
+    assert signals_of(proposal) == ([("/table", "heat")], [("/table", "heater"), ("/table", "pump")]), proposal.text
     (said,) = [warning for warning in proposal.warnings if "words" in warning]
     assert said.startswith("columns of words are no signals: fan (high, low, off);")
 
@@ -1670,17 +1671,18 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         pressure = 2 * flow + 3 * rng.normal()
         switch = 1 + on[k] if k else ""
         rows.append([60 * k, level, rng.normal(), pressure, switch, flow, 0, valve, analyser, level, int(k == 700)])
-        rows[-1] += [622 + int(rng.integers(2)), rng.random(), 24 if 300 < k < 320 else 192]
+        rows[-1] += [622 + int(rng.integers(2)), rng.random(), *(64 if k in (i, i + 9) else 192 for i in (31, 42, 53))]
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
-    path = csv(tmp_path / "plant.csv", [*names, "Flicker", "elapsed", "Level1_Q"], rows)
+    path = csv(tmp_path / "plant.csv", [*names, "Flicker", "elapsed", "Level1_Q", "Temp_Q", "Press_Q"], rows)
     proposal = propose([path])
     assert [c.name for c in proposal.states] == ["Level1", "Temp", "Flicker"], proposal.text
     why = {c.name: c.why for c in proposal.controls}
     assert why["S_PU1"] == "switched between 1, 2" and why["F_PU1"] == "0 whenever S_PU1 is off"
     assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
-                  "Level1_again: moves with Level1", "elapsed: of a computer", "Level1_Q: a quality code"):  # fmt: skip
+                  "Level1_again: moves with Level1", "elapsed: of a computer",
+                  "Level1_Q, Temp_Q, Press_Q: a quality code"):  # fmt: skip
         assert re.search(words, proposal.text), words
     assert not any(c.steady for c in [*proposal.states, *proposal.controls]), "fit decides what to count from"
     model = fitted([path], proposal)

@@ -272,6 +272,10 @@ def _sift(source: Source) -> None:
         source.candidates = [  # the other form of the same numbers has its line
             c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
+    for candidate in source.free if source.type == TABLE else ():  # before its usual value is taken for none
+        quality = _QUALITY.search("_".join(words_of(candidate.path))) and np.isin(candidate.finite, _QUALITIES).all()
+        if quality and candidate.finite.max(initial=0.0) >= 192:
+            candidate.reason = "a quality code, by its name and values"
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
     measured = source.type == TABLE and source.role != "control"  # a command stands at its least, and no sensor failed
     shared = shared_codes(list(each.values())) if measured else set()
@@ -301,9 +305,6 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
         what = f"rows only, so {_FILL}" if source.type == TABLE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
-    name = "_".join(words_of(candidate.path))
-    if source.type == TABLE and _QUALITY.search(name) and np.isin(finite, _QUALITIES).all() and finite.max() >= 192:
-        return "a quality code, by its name and values"
     if finite.min() == finite.max():
         return f"always {finite[0] + 0.0:.6g}"
     if source.type != TABLE and np.ptp(finite) < DUST:
@@ -317,6 +318,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
+    name = "_".join(words_of(candidate.path))
     if _COMPUTER.search(name):
         return "of a computer, by its name, and no signal of the machine"
     if source.type == TABLE and _PLACE.search(name):
