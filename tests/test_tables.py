@@ -1059,7 +1059,8 @@ def test_days_of_a_spreadsheet_are_read_where_they_are_said(first, hour, tmp_pat
     """A plant's rows a second apart were taken for 10^5 a second; now their unit is asked for."""
     rows = [f"{first + k / 86400:.5f},{k}" for k in range(400)]
     refuses(BagError, "may be s or days.*unit=d", read_csv, tmp_path, "time,x", rows)
-    for head, layout in (("time,x", TableLayout(unit="d")), ("time (days),x", None)):
+    said = ("time,x", TableLayout(unit="d")), ("time (days),x", None), ("Date/Time,x", None), ("Time,Elapsed [s]", None)
+    for head, layout in said:  # the last by the seconds beside it
         (tmp_path / "a.csv").write_text("\n".join([head, *rows]))
         (bag,) = group_recordings([tmp_path / "a.csv"], layout=layout or TableLayout())
         begin, end = (np.datetime64(int(t), "ns").astype("datetime64[s]") for t in bag.times[[0, -1]])

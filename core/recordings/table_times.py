@@ -125,6 +125,8 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         unit, days = stated or "s", "write days of a spreadsheet as ISO times, or give `--table unit=d`"
         doubt = f"; {days}" * (not stated and _like_days(values))
         if doubt and np.median(np.abs(np.diff(values[np.isfinite(values)]))) < _HARDLY:
+            unit, doubt = "d", ""
+        if unit == "d" and not stated and not _says_days(table, column):
             none = "has no unit, which may be s or days"
             raise BagError(f"{where}: {none}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
         if unit == "s" and not stated and (step := _coarse(values)):
@@ -142,6 +144,13 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         times = _of_numbers(where, table, column, UNITS[unit])
     words = " and ".join(filter(None, said))
     return column, times, f"column '{column}': {words}" if words else ""
+
+
+def _says_days(table: RawTable, column: str) -> bool:
+    """Whether a column of days says so by its name, or by a time beside it that grows by as many seconds."""
+    span = 86_400 * np.ptp(table.columns[column])
+    others = (c for n, c in table.columns.items() if n != column and called_time(n) and c.dtype.kind in "iuf")
+    return bool(re.search("date|datum", column.lower()) or any(abs(np.ptp(c) / span - 1) < 1e-3 for c in others))
 
 
 def _likely(path: object, table: RawTable) -> tuple[str, str]:
