@@ -229,6 +229,7 @@ def test_what_is_measured_by_its_name_is_no_command_nor_is_any_where_one_cannot_
         ("/motor/duty", "control"), ("/set_rpm", "control"), ("/set_current", "control"), ("/set_state", "state"),
         ("/mavros/rc/out", "control"), ("/mavros/rc/in", "reference"), ("/mavros/setpoint_raw/attitude", "reference"),
         ("/engine/rpm", "state"), ("/wheel_vels", "state"), ("/tank/level", "state"), ("/elevator/position", "state"),
+        ("/gps/speed_over_ground", "state"), ("/gps/status", "apart"),
     ],
 )  # fmt: skip
 def test_a_controller_publishes_all_kinds(topic, role):
@@ -410,6 +411,22 @@ def test_the_set_points_of_a_test_stand_are_its_commands_and_what_its_actuators_
     fitted([path], proposal)
     asked = propose([path], states=["/engine/speed"])
     assert [c.topic for c in asked.states] == ["/engine/speed"], asked.text
+
+
+def test_a_steering_angle_is_measured_where_a_command_moves_it_and_else_a_control(tmp_path):
+    """Of a car with its CAN bus the wheel's angle was a control, so that no fault of the steering was seen."""
+    rng, messages, sent, angle, turn = np.random.default_rng(0), [], 0.0, 0.0, 0.0
+    for k in range(2000):
+        sent = float(rng.normal()) if k % 40 == 0 else sent
+        measured = np.array([angle, turn]) + 1e-3 * rng.normal(size=2)
+        values = zip(("/steering_cmd", "/can/steering_angle", "/gyro/z"), (sent, *measured), strict=True)
+        messages += [f64(topic, at(k), float(value)) for topic, value in values]
+        angle, turn = angle + 0.2 * (sent - angle), turn + 0.1 * (angle - turn)
+    _, proposal = proposed(tmp_path, messages)
+    assert [c.name for c in proposal.states] == ["steering_angle", "gyro_z"], proposal.text
+    assert [c.topic for c in proposal.controls] == ["/steering_cmd"], proposal.text
+    _, proposal = proposed(tmp_path, [m for m in messages if m.topic != "/steering_cmd"])
+    assert signals_of(proposal) == ([("/gyro/z", "data")], [("/can/steering_angle", "data")]), proposal.text
 
 
 def test_an_outer_set_point_is_none_where_the_command_that_follows_it_is_recorded(tmp_path):
@@ -1671,17 +1688,19 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
         pressure = 2 * flow + 3 * rng.normal()
         switch = 1 + on[k] if k else ""
         rows.append([60 * k, level, rng.normal(), pressure, switch, flow, 0, valve, analyser, level, int(k == 700)])
-        rows[-1] += [622 + int(rng.integers(2)), rng.random(), *(64 if k in (i, i + 9) else 192 for i in (31, 42, 53))]
+        quality = [64 if k in (i, i + 9) else 192 for i in (31, 42, 53)]
+        rows[-1] += [622 + int(rng.integers(2)), rng.random(), *quality, 60.0 * k + 7]
         level += 0.01 * (flow - 15) - 0.05 * (level - 1) + 0.01 * rng.normal()
     names = ["time", "Level1", "Temp", "Press", "S_PU1", "F_PU1", "S_PU2", "XMV_1", "Ratio", "Level1_again", "ATT_FLAG"]
-    path = csv(tmp_path / "plant.csv", [*names, "Flicker", "elapsed", "Level1_Q", "Temp_Q", "Press_Q"], rows)
+    names += ["Flicker", "elapsed", "Level1_Q", "Temp_Q", "Press_Q", "Elapsed [s]"]
+    path = csv(tmp_path / "plant.csv", names, rows)
     proposal = propose([path])
     assert [c.name for c in proposal.states] == ["Level1", "Temp", "Flicker"], proposal.text
     why = {c.name: c.why for c in proposal.controls}
     assert why["S_PU1"] == "switched between 1, 2" and why["F_PU1"] == "0 whenever S_PU1 is off"
     assert why["S_PU2"].startswith("always 0 here, so its effect is unknown") and "judged as well" in why["XMV_1"]
     for words in ("Ratio.*an analyser: holds each value for 5 rows", "Press.*answers within a row", "ATT_FLAG: a label",
-                  "Level1_again: moves with Level1", "elapsed: of a computer",
+                  "Level1_again: moves with Level1", "elapsed: of a computer", "Elapsed_s: grows as a clock",
                   "Level1_Q, Temp_Q, Press_Q: a quality code"):  # fmt: skip
         assert re.search(words, proposal.text), words
     assert not any(c.steady for c in [*proposal.states, *proposal.controls]), "fit decides what to count from"

@@ -336,7 +336,9 @@ _STATE = re.compile(
 )
 _FORCE, _ESC = re.compile(r"thrust.*_(g|gf|kgf?|k?n|lbf?)$"), re.compile(r"throttle|pwm|(^|_)esc(_|$)")  # on a stand
 _ANSWER = re.compile(r"(state|states|status|report|feedback|response|actual|odom|odometry)$|meas(ur|_|\d|$)|estimat")
-_APART = re.compile(r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps|fix$)")
+_APART = re.compile(
+    r"(battery|leak|diagnos|health|rosout|event|tf$|tf_static|camera|image|map$|marker|gps(?!.*(speed|vel|sog))|fix$)"
+)
 _FOLLOWED = re.compile(r"setpoint[^/]*/|/rc/(in|override)$")  # topics below a folder, and what a pilot's sticks say
 _SENT = re.compile(
     r"(^|/)(commands?|cmds?)/|(^|/)(cmd|set)_(?!.*(feedback|response|actual|report|status|odom))[^/]*$|/rc/out$|"

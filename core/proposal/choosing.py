@@ -257,7 +257,7 @@ class _Room:
         self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
 
 
-_REACHED = re.compile(r"_(position|pos|angle)$")
+_REACHED = re.compile(r"^(?!.*(cmd|command|set)).*_(position|pos|angle)$")
 """Name of what an actuator has reached, where something else says what it is to reach."""
 ONE_NUMBER = {f"std_msgs/msg/{kind}" for kind in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32")}
 """Messages of one number, which only their topic names."""
@@ -285,13 +285,17 @@ def _within_loops(
 ) -> tuple[list[Source], list[Source]]:
     """Controls and states, where the loop that follows a reference is part of the machine.
 
-    What an actuator has reached (`throttle_position`) is measured, where a reference shows in it. A reference is a
-    control where it shows clearly in what no command does, and in no command: its controller's output is not there.
+    What an actuator has reached (`throttle_position`) is measured, where a reference or a command shows in it, and more
+    than it in any command. A reference is a control where it shows clearly in what no command does, and in no command:
+    its controller's output is not there.
     """
-    reached = [s for s in controls if _REACHED.search(s.topic) and explained(s, references) > STEERS]
+    named = [s for s in controls if _REACHED.search(s.topic)]
+    sent = [s for s in controls if s not in named]
+    led = {s: max([STEERS, *(explained(c, [s]) for c in sent)]) for s in named}
+    reached = [s for s in named if explained(s, [*references, *sent]) > led[s]]
     controls, states = [s for s in controls if s not in reached], [*states, *reached]
     used = [c for s in controls for c in s.free]
-    unmoved = [s for s in states if not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
+    unmoved = [s for s in states if references and not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
     outer = [r for r in references if any(_answers(s, r) for s in controls)]
     inner = (r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved))
     return [*controls, *inner], states
@@ -313,7 +317,7 @@ def assign_roles(sources: Sequence[Source], asked: bool = False) -> tuple[list[S
         controls, references = references, []
     states = [s for s in moving if s.role == "state"]
     unknown = unnamed = [s for s in moving if s.role == ""]
-    if references and not asked:
+    if not asked:
         controls, states = _within_loops(controls, states, references)
     for source in references:
         if source not in controls:

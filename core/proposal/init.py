@@ -319,8 +319,6 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
     name = "_".join(words_of(candidate.path))
-    if _COMPUTER.search(name):
-        return "of a computer, by its name, and no signal of the machine"
     if source.type == TABLE and _PLACE.search(name):
         return "a place on the map, and another run may be elsewhere"
     wheel = of_wheel(candidate)
@@ -330,6 +328,8 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
     if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival, repeat(wheel)))):
         return "grows as a clock or a counter does"
+    if _COMPUTER.search(name):
+        return "of a computer, by its name, and no signal of the machine"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 

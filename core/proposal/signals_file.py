@@ -81,7 +81,8 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
     inner = re.sub(rf"^({OF_QUATERNION})\(.*", r"\1", FieldPath(candidate.path).angle)
     inner = re.sub(rf"^({'|'.join(FUNCTIONS)})\(|\)$", "", inner)
     words = [w for w in words_of(inner) if w not in _DULL]
-    of_topic = words_of(candidate.topic.rstrip("/").rpartition("/")[2])
+    *folders, last = map(words_of, candidate.topic.strip("/").split("/"))
+    of_topic = [*folders[-1], *last] if folders and all(len(w) == 1 for w in last) else last  # /gyro/z
     if all(len(w) == 1 or w.isdigit() for w in words):
         array = candidate.kind if "[" in candidate.path else ""  # of a table, whose topic says nothing more
         words = [*(words_of(array) if of_table(candidate.topic) else of_topic), *words]
