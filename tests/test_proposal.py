@@ -303,6 +303,7 @@ COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "ya
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 COLUMNS += [("action[0..5]", "control"), ("action_3", "control"), ("reaction", "state"), ("tau[0..6]", "control")]
 COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
+COLUMNS += [("Zieletage", "reference"), ("U_dc_V", "state"), ("U_q", "control")]
 
 
 @pytest.mark.parametrize(("column", "role"), COLUMNS)
@@ -320,6 +321,7 @@ def test_what_is_desired_is_a_reference(column, role):
         ("Pos_AccPedal drive_axle_speed DE_drive_end drive_cmd", "Pos_AccPedal drive_cmd"),
         ("pitch_input pitch_setpoint fin_output", "fin_output"), ("Input Setpoint Output", "Output"),
         ("setpoint error temperature output", "output"), ("input output", "input"), ("setpoint output", ""),
+        ("I_U I_V I_W U_dc U_U U_V U_W", "U_U U_V U_W"), ("I_U_A I_V_A I_W_A x_u", "x_u"),
         ("q1 tau1 tau_con2 tau_meas1 tail_meas_tau tail_clipped_tau", "tau1 tau_con2 tail_clipped_tau"),
     ],
 )  # fmt: skip
@@ -427,6 +429,19 @@ def test_a_steering_angle_is_measured_where_a_command_moves_it_and_else_a_contro
     assert [c.topic for c in proposal.controls] == ["/steering_cmd"], proposal.text
     _, proposal = proposed(tmp_path, [m for m in messages if m.topic != "/steering_cmd"])
     assert signals_of(proposal) == ([("/gyro/z", "data")], [("/can/steering_angle", "data")]), proposal.text
+
+
+def test_a_throttle_in_a_table_is_measured_and_the_speed_that_is_asked_for_a_control(tmp_path):
+    """Of a car's CAN log angle and throttle were controls, and the speed asked for was left out beside steering_cmd."""
+    rng, rows, sent, x = np.random.default_rng(0), [], np.zeros(2), np.zeros(3)
+    for k in range(2000):
+        sent = rng.normal(size=2) if k % 40 == 0 else sent
+        rows.append([f"{0.02 * k:.2f}", *sent, *(x + 1e-3 * rng.normal(size=3))])
+        x = x + [0.2 * (sent[0] - x[0]), 0.2 * (2 * (sent[1] - x[2]) + sent[1] - x[1]), 0.05 * (x[1] - x[2])]
+    names = ["time", "steering_cmd_rad", "target_speed_mps", "steering_angle_deg", "throttle_position_pct", "accel_x"]
+    proposal = propose([csv(tmp_path / "can.csv", names, rows)])
+    assert {c.name for c in proposal.states} == {*names[3:]}, proposal.text
+    assert {c.name for c in proposal.controls} == {*names[1:3]}, proposal.text
 
 
 def test_an_outer_set_point_is_none_where_the_command_that_follows_it_is_recorded(tmp_path):

@@ -316,7 +316,7 @@ _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|pedal|joy|ackerm
 _COMMANDS += "|drive(?!n|_?(train|axle|shaft|wheel|end))"  # parts of a machine are none
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 _COLUMN = re.compile(
-    r"^u_?\d*$|^u_|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?(con|calc?))?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
+    r"^u_?\d*$|^u_(?!dc|zk|bat|netz|bus)|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?(con|calc?))?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
 )
 _DESIRED = re.compile(r"(^|_)(Des[A-Z]|[A-Z]Des$)")  # as the log of an autopilot spells what its controllers follow
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
@@ -327,7 +327,7 @@ _LABEL = re.compile(
 _LABELS = 30  # values that a label takes, at most
 
 _REFERENCE = re.compile(
-    r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)soll|demand|request|(^|_)req(_|$)|ref$|_des(_|\d|$)|"
+    r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)(soll|ziel)|demand|request|(^|_)req(_|$)|ref$|_des(_|\d|$)|"
     r"(^|_)(sp|ref|des)_|_sp$)"
 )
 _STATE = re.compile(
@@ -446,6 +446,9 @@ def role_of_column(name: str, beside: Collection[str] = ()) -> str:
     if _CHANNEL.fullmatch(low) and len({m[1] for b in beside if (m := _CHANNEL.fullmatch(b))}) > 1:
         return "control"
     if _OF_CABINET.search(low) and not _REFERENCE.search(low):
+        return "state"
+    phases = {re.sub(r"(?<!^u)_u(?=_|$)", f"_{other}", low) for other in "vw"}
+    if len(phases) == 2 and phases.issubset(beside):  # i_u, i_v and i_w, and no input
         return "state"
     if low[:1] == "u" and "y" + low[1:] in beside:  # of an experiment's input and output
         return "control"

@@ -257,7 +257,7 @@ class _Room:
         self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
 
 
-_REACHED = re.compile(r"^(?!.*(cmd|command|set)).*_(position|pos|angle)$")
+_REACHED = re.compile(r"^(?!.*(cmd|command|set)).*_(position|pos|angle)(_(deg|rad|pct|percent|mm))?$")
 """Name of what an actuator has reached, where something else says what it is to reach."""
 ONE_NUMBER = {f"std_msgs/msg/{kind}" for kind in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32")}
 """Messages of one number, which only their topic names."""
@@ -286,19 +286,24 @@ def _within_loops(
     """Controls and states, where the loop that follows a reference is part of the machine.
 
     What an actuator has reached (`throttle_position`) is measured, where a reference or a command shows in it, and more
-    than it in any command. A reference is a control where it shows clearly in what no command does, and in no command:
-    its controller's output is not there.
+    than it in any command. A reference is a control where it shows more than commands in such an actuator, or clearly
+    in what no command does, and in no command: its controller's output is not there.
     """
-    named = [s for s in controls if _REACHED.search(s.topic)]
-    sent = [s for s in controls if s not in named]
-    led = {s: max([STEERS, *(explained(c, [s]) for c in sent)]) for s in named}
-    reached = [s for s in named if explained(s, [*references, *sent]) > led[s]]
-    controls, states = [s for s in controls if s not in reached], [*states, *reached]
+    every = [c for s in controls for c in s.free]
+    named = [c for c in every if _REACHED.search(c.path if c.source.type == TABLE else c.topic)]
+    sent = [c for c in every if c not in named]
+    leads = [*sent, *(c for s in references for c in s.free)]
+    led = {c: max([STEERS, *(most_shown([other], [c]) for other in sent)]) for c in named}
+    reached = [c for c in named if most_shown([c], leads) > led[c]]
+    parts = [s.parted(some, "state") for s in controls if (some := [c for c in reached if c in s.free])]
+    controls, states = [s for s in controls if s.free], [*states, *parts]
     used = [c for s in controls for c in s.free]
     unmoved = [s for s in states if references and not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
-    outer = [r for r in references if any(_answers(s, r) for s in controls)]
-    inner = (r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved))
-    return [*controls, *inner], states
+    moved = {c: max(STEERS, most_shown([c], sent)) for c in reached}
+    inner = [r for r in references if any(most_shown([c], r.free) > by for c, by in moved.items())]
+    outer = [r for r in references if r not in inner and any(_answers(s, r) for s in controls)]
+    inner += [r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved)]
+    return [*controls, *dict.fromkeys(inner)], states
 
 
 def _answers(command: Source, reference: Source) -> bool:

@@ -509,7 +509,7 @@ def propose(
     switches = [] if controls else take_switches(sources)
     commands, measured = assign_roles(sources, bool(states or controls))
     commands += switches
-    sources += [s for s in commands if s not in sources]  # columns of a table
+    sources += [s for s in [*commands, *measured] if s not in sources]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         why = [f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]]

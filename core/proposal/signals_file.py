@@ -80,7 +80,7 @@ def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
         return [*words, *words_of(candidate.kind)] if several_kinds else words
     inner = re.sub(rf"^({OF_QUATERNION})\(.*", r"\1", FieldPath(candidate.path).angle)
     inner = re.sub(rf"^({'|'.join(FUNCTIONS)})\(|\)$", "", inner)
-    words = [w for w in words_of(inner) if w not in _DULL]
+    words = [w for w in words_of(inner) if w not in _DULL or of_table(candidate.topic)]
     *folders, last = map(words_of, candidate.topic.strip("/").split("/"))
     of_topic = [*folders[-1], *last] if folders and all(len(w) == 1 for w in last) else last  # /gyro/z
     if all(len(w) == 1 or w.isdigit() for w in words):
