@@ -565,13 +565,15 @@ def test_words_of_a_switch_are_read_where_they_are_truths_and_told_where_not(tmp
     rows, heat = [], 20.0
     for k in range(600):
         on, fan = k // 40 % 2, ("low", "high", "off")[k // 70 % 3]
-        pump = k // 55 % 2
-        rows.append([0.1 * k, f"{heat:.4f}", ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3], ("STOP", "RUN")[pump]])
+        pump, line = k // 55 % 2, ("RUN", "IDLE", "STOP")[k // 35 % 3]  # the latter with a word that is no truth
+        words = ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3], ("STOP", "RUN")[pump], line
+        rows.append([0.1 * k, f"{heat:.4f}", *words])
         heat += 0.05 * (20 + 30 * on - 20 * pump - heat)
-    proposal = propose([csv(tmp_path / "a.csv", ["time", "heat", "heater", "fan", "fault_label", "pump"], rows)])
+    names = ["time", "heat", "heater", "fan", "fault_label", "pump", "line"]
+    proposal = propose([csv(tmp_path / "a.csv", names, rows)])
     assert signals_of(proposal) == ([("/table", "heat")], [("/table", "heater"), ("/table", "pump")]), proposal.text
     (said,) = [warning for warning in proposal.warnings if "words" in warning]
-    assert said.startswith("columns of words are no signals: fan (high, low, off);")
+    assert said.startswith("columns of words are no signals: fan (high, low, off), line (IDLE, RUN, STOP);")
 
 
 @pytest.mark.parametrize(

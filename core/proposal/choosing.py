@@ -285,9 +285,8 @@ def _within_loops(
 ) -> tuple[list[Source], list[Source]]:
     """Controls and states, where the loop that follows a reference is part of the machine.
 
-    What an actuator has reached (`throttle_position`) is measured, where a reference or a command shows in it, and more
-    than it in any command. A reference is a control where it shows more than commands in such an actuator, or clearly
-    in what no command does, and in no command: its controller's output is not there.
+    What an actuator has reached (`throttle_position`) is measured, where a reference or a command shows in it. A
+    reference is a control where it shows most there, or clearly in what no command does, and in no command.
     """
     every = [c for s in controls for c in s.free]
     named = [c for c in every if _REACHED.search(c.path if c.source.type == TABLE else c.topic)]

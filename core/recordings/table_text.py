@@ -227,7 +227,7 @@ def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str
     if by := _thousands(plain, commas):
         plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]
     decimal = delimiter != "," or commas  # in quotes between commas they may part thousands
-    comma = missing = odd = 0
+    comma = missing = odd = truths = 0
     first = ""
     for i, cell in enumerate(plain):
         low = cell.lower()
@@ -240,10 +240,11 @@ def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str
             comma += 1
         elif low in _TRUTH:
             numbers[i] = _TRUTH[low]
+            truths += 1
         else:
             odd += 1
             first = first or cell
-    if odd > 0.5 * (len(plain) - missing) or _INSTANT.match(first):
+    if odd > (ODD_SHARE if truths else 0.5) * (len(plain) - missing) or _INSTANT.match(first):
         unit = match["unit"] if (match := QUANTITY.fullmatch(first)) else ""
         written = (QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING)
         if not unit or len({*plain}) < 2 or not all(match and match["unit"] == unit for match in written):

@@ -147,8 +147,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
 
 
 def _says_days(table: RawTable, column: str) -> bool:
-    """Whether a column of days says so by its name, or by a time beside it that grows by as many seconds."""
-    span = 86_400 * np.ptp(table.columns[column])
+    span = 86_400 * np.ptp(table.columns[column])  # s, as a time beside it says
     others = (c for n, c in table.columns.items() if n != column and called_time(n) and c.dtype.kind in "iuf")
     return bool(re.search("date|datum", column.lower()) or any(abs(np.ptp(c) / span - 1) < 1e-3 for c in others))
 
