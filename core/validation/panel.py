@@ -537,11 +537,11 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
     """What the panel promises, a sentence each: false alarms, jumps seen, and what rate was asked for."""
     span = model.domain.span(model.operating_point.X)
     evidence = panel.evidence
-    of = list(zip(model.signals.states, panel.biases.tolist(), (panel.biases < _FAR * span).tolist(), strict=True))
+    of = list(zip(model.signals.states, panel.biases.tolist(), (panel.biases <= BLIND * span).tolist(), strict=True))
     each = [f"{s.name} {b:.3g}" + (f" {s.unit}" if s.unit else "") for s, b, near in of if near]
     blind = [s.name for s, _, near in of if not near]
     sees = [f"a jump of {shortlist(each, 2 * _NAMED)}"] if each else []
-    sees += [f"of {shortlist(blind, 4)} not even a jump of ten times the recorded range"] if blind else []
+    sees += [f"of {shortlist(blind, 4)} not even a jump of the whole recorded range"] if blind else []
     if math.isfinite(panel.limit):
         count, most = int(evidence.counts.sum()), float(f"{panel.limit:.2g}")
         units = f"{lasting(evidence.hours)} {shown} ({plural(panel.units, panel.what)})"
