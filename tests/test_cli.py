@@ -62,6 +62,14 @@ def test_check_ends_with_how_to_take_a_healthy_recording_into_the_model(folder, 
     last = cli("check", model, folder / "bad.mcap", status=1).out.splitlines()[-1]
     said, _, command = last.partition("uncertain-lti ")
     assert said == "if the machine was healthy: "
+    whole = Bag(folder / "bad.mcap")
+    every = [Message(m.topic, m.log_time_ns, m.data, m.log_time_ns) for m in whole.raw_messages()]
+    topics = [Topic(name, info.type) for name, info in whole.topics.items()]
+    parts = [
+        str(write(topics, some).save(tmp_path / f"run_{i}.mcap")) for i, some in enumerate((every[:300], every[300:]))
+    ]
+    in_parts = cli("check", model, *parts, status=1).out.splitlines()[-1]
+    assert shlex.split(in_parts)[-3:] == ["--force", *parts], "of one recording"
     cli(*shlex.split(command))
     assert "healthy" not in cli("check", model, folder / "bad.mcap").out
     UncertainLTI.load(model).replace(memory=None).save(model)

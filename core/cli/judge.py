@@ -158,10 +158,13 @@ def check(options: argparse.Namespace) -> Result:
         from uncertain_lti.reports.annotate import annotate, targets
 
         copies = dict(zip(bags, targets(options.write, bags), strict=True))
-    results = []
+    results, loud = [], list[str]()
     for bag, verdicts, decisions in judged:
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
+        if data["alarm"] and not data["reason"]:
+            files = bag.parts if len(bag.parts) > 1 and not bag.path.is_dir() else [bag.path]
+            loud += map(shlex.quote, map(str, files))
         options.say(check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
         if (copy := copies.get(bag)) is not None:
             writing = options.progress.iterate("writing")
@@ -176,7 +179,6 @@ def check(options: argparse.Namespace) -> Result:
     drift = drift_in_words(model, results)
     for text in drift:
         options.say(text)
-    loud = [shlex.quote(r["recording"]) for r in results if r["alarm"] and not r["reason"]]
     if loud and model.memory and not deployed.words():
         name, those = shlex.quote(options.model), " ".join(loud[:3]) + " ..." * (len(loud) > 3)
         options.say(f"if the machine was healthy: uncertain-lti fit --update {name} --output {name} --force {those}")
