@@ -261,8 +261,7 @@ def together(n: int, found: Sequence[Found]) -> Repeats:
 def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
     """Activity in each unbroken window, and the steps that show noise: `windows` and `noisy` of `Found`.
 
-    A long recording is looked at in parts that are spread over it: a share of its windows is asked for, and whether
-    many steps show noise.
+    Parts spread over a long recording do: a share of its windows is asked for, and whether many steps show noise.
     """
     found, noisy = list[Array](), np.zeros(model.n)
     t = transient.t_ns[steps.k]

@@ -369,8 +369,7 @@ class Engine:
     ) -> tuple[Array, GasPath]:
         """Mismatch of the five flow balances and all stations at a trial q.
 
-        q: flow coefficients of fan and compressor, ideal drops of both turbines and static pressure in the mixing
-        plane, each over its design value.
+        q: flow coefficients of fan and compressor, ideal drops of both turbines, static mixing pressure, over design.
         """
         d = self.design
         fuel, area, fan_vane, compressor_vane = u

@@ -63,7 +63,7 @@ def _turns(numbers: Sequence[Candidate]) -> bool:
 
 
 def _comes_to(numbers: Sequence[Candidate], used: Sequence[Candidate]) -> bool:
-    # an angle alone, which comes to rest where one of the commands, in its unit, is
+    """Whether it is an angle alone, which comes to rest where one of the commands, in its unit, is."""
     if len(numbers) > 1 or not _ANGLE.search(numbers[0].kind):
         return False
     steps = steps_of(numbers, used)
@@ -154,7 +154,7 @@ def one_of_them(pool: list[Candidate], used: list[Candidate], like: str) -> tupl
 
 
 def _most_are_others(pool: Sequence[Candidate], used: Sequence[Candidate], shared: Sequence[str]) -> bool:
-    # more members than those with commands of their own move by commands of none: wheels of a rover
+    """Whether more members than have commands of their own move by commands of none, as a rover's wheels do."""
     others = [c for c in pool if c.element and c.element not in shared]
     rest = [c for c in used if c.element not in shared]
     return bool(len({c.element for c in others}) > len(shared) and rest and most_shown(others, rest) > SHOWS)

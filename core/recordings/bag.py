@@ -239,8 +239,7 @@ class Bag(Recording):
     def _sorted(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[RawMessage]:
         """Messages of these channels of each file in order of log time, ties in file order.
 
-        Blocks are read in order of their smallest log time; what is earlier than every block still to be read
-        is final.
+        Blocks are read in order of their smallest log time; what is earlier than all that are left is final.
         """
         blocks: list[tuple[int, int, int, Block]] = sorted(
             (block.start, part, number, block)

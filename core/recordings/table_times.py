@@ -125,10 +125,10 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         unit, days = stated or "s", "write days of a spreadsheet as ISO times, or give `--table unit=d`"
         doubt = f"; {days}" * (not stated and _like_days(values))
         if doubt and np.median(np.abs(np.diff(values[np.isfinite(values)]))) < _HARDLY:
+            if not _says_days(table, column):
+                no = "has no unit, which may be s or days"
+                raise BagError(f"{where}: {no}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
             unit, doubt = "d", ""
-        if unit == "d" and not stated and not _says_days(table, column):
-            none = "has no unit, which may be s or days"
-            raise BagError(f"{where}: {none}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
         if unit == "s" and not stated and (step := _coarse(values)):
             doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
             ask = f"name it time_us or time_ms, or give `--table unit={likely}`"
@@ -147,7 +147,8 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
 
 
 def _says_days(table: RawTable, column: str) -> bool:
-    span = 86_400 * np.ptp(table.columns[column])  # s, as a time beside it says
+    """Whether a column of days is one by its name, or by a time beside it that grows by as many seconds."""
+    span = 86_400 * np.ptp(table.columns[column])
     others = (c for n, c in table.columns.items() if n != column and called_time(n) and c.dtype.kind in "iuf")
     return bool(re.search("date|datum", column.lower()) or any(abs(np.ptp(c) / span - 1) < 1e-3 for c in others))
 
@@ -374,8 +375,9 @@ def _spelt(text: str) -> str:
         return text.replace(".", ":")
     if _ISO.match(text) or _CLOCK.match(text):
         return text
-    zone = found[1] if (found := _ZONE.search(re.sub(r"\s([A-Z]{3,4})\s(\d{4})$", r" \2 \1", text))) else ""
-    text, zone = found.string[: found.start()] if found else text, _ZONES.get(zone, zone)
+    zone, year_last = "", re.sub(r"\s([A-Z]{3,4})\s(\d{4})$", r" \2 \1", text)
+    if found := _ZONE.search(year_last):
+        text, zone = year_last[: found.start()], _ZONES.get(found[1], found[1])
     if half := _HALF.fullmatch(text):
         day, hour, minutes, seconds, letter = half.groups("00")
         of = int(hour) % 12 + 12 * (letter in "Pp") if int(hour) <= 12 else int(hour)

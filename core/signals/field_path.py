@@ -303,15 +303,14 @@ class FieldPath:
 
     def _look_up(self, message: Any) -> tuple[Any, tuple[str, str | int, list[str]] | None]:
         """The value; or the array that lacks an entry, with its name, the key and the names of the message."""
-        value, name = message, ""
-        named: Sequence[object] = ()
+        value, around, name = message, list[Any](), ""
         for kind, key in self.steps:
             if kind == "attribute":
-                own = (getattr(value, of, "") for of in _NAMES)
-                named = next((one for one in own if not isinstance(one, str)), named)
+                around.append(value)
                 value, name = getattr(value, str(key)), str(key)
                 continue
-            names = [str(one) for one in named] if kind == "name" else []
+            named = (getattr(one, of, "") for one in reversed(around) for of in _NAMES) if kind == "name" else ()
+            names = [str(one) for one in next((some for some in named if not isinstance(some, str)), ())]
             index = int(key) if kind == "index" else names.index(str(key)) if key in names else len(value)
             if index >= len(value):
                 return value, (name, key, names)
