@@ -245,18 +245,19 @@ def alarm_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tu
     if columns.alarm.any():
         first = int(columns.starts[columns.alarm.argmax()])
         raised = verdicts.raised(first + int(verdicts.alarm[first:].argmax()))
-    return score_panel(columns, score, raised[0].words if raised else ""), states
+    return score_panel(columns, score, f"first {raised[0].what}, " if raised else ""), states
 
 
-def score_panel(columns: Columns, score: Array, note: str = "") -> Panel:
-    """A score (P,) over its threshold, which it is never below while the alarm is up."""
+def score_panel(columns: Columns, score: Array, first: str = "") -> Panel:
+    """A score (P,) over its threshold, which it is never below while the alarm is up; `first`: what raised it."""
     score = np.where(columns.alarm, np.fmax(score, 1.0), score)
     greatest, never = float(np.nanmax(score, initial=0.0)), "never over it" if np.isfinite(score).any() else ""
+    over = greatest > 1 or bool(columns.alarm.any())
     capped = np.minimum(score, FARTHEST)
     return Panel(
         "alarm score, 1 is the threshold", (Series("score", np.where(np.isnan(capped), np.nan, 0.0), capped),),
         limits=(0.0, float(np.clip(1.1 * greatest, 1.5, 6.0))), levels=(1.0,),
-        note=note or (never if greatest <= 1 else f"greatest {greatest:.3g}"),
+        note=first + f"greatest {greatest:.3g}" if over else never,
     )  # fmt: skip
 
 

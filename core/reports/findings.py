@@ -35,6 +35,7 @@ from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.domain import UNVOUCHED
 from uncertain_lti.model.interchange import block_facts
 from uncertain_lti.model.uncertain_lti import UncertainLTI
+from uncertain_lti.monitor.alarm import times_text
 from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.reports.check import check_data, instant_text, raised_by
@@ -173,6 +174,8 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         text += f". {longest['text']}, while {shortlist(longest['moving'], 3)} moved"
     if alarms := recording["alarms"]:
         by = "".join(f", by {words}" for words in raised_by(alarms[0])[:1])
+        if (far := recording["farthest"]) and far["k"] != alarms[0]["k"]:
+            by += f"; at most {times_text(far['value'])} times, by {far['what']} at {instant_text(far, '.8g')}"
         text = f"The alarm was raised {times(len(alarms))}, first at {instant_text(alarms[0], '.8g')}{by}. {text}"
     return {"recording": recording["recording"], "state": state, "text": text}
 
