@@ -127,11 +127,12 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
 
 
 _WITHIN = "answers within a step; add it if it has a memory of its own"
+_EFFORT = "an effort answers within a step; with it, friction and load show that a position loop hides"
 _BESIDE = (
     (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist beside it"),
     (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", f"an acceleration {_WITHIN}"),
     (r"^velocity\[.*wheel", r"^position\[(?!.*steer).*wheel", "grows with the way; its rate of change is beside it"),
-    (r"^(position|velocity)\[", r"^effort\[", f"an effort {_WITHIN}"),
+    (r"^(position|velocity)\[", r"^effort\[", _EFFORT),
 )
 """What is left out beside what, and why: of pose and twist the pose, of a wheel the angle, of a joint the effort."""
 
@@ -142,7 +143,7 @@ def prefer_rates(source: Source) -> None:
     for there, left, reason in _BESIDE:
         if any(re.search(there, path) for path in moves):
             for candidate in (c for c in source.free if re.search(left, c.path)):
-                candidate.reason = reason
+                candidate.reason, candidate.ready = reason, "state" * (reason is _EFFORT)
 
 
 _ROWS = 1 << 14

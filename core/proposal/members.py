@@ -47,9 +47,11 @@ def pair_entries(pool: Sequence[Candidate], used: Sequence[Candidate]) -> None:
     named: Members = defaultdict(list)
     for candidate in (c for c in pool if c.element):
         named[candidate.element].append(candidate)
-    for commands in _indexed(used):
-        for every in [named, *_indexed(pool)]:
-            members = {name: its for name, its in every.items() if _turns(its) or _comes_to(its, used)}
+    arrays = _indexed(used)
+    groups = [named, *_indexed(pool)] if arrays else []
+    groups = [{name: of for name, of in all_.items() if _turns(of) or _comes_to(of, used)} for all_ in groups]
+    for commands in arrays:
+        for members in groups:
             if whose := _whose([*commands.values()], members):
                 for name, its in [*zip(whose, commands.values(), strict=True), *members.items()]:
                     for candidate in its:
