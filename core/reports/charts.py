@@ -245,7 +245,7 @@ def alarm_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tu
     if columns.alarm.any():
         first = int(columns.starts[columns.alarm.argmax()])
         raised = verdicts.raised(first + int(verdicts.alarm[first:].argmax()))
-    return score_panel(columns, score, f"first {raised[0].what}, " if raised else ""), states
+    return score_panel(columns, score, f"raised by {raised[0].what}; " if raised else ""), states
 
 
 def score_panel(columns: Columns, score: Array, first: str = "") -> Panel:
