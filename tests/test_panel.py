@@ -428,10 +428,14 @@ def test_quiet_of_a_machine_that_is_parked_says_nothing(model, moved):
     assert (data["outcome"] == "unknown") == (moved is not None) == data["reason"].startswith("nothing that is judged")
 
 
-def test_one_recording_does_not_vouch_for_another_day(runs):
+def test_one_recording_does_not_vouch_for_another_day(runs, learnt):
+    told = "says nothing of another day: fit 4 or more, or expect alarms"
     alarm = fit(runs[:1], "lp", additive="noise").fit_summary["alarm"]
-    assert alarm["what"] == "block" and alarm["worth"] == "some"
-    assert "says nothing of another day: fit 4 or more, or expect alarms" in alarm["headline"]
+    assert alarm["what"] == "block" and alarm["worth"] == "some" and told in alarm["headline"]
+    full, _, panel = learnt
+    for what in ("block", "recording"):  # also where some of its blocks are unlike the others
+        kind, words = worth(full, replace(panel, unlike=("part",), what=what))
+        assert kind == "some" and "not repeat" in words and (told in words) == (what == "block")
 
 
 def test_a_combination_that_the_others_lack_is_far_though_each_signal_is_in_its_range():

@@ -518,15 +518,18 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     if len(coarse) == model.n:
         missing = "what moves the states may be missing among the controls"
         return "some", f"worth little: it sees jumps of {ranges} only, which a plot shows as well; {missing}"
+    alone = panel.what == "block" or panel.units == 1
+    further = f"fit {TELLING} or more, or expect alarms in healthy ones"
     if count:
         return "some", (
             f"worth having within what was recorded: {unlike}, so nothing vouches for operation that none of them shows"
+            + f"; one recording says nothing of another day: {further}" * alone
         )
     sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
-    if panel.what == "block" or panel.units == 1:
+    if alone:
         return "some", (
-            f"worth having while the machine runs as in the one recording, which says nothing of another day: fit "
-            f"{TELLING} or more, or expect alarms in healthy ones; {sees}"
+            "worth having while the machine runs as in the one recording, which says nothing of another day: "
+            f"{further}; {sees}"
         )
     if 2 * panel.alarming > panel.units:
         return "some", f"worth having, but expect an alarm in most healthy recordings: {sees}"
