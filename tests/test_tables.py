@@ -20,6 +20,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import ROOT
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from processes import bounded
 from refusals import refuses
 
@@ -984,8 +986,46 @@ def test_names_in_several_lines_and_what_is_behind_rows_and_files_cost_no_row(te
 
 
 def test_a_first_row_with_a_cell_that_is_too_long_is_not_passed_over(tmp_path):
+    rows = [f"0,1,{'y' * 200_000}", *(f"{k},{k % 7},z" for k in range(1, 50))]
+    assert len(read_csv(tmp_path, "time,x,note", rows).times) == 50
     with pytest.raises(BagError, match=r"line 2 cannot be read \(field larger than field limit"):
-        read_csv(tmp_path, "time,x,note", [f"0,1,{'y' * 200_000}", *(f"{k},{k % 7},z" for k in range(1, 50))])
+        read_csv(tmp_path, "time,x,note", [*rows, "50,1"])  # which is looked at line by line
+
+
+CELLS = [
+    "1.5",
+    "-2e3",
+    "",
+    "NA",
+    "nan",
+    "on",
+    "off",
+    "7 rpm",
+    "1,5",
+    '"1,234.5"',
+    "1.234",
+    "1_0",
+    '"a ""b"" c"',
+    "\u22123",
+    " 4 ",
+]
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    delimiter=st.sampled_from([",", ";", "\t"]),
+    odd=st.lists(st.tuples(*[st.sampled_from(CELLS)] * 3), min_size=1, max_size=4),
+)
+def test_a_file_read_at_once_is_that_read_line_by_line(tmp_path, delimiter, odd):
+    """A line that is cut at the end has each looked at; cells that are no plain numbers come late in the file."""
+    rows = [("time", "a", "b", "c"), *((f"2026-03-01 00:00:{k:02}", "1", f"{k / 7}", "on") for k in range(45))]
+    rows += [(f"2026-03-01 00:01:{k:02}", *cells) for k, cells in enumerate(odd)]
+    quoted = ((f'"{cell}"' if delimiter in cell and '"' not in cell else cell for cell in row) for row in rows)
+    lines = [*map(delimiter.join, quoted)]
+    found = [read_table(write(tmp_path / "a.csv", *lines, *cut)) for cut in ([], ["9"])]
+    assert [*found[0].columns] == [*found[1].columns] and found[0].notes == found[1].notes[1:]
+    for one, other in zip(*(table.columns.values() for table in found), strict=True):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_a_parquet_without_rows_or_with_a_name_twice(tmp_path):

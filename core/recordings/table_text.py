@@ -51,11 +51,13 @@ _CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes
 _ARROW = re.compile(r"(\d\d:\d\d:\d\d\.\d{3}) -> (.*)", re.DOTALL)  # as the serial monitor of Arduino writes a line
 QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?P<unit>[^\W\d_]\S{0,7}|[%°]\S{0,7})")
 _MOST_COLUMNS = 20_000
+_ODD_CELL = re.compile(r"could not convert string .* at row (\d+), column (\d+)")  # of numpy.loadtxt
+_MOST_PASSED = 10**6  # rows that may be passed over again for such cells
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
 
 Column = NDArray[Any]
-"""Numbers, (rows,) or (rows, parts); text, (rows,) of object; or instants, (rows,) of datetime64[ns]."""
+"""Numbers, (rows,) or (rows, parts); text or cells, (rows,) of object; or instants, (rows,) of datetime64[ns]."""
 
 
 @dataclass
@@ -112,16 +114,34 @@ def read_csv(path: Path) -> RawTable:
     shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), mend=mend)
     names, notes = unique(shape.names), [shape.note] * bool(shape.note)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
-    values = np.empty((0, 0))
-    with suppress(ValueError, OverflowError), open(path, encoding=encoding, errors="replace", newline="") as text:
-        apart = shape.delimiter.strip(" ") or None
-        values = np.loadtxt(text, delimiter=apart, skiprows=shape.skip, comments=None, quotechar='"', ndmin=2)
-    if values.shape[1] != len(names) or not len(values):
-        read = _read_cells(path, encoding, shape, names)
-        return replace(read, units=units, notes=notes + read.notes)
-    exact = partial(_texts, path, encoding, shape, names)
-    found = dict(zip(names, np.ascontiguousarray(values.T), strict=True))
-    return RawTable(found, notes, exact, units)
+    first = [_split(line, shape.delimiter) for line in lines[shape.skip :]]
+    read = _read_at_once(path, encoding, shape, names, first) or _read_cells(path, encoding, shape, names)
+    return replace(read, units=units, notes=notes + read.notes)
+
+
+def _read_at_once(
+    path: Path, encoding: str, shape: _Shape, names: Sequence[str], first: Sequence[Sequence[str]]
+) -> RawTable | None:
+    """Columns of numbers where all cells are some, others of cells; None where lines have to be looked at."""
+    columns_of_first = zip(*(cells for cells in first if len(cells) == len(names)), strict=True)
+    numbers = [all(map(_NUMBER.match, cells)) for cells in columns_of_first]
+    columns: list[Column] = []
+    apart, passed = shape.delimiter.strip(" ") or None, 0
+    while any(numbers) and not columns and passed < _MOST_PASSED and not shape.mend:
+        kinds = [(f"f{i}", "f8" if number else "O") for i, number in enumerate(numbers)]
+        try:
+            with open(path, encoding=encoding, errors="replace", newline="") as text:
+                table = np.loadtxt(text, kinds, None, apart, skiprows=shape.skip, quotechar='"', ndmin=1)
+            columns = [np.ascontiguousarray(table[name]) for name, _ in kinds]
+        except (ValueError, OverflowError) as error:
+            if not (odd := _ODD_CELL.search(str(error))):
+                return None
+            numbers[int(odd[2]) - 1], passed = False, passed + int(odd[1])
+    wholes = ["".join(cells) if cells.dtype.kind == "O" else "" for cells in columns]
+    if not columns or any(mark in whole for whole in wholes for mark in ",\n\r"):
+        return None  # 1.234 may be another number where commas part decimals; a quote may not be closed
+    read = _columns(names, columns, wholes, shape.delimiter)
+    return replace(read, exact=partial(_texts, path, encoding, shape, names))
 
 
 def _names_on_one_line(lines: list[str]) -> list[str]:
@@ -199,30 +219,38 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     if odd:
         cut = " (the file ends in it)" if odd == 1 and first_odd == line else ""
         notes.append(f"{plural(odd, 'line')} with another number of cells left out, the first is line {first_odd}{cut}")
+    read = _columns(names, [np.array(c, dtype=object) for c in columns], [*map("".join, columns)], shape.delimiter)
+    texts = dict(zip(names, columns, strict=True))
+    return replace(read, notes=notes + read.notes, exact=lambda name: [cell.strip() for cell in texts[name]])
+
+
+def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[str], delimiter: str) -> RawTable:
+    """Columns of cells by what all of them tell, and what was done; those of numbers as they are."""
     found: dict[str, Column] = {}
     noted: dict[str, list[str]] = {}
-    commas = any("," in cell and _has_comma(cell.strip()) for texts_of in columns for cell in texts_of)
-    for name, texts_of in zip(names, columns, strict=True):
-        if name.startswith("column ") and not any(texts_of):
+    texts = (cells for cells, whole in zip(columns, wholes, strict=True) if "," in whole)
+    commas = any("," in cell and _has_comma(cell.strip()) for cells in texts for cell in cells)
+    for name, cells, whole in zip(names, columns, wholes, strict=True):
+        if cells.dtype.kind != "O":
+            found[name] = cells
+            continue
+        if name.startswith("column ") and not whole:
             continue  # a delimiter at the end of each line
-        found[name], note = _column(texts_of, commas, shape.delimiter)
+        # 1.234 is one number to all, and another here; `1_0` is 10 to Python alone
+        if "_" not in whole and not (commas and any(_GROUPED.match(cell.strip()) for cell in cells)):
+            with suppress(ValueError):
+                found[name] = np.where(cells == "", "nan", cells).astype(np.float64)
+                continue
+        found[name], note = _column(cells.tolist(), commas, delimiter)
         if note:
             noted.setdefault(note, []).append(name)
-    for note, of in noted.items():
-        notes.append(f"column{'s' * (len(of) > 1)} {shortlist([repr(name) for name in of], 6)}: {note}")
-    texts = dict(zip(names, columns, strict=True))
-    return RawTable(found, notes, lambda name: [cell.strip() for cell in texts[name]])
+    words = ((note, shortlist([repr(name) for name in of], 6), "s" * (len(of) > 1)) for note, of in noted.items())
+    return RawTable(found, [f"column{several} {of}: {note}" for note, of, several in words])
 
 
 def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str]:
     """Numbers where most cells are some, else text; and what was done; `commas`: whether they part its decimals."""
     plain = [cell.strip().replace("\u2212", "-") for cell in cells]  # the minus of some languages
-    grouped = commas and any(map(_GROUPED.match, plain))  # 1.234 is one number to all, and another here
-    if not grouped and not any("_" in cell for cell in cells):  # `1_0` is 10 to Python alone
-        with suppress(ValueError):
-            return np.array([float(cell) for cell in cells]), ""
-        with suppress(ValueError):
-            return np.array([np.nan if cell.lower() in _MISSING else float(cell) for cell in plain]), ""
     numbers = np.full(len(plain), np.nan)
     if by := _thousands(plain, commas):
         plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]

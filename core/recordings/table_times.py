@@ -347,6 +347,8 @@ def goes_forward(column: Column) -> bool:
 def _with_colons(cells: Sequence[object]) -> Sequence[object]:
     """Times of day such as 18.00.00, and minutes and seconds such as 14:11.6, as others are written."""
     texts = [str(cell).strip() for cell in cells]
+    if not {".", ","} & {*"".join(texts)}:
+        return cells
     if any(map(_dotted, texts)):
         return [text.replace(".", ":") if _DOTTED.fullmatch(text) else text for text in texts]
     if sum(map(bool, map(_MINUTES.fullmatch, texts))) < (1 - ODD_SHARE) * sum(map(bool, texts)):
@@ -369,12 +371,12 @@ def _dotted(text: str) -> bool:
 def _spelt(text: str) -> str:
     """An instant as people and controllers write it, such as 13-Mar-24 1:05:03 PM, as ISO does; else as it is."""
     text = text.strip()
+    if _ISO.match(text) or _CLOCK.match(text):
+        return text
     if _MINUTES.fullmatch(text):
         return f"0:{text}"
     if _dotted(text):
         return text.replace(".", ":")
-    if _ISO.match(text) or _CLOCK.match(text):
-        return text
     zone, year_last = "", re.sub(r"\s([A-Z]{3,4})\s(\d{4})$", r" \2 \1", text)
     if found := _ZONE.search(year_last):
         text, zone = year_last[: found.start()], _ZONES.get(found[1], found[1])
@@ -534,7 +536,8 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
     text = f"{day}T{(clock or '00:00').replace(',', '.')}"
     if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
         raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
-    late = 86_400 * 10**9 * bool(re.search(r"T24:00(:00([.]0*)?)?$", text))  # how a day ends in ISO 8601
+    midnight = "T24" in text and re.search(r"T24:00(:00([.]0*)?)?$", text)  # how a day ends in ISO 8601
+    late = 86_400 * 10**9 * bool(midnight)
     text = text.replace("T24:", "T00:") if late else text
     if not zone or zone in ("Z", "UTC"):
         return text, -late
