@@ -269,10 +269,12 @@ def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str
         elif low in _TRUTH:
             numbers[i] = _TRUTH[low]
             truths += 1
+        elif not first and _INSTANT.match(cell):
+            return np.array(plain, dtype=object), ""
         else:
             odd += 1
             first = first or cell
-    if odd > (ODD_SHARE if truths else 0.5) * (len(plain) - missing) or _INSTANT.match(first):
+    if odd > (ODD_SHARE if truths else 0.5) * (len(plain) - missing):
         unit = match["unit"] if (match := QUANTITY.fullmatch(first)) else ""
         written = (QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING)
         if not unit or len({*plain}) < 2 or not all(match and match["unit"] == unit for match in written):
