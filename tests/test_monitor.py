@@ -11,6 +11,7 @@
 
 import math
 from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ from test_transient import runs
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.clock import Status
 from uncertain_lti.sampling.sampler import Step
@@ -235,6 +236,22 @@ def test_a_transient_without_samples_has_no_verdict() -> None:
     for count in (0, 1):
         verdicts = EnvelopeMonitor(scalar()).check(Transient(np.zeros(count), np.zeros((count, 1)), []))
         assert len(verdicts.judged) == count and not verdicts.judged.any() and not verdicts.alarm.any()
+
+
+def test_verdicts_are_the_same_for_all_threads_that_ask() -> None:
+    """Statistics are computed when first asked for; threads that asked at once shared the windows, and broke memory."""
+    model = random_model(np.random.default_rng(3), 2, 1)
+    rules = [StatisticRule(kind, window_s=1.0, threshold=[1.0, 1.0]) for kind in ("energy", "mean", "ewma")]
+    rng = np.random.default_rng(0)
+    count = 60_000
+    run = Transient(np.arange(count) * 0.01, rng.normal(size=(count, 2)), rng.normal(size=(count, 1)))
+    monitor = EnvelopeMonitor(model, rules=rules)
+    expected = monitor.check(run).statistics
+    for _ in range(5):
+        verdicts = monitor.check(run)
+        with ThreadPoolExecutor(4) as pool:
+            for found in pool.map(lambda _, one: one.statistics, range(4), [verdicts] * 4):
+                np.testing.assert_array_equal(found, expected)
 
 
 def test_each_check_starts_from_a_cleared_alarm() -> None:

@@ -427,8 +427,11 @@ class EnvelopeMonitor:
         each, dt = np.zeros((count, len(self.alarms.rules)), dtype=bool), np.zeros(count)
         dt[steps.k + 1] = steps.dt
         rows_of = [seen[UTILISATION], *longer, seen[RESIDUAL], *longer_residual]
-        alarms = Alarm(self.alarms.rules, model, self._counted)
-        over = partial(alarms.over, _alarm_spans(transient.t_ns, armed), dt, violated, rows_of, judged)
+        spans = _alarm_spans(transient.t_ns, armed)
+
+        def over(**into: Any) -> NDArray[np.bool_]:
+            alarms = Alarm(self.alarms.rules, model, self._counted)  # threads may ask for the statistics at once
+            return alarms.over(spans, dt, violated, rows_of, judged, **into)
 
         @cache
         def statistics() -> tuple[Array, NDArray[np.int16]]:
@@ -437,7 +440,7 @@ class EnvelopeMonitor:
             over(values=values, blamed=blamed)
             return values, blamed
 
-        alarm = over(each)
+        alarm = over(each=each)
         if why:
             alarm |= frozen.any(axis=1) & armed.counts
         return Verdicts(
