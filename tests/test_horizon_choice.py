@@ -105,6 +105,17 @@ def test_statistics_at_a_horizon_take_the_residuals_of_the_model_fitted_without(
         np.testing.assert_allclose(sizes_of(rules, part) ** power, np.nan_to_num(expected), rtol=1e-12)
 
 
+def test_a_model_with_horizons_in_its_alarm_is_validated_with_them() -> None:
+    """It was fitted again without them, so that its own rules asked for rows that no part had."""
+    model = uncertain_lti.fit(RUNS, "lp", additive="noise", horizons=[2, 5])
+    assert 5 in {rule.horizon for rule in model.alarm}
+    validation = uncertain_lti.validate(model, RUNS)
+    assert validation.model.steps == model.steps
+    assert validation.judged_as(model).to_dict()["false_alarms"][0]["rule"] == "; or ".join(
+        rule.words for rule in model.alarm
+    )
+
+
 def test_horizons_that_lose_are_refused() -> None:
     """Every recording has a bias of its own in the rate: what is left out drifts off, and longer horizons show it."""
     rng = np.random.default_rng(5)

@@ -113,9 +113,8 @@ def leave_out(
     options |= {
         "operating_point": full.operating_point,
         "schedule": full.schedule or {},  # none, even where the signals file asks for one
-        "horizons": full.steps,
-        "widths": {horizon.steps: horizon.widths for horizon in full.horizons},
         "drop_horizons": True,  # where a part is too short for one, the others are judged
+        **_horizons(full),
     }
     further = [s.name for s in full.signals.scheduling]
     transients = [controls_as(t.scheduled_on(further), full.signals.controls) for t in transients]
@@ -210,7 +209,9 @@ def validate(
     if (progress := options.get("progress")) is not None:
         progress("the fit to all recordings")
     runs = listed_transients(transients)
-    again = fit(runs, operating_point=subject.operating_point, schedule=subject.schedule or {}, **own)
+    again = fit(
+        runs, operating_point=subject.operating_point, schedule=subject.schedule or {}, **own, **_horizons(subject)
+    )
     if not _same(again, subject):
         raise FitError(
             "these recordings do not give this model again, so what was left out of them would say nothing about it; "
@@ -221,6 +222,10 @@ def validate(
         again = again.replace(residuals=kept)
     groups = None if isinstance(groups, str) and groups == "none" else groups
     return leave_out(runs, alarm_rule=subject.alarm_rule, groups=groups, full=again, **options, **own)
+
+
+def _horizons(model: UncertainLTI) -> dict[str, Any]:
+    return {"horizons": model.steps, "widths": {horizon.steps: horizon.widths for horizon in model.horizons}}
 
 
 def _options(model: UncertainLTI) -> Mapping[str, Any]:
