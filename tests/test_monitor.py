@@ -10,6 +10,7 @@
 """EnvelopeMonitor: one sample at a time or a whole transient, the same bits; and which verdicts count."""
 
 import math
+import pickle
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
@@ -96,6 +97,11 @@ def test_masks_and_rules_are_held_against_the_model() -> None:
     assert EnvelopeMonitor(model, masked=["x1"]).masked == ("x1",)
     with pytest.raises(ModelError, match="masked state 'x2' is not in the model; its states are x0, x1"):
         EnvelopeMonitor(model, masked=["x2"])
+    for one in ("x1", iter(["x1"]), {"x1"}):  # an iterator was used up before it masked anything
+        assert EnvelopeMonitor(model, masked=one).masked == ("x1",)
+    assert EnvelopeMonitor(model, *np.array([2, 3])).rule == AlarmRule(2, 3)
+    with pytest.raises(ModelError, match="alarm is of type AlarmRule; give a list of AlarmRule or StatisticRule"):
+        EnvelopeMonitor(model, rules=AlarmRule())
     with pytest.raises(ModelError, match="every state of the model is masked"):
         EnvelopeMonitor(model, masked=["x0", "x1"])
     with pytest.raises(ModelError, match=r"violations is 1.5 of window 3; it takes whole numbers"):
@@ -238,7 +244,7 @@ def test_a_transient_without_samples_has_no_verdict() -> None:
         assert len(verdicts.judged) == count and not verdicts.judged.any() and not verdicts.alarm.any()
 
 
-def test_verdicts_are_the_same_for_all_threads_that_ask() -> None:
+def test_verdicts_are_the_same_for_all_threads_and_processes_that_ask() -> None:
     """Statistics are computed when first asked for; threads that asked at once shared the windows, and broke memory."""
     model = random_model(np.random.default_rng(3), 2, 1)
     rules = [StatisticRule(kind, window_s=1.0, threshold=[1.0, 1.0]) for kind in ("energy", "mean", "ewma")]
@@ -246,7 +252,12 @@ def test_verdicts_are_the_same_for_all_threads_that_ask() -> None:
     count = 60_000
     run = Transient(np.arange(count) * 0.01, rng.normal(size=(count, 2)), rng.normal(size=(count, 1)))
     monitor = EnvelopeMonitor(model, rules=rules)
-    expected = monitor.check(run).statistics
+    verdicts = monitor.check(run)
+    expected = verdicts.statistics
+    for copy in (pickle.loads(pickle.dumps(monitor.check(run))), pickle.loads(pickle.dumps(verdicts))):  # of processes
+        np.testing.assert_array_equal(copy.statistics, expected)
+        np.testing.assert_array_equal(copy.lower, verdicts.lower)
+        assert copy.raised(9) == verdicts.raised(9) and repr(copy) == repr(verdicts)
     for _ in range(5):
         verdicts = monitor.check(run)
         with ThreadPoolExecutor(4) as pool:

@@ -16,6 +16,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+import numpy as np
+
 from uncertain_lti.base.arrays import LARGEST, LONGEST_S
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.text import plural
@@ -59,6 +61,9 @@ class AlarmRule:
     horizon: int = 1
 
     def __post_init__(self) -> None:
+        for name in ("violations", "window", "horizon"):
+            if isinstance(value := getattr(self, name), np.integer):
+                object.__setattr__(self, name, int(value))
         m, n = self.violations, self.window
         if not (is_whole(m) and is_whole(n) and 1 <= m <= n <= LONGEST_WINDOW):
             raise ModelError(
@@ -204,6 +209,7 @@ def with_containment(rules: Sequence[Rule], rule: AlarmRule) -> tuple[Rule, ...]
 
 def checked_rules(rules: Sequence[Rule]) -> tuple[Rule, ...]:
     """The rules of one alarm."""
+    refuse_other(rules, Iterable, "alarm", "give a list of AlarmRule or StatisticRule", ModelError)
     rules = tuple(rules)
     for rule in rules:
         refuse_other(rule, (AlarmRule, StatisticRule), "alarm: a rule", "give AlarmRule or StatisticRule", ModelError)

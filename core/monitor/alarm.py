@@ -132,6 +132,9 @@ class Alarm:
         over = [(part, row) for part, row in zip(self._parts, self._rows, strict=True) if isinstance(part, Statistic)]
         self._statistics = Statistics([part for part, _ in over], [row * model.n for _, row in over])
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Alarm, (self.rules, self._model, self._counted)
+
     def _part(self, rule: Rule, row: int) -> Window | Statistic:
         """What a rule makes of verdicts; a row of the table begins at its number times n."""
         n = self._model.n

@@ -126,6 +126,7 @@ class EnvelopeMonitor:
         self.rule = replace(model.alarm_rule, **given)
         every = with_containment(model.alarm, self.rule) if given else model.alarm
         names = model.state_names
+        masked = [masked] if isinstance(masked, str) else list(masked)
         for name in masked:
             if name not in names:
                 raise ModelError(f"masked state '{name}' is not in the model; its states are {', '.join(names)}")

@@ -14,8 +14,8 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cache
+from dataclasses import dataclass, fields
+from functools import cache, partial
 from typing import Any
 
 import cython
@@ -319,6 +319,10 @@ class Foreseen:
         return bytes(numbers)
 
 
+def _kept(value: Any) -> Any:
+    return value
+
+
 @dataclass(frozen=True, repr=False)
 class Verdicts:
     """Verdicts over one transient, one row per sample k = 0..N; row k judges the arrival at t_k.
@@ -391,6 +395,11 @@ class Verdicts:
     why_frozen: dict[tuple[int, int], str]
     asked: NDArray[np.bool_]
     armed: NDArray[np.bool_]
+
+    def __reduce__(self) -> tuple[Any, ...]:  # with the numbers, not what computes them
+        given = {one.name: getattr(self, one.name) for one in fields(self)}
+        later = {name: partial(_kept, given[name]()) for name in ("numbers", "over_thresholds")}
+        return partial(Verdicts, **given | later), ()
 
     def __repr__(self) -> str:
         judged, left = int(self.judged.sum()), int(self.violated.sum())
