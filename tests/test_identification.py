@@ -23,6 +23,7 @@ from uncertain_lti.identification import fit, passes, programmes, solvers, worki
 from uncertain_lti.identification.assembly import assemble
 from uncertain_lti.identification.problem import Columns, Problem, Regimes, solve_as_written
 from uncertain_lti.identification.structure import Structure
+from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.plants.leibov import leibov2006
 
@@ -347,11 +348,13 @@ def test_wrong_options_are_refused():
         (dict(operating_point=OperatingPoint.identity(3, 1)), "3 states"),
         (dict(operating_point=(0.0, 0.0, 1.0, 1.0)), "OperatingPoint is of type tuple; give one"),
         (dict(structure={"a": 0.0}), "Structure is of type dict; give one"),
-        *((dict(additive="noise", discard=budget), "discard is") for budget in (-1, 1.5, np.nan, True)),
+        *((dict(additive="noise", discard=budget), "discard is") for budget in (-1, 1.5, np.nan, True, "1", None)),
     ]
     for options, words in cases:
         refuses(FitError, words, fit, transient, **options)
     refuses(FitError, "no transients", fit, [])
+    refuses(FitError, "false_alarms is '1'; give a positive number", uncertain_lti.fit, transient, false_alarms="1")
+    refuses(ModelError, "alarm is of type AlarmRule; give a list", uncertain_lti.fit, transient, alarm=AlarmRule())
     other = Transient(transient.t_ns, transient.x, transient.u, state_names=["a", "b"])
     refuses(FitError, "read all recordings with one signals file", fit, [transient, other])
     fewer = Transient(transient.t_ns, transient.x[:, :1], transient.u)

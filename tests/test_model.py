@@ -131,6 +131,7 @@ def test_samples_controls_and_steps_are_broadcast() -> None:
 def test_wrong_shapes_are_said(x: tuple[int, ...], u: tuple[int, ...]) -> None:
     model = random_model(np.random.default_rng(0), 3, 1)
     refuses(ModelError, "they must end in 3 and 1", model.bounds, np.ones(x), np.ones(u), 0.1)
+    refuses(ModelError, "give as many of each, or one for all", model.bounds, np.ones((5, 3)), np.ones((2, 1)), 0.1)
 
 
 # --- discrepancies (4)(5) and the nominal model ---------------------------------------------------------------

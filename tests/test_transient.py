@@ -201,7 +201,7 @@ def test_an_empty_run_and_a_single_sample_have_no_transition() -> None:
         (([[0.0], [1.0]], [1.0, 2.0], []), {}, r"t has shape \(2, 1\); it must be a vector"),
         (([0.0, NAN], [1.0, 2.0], []), {}, r"t\[1\] is nan; leave out samples without a time"),
         ((np.array([0, "NaT"], "datetime64[s]"), [1.0, 2.0], []), {}, r"t\[1\] is not a time"),
-        ((["a", "b"], [1.0, 2.0], []), {}, "t is not numeric; give seconds, or integer nanoseconds"),
+        ((["a", "b"], [1.0, 2.0], []), {}, "t is not numeric; give seconds, integer nanoseconds or datetime64"),
         (([1.7e18, 1.8e18], [1.0, 2.0], []), {}, r"t reaches 1.8e\+18 s; give seconds, or nanoseconds as an array"),
         (([0, 1, 2], [1.0, 2.0, 3.0], []), {}, "integers are nanoseconds, and the steps are 1; give seconds as floats"),
         ((np.array([2**63, 2**63 + 10**9], np.uint64), [1.0, 2.0], []), {}, "past what 64 bits hold"),
@@ -213,6 +213,9 @@ def test_an_empty_run_and_a_single_sample_have_no_transition() -> None:
         (([0.0, 1.0], [1.0, 2.0], []), {"state_names": ["a", "b"]}, "2 names for 1 column of x"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": "ab"}, "give a list, one for each"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": ["a", "a"]}, "two columns of x have the same name"),
+        (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": ["a", ""]}, "a column of x is called ''; give"),
+        (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": [1, 2]}, "a column of x is called 1; give"),
+        ((np.ma.masked_greater([0.0, 9.0], 5.0), [1.0, 2.0], []), {}, r"t\[1\] is masked; leave out samples without"),
     ],
 )
 def test_arrays_that_are_no_transient_are_refused(arguments: Any, options: Any, words: str) -> None:
@@ -246,6 +249,11 @@ def test_a_data_frame_gives_what_its_arrays_give(run: tuple[Any, ...]) -> None:
         for name in ("t_ns", "x", "u", "segment"):
             assert np.array_equal(getattr(got, name), getattr(wanted, name), equal_nan=True)
         assert (got.state_names, got.control_names) == (tuple(states), tuple(controls))
+
+
+@pytest.mark.parametrize("kind", [np.float32, np.float64, np.int64])
+def test_a_step_is_any_number(kind: Any) -> None:
+    assert Transient([0.0, 1.0, 2.0], [1.0, 2.0, 3.0], [], step=kind(1)).dt.tolist() == [1.0, 1.0]
 
 
 def test_masked_values_are_nan() -> None:

@@ -11,11 +11,13 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
+from numbers import Integral, Real
 from typing import Any, Literal
 
 import numpy as np
@@ -392,10 +394,10 @@ def _contradiction(error: InfeasibleError, where: str, signals: SignalMap) -> Fi
     )
 
 
-def _budget(discard: float, transitions: int) -> int:
+def _budget(discard: Any, transitions: int) -> int:
     """Number of transitions that may be discarded: a whole number, or a share below 1."""
-    whole = isinstance(discard, (int, np.integer)) and not isinstance(discard, bool)
-    if isinstance(discard, bool) or not (np.isfinite(discard) and discard >= 0) or (not whole and discard >= 1):
+    whole, number = isinstance(discard, Integral), isinstance(discard, Real) and not isinstance(discard, bool)
+    if not (number and math.isfinite(discard) and discard >= 0) or (not whole and discard >= 1):
         raise FitError(f"discard is {discard!r}; give a whole number of transitions, or a share below 1")
     return int(discard) if whole else int(discard * transitions)
 

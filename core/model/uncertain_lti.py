@@ -334,7 +334,11 @@ class UncertainLTI(Envelope):
         if s.shape[-1:] != (self.q,):
             names = ", ".join(signal.name for signal in self.signals.scheduling)
             raise ModelError(f"s has shape {s.shape}; it must end in {self.q}" + f", with {names}" * bool(names))
-        lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], s.shape[:-1], dt.shape)
+        try:
+            lead = np.broadcast_shapes(x.shape[:-1], u.shape[:-1], s.shape[:-1], dt.shape)
+        except ValueError:
+            shapes = f"x has shape {x.shape}, u {u.shape}, s {s.shape} and dt {dt.shape}"
+            raise ModelError(f"{shapes}; give as many of each, or one for all") from None
         count = math.prod(lead)  # not -1: that says nothing where there are no controls
         flat = [np.broadcast_to(a, (*lead, a.shape[-1])).reshape(count, a.shape[-1]).T for a in (x, u, s)]
         centre, half = self.columns_centre_and_half(np.vstack(flat), np.broadcast_to(dt, lead).reshape(count))

@@ -25,7 +25,7 @@ from uncertain_lti.identification.archive import fit_archive, refuse_auto
 from uncertain_lti.identification.problem import check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, check_names, signals_of, unused
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.model.alarm_rule import Rule
+from uncertain_lti.model.alarm_rule import Rule, checked_rules
 from uncertain_lti.model.horizon import Widths
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.model.schedule import Schedule
@@ -296,7 +296,9 @@ def fit_many(
 
 def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> None:
     """Refuse an alarm that there is not, and a rate for one that is not learnt."""
-    if isinstance(alarm, str) and alarm not in ("panel", "containment"):
+    if not isinstance(alarm, str):
+        checked_rules(alarm)
+    elif alarm not in ("panel", "containment"):
         raise FitError(f"alarm is {alarm!r}; it must be panel, containment, or a list of rules")
     if false_alarms is not None and alarm != "panel":
         raise FitError("false_alarms is what the panel is learnt for; leave alarm or false_alarms out")

@@ -116,6 +116,9 @@ def _numeric(column: Any, wanted: str, name: str) -> Array:
 
 def nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
     """Instants in ns; recorded: they are those of messages, which may follow each other within a few."""
+    if np.ma.is_masked(t):
+        where = int(np.argmax(np.ma.getmask(t)))
+        raise TransientError(f"{name}: t[{where}] is masked; leave out samples without a time")
     raw = np.array(t)
     if raw.ndim != 1:
         raise TransientError(f"{name}: t has shape {raw.shape}; it must be a vector (N+1,)")
@@ -137,7 +140,7 @@ def nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
             raise TypeError
         seconds = raw.astype(np.float64)
     except (TypeError, ValueError):
-        raise TransientError(f"{name}: t is not numeric; give seconds, or integer nanoseconds") from None
+        raise TransientError(f"{name}: t is not numeric; give seconds, integer nanoseconds or datetime64") from None
     if not np.isfinite(seconds).all():
         where = int(np.argmin(np.isfinite(seconds)))
         raise TransientError(f"{name}: t[{where}] is {seconds[where]}; leave out samples without a time")
@@ -185,6 +188,8 @@ def names_of(
         raise TransientError(
             f"{name}: {plural(len(names), 'name')} for {plural(count, 'column')} of {letter}; give a list, one for each"
         )
+    if odd := [n for n in names if not isinstance(n, str) or not n]:
+        raise TransientError(f"{name}: a column of {letter} is called {odd[0]!r}; give each a name, as text")
     if len(set(names)) < count:
         raise TransientError(f"{name}: two columns of {letter} have the same name; give each its own")
     return names

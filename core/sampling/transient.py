@@ -198,7 +198,7 @@ class Transient:
             raise TransientError(f"{name}: min_step is {min_step}; it must be 0 s or more, up to {LONGEST_S:g}")
         if step is None:
             step = "recorded" if signals is None or signals.step == "constant" else signals.step
-        if step != "recorded" and not (isinstance(step, (int, float)) and 1e-9 <= step <= LONGEST_S):
+        if step != "recorded" and not (isinstance(step, (int, float, np.number)) and 1e-9 <= step <= LONGEST_S):
             raise TransientError(f"{name}: step is {step}; it must be 1e-9 to {LONGEST_S:g} s, or recorded")
         self.step = None if isinstance(step, str) else float(step)
         min_step_ns = to_ns(min_step)

@@ -325,10 +325,10 @@ def sizes_of(rules: Sequence[StatisticRule], part: Part) -> Array:
     return np.asarray(np.sqrt(sizes, out=sizes, where=squared))
 
 
-def check_rate(rate: float | None) -> None:
+def check_rate(rate: Any) -> None:
     """Refuse what no rate of false alarms is."""
-    if rate is not None and not (math.isfinite(rate) and rate > 0):
-        raise FitError(f"false_alarms is {rate}; give a positive number per hour")
+    if rate is not None and not (isinstance(rate, (int, float, np.number)) and math.isfinite(rate) and rate > 0):
+        raise FitError(f"false_alarms is {rate!r}; give a positive number per hour")
 
 
 def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = None) -> Panel:
