@@ -174,7 +174,7 @@ def test_names_from_files_are_text(engine):
         **model.fit_summary,
         "criterion": HOSTILE,
         "messages": [HOSTILE, 3],
-        "sources": [{"file": HOSTILE, "sha256": HOSTILE}, HOSTILE],
+        "sources": [{"file": HOSTILE, "sha256": HOSTILE}, {"sha256": {"a": 1}}, HOSTILE],
         "transients": HOSTILE,
     }
     run = read_transients(engine / "bad.mcap", engine / "signals.yaml")[0]

@@ -289,7 +289,8 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
 def _recording_reasons(
     model: UncertainLTI, recordings: Sequence[Mapping[str, Any]], validation: Mapping[str, Any] | None
 ) -> Reasons:
-    fitted = {s.get("sha256") for s in list_of(model.fit_summary.get("sources")) if isinstance(s, Mapping)} - {None, ""}
+    sources = [s for s in list_of(model.fit_summary.get("sources")) if isinstance(s, Mapping)]
+    fitted = {str(s.get("sha256") or "") for s in sources} - {""}
     if same := [os.path.basename(r["recording"]) for r in recordings if any(f["sha256"] in fitted for f in r["files"])]:
         proves = "which it contains by construction: that proves nothing"
         yield CARE, "recordings", f"checked on what it was fitted to ({shortlist(same, 4)}), {proves}"
