@@ -79,7 +79,7 @@ class EnvelopeMonitorNode(LifecycleNode):
     `reason` (why the last configure failed), `clock`, `settings`, `inputs` by topic, `outputs`, `snapshots` and
     `failures`.
 
-    Several may be in one process, on one executor. `start` configures and activates; the program does that if
+    Several may be in one process, on one `EventsExecutor`. `start` configures and activates; the program does that if
     `autostart` is true, others decide for themselves.
 
     `name`: of the node; `**options`: of `rclpy.node.Node`: `namespace`, `parameter_overrides`, `context`, `cli_args`,
