@@ -43,7 +43,9 @@ _UNIT = {
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?", "d": r"days?",
 }  # fmt: skip
 _ISO = re.compile(r"(\d{4}-\d\d-\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?))?\s*(Z|UTC|[+-]\d\d(?::?\d\d)?)?$")
-_PLAIN = re.compile(r"\d{4}-\d\d-\d\d[T ]([01]\d|2[0-3]):[0-5]\d(:[0-5]\d(\.\d{1,9})?)?")  # as numpy reads it
+_PLAIN = re.compile(
+    r"(1[7-9]|2[01])\d\d-\d\d-\d\d[T ]([01]\d|2[0-3]):[0-5]\d(:[0-5]\d(\.\d{1,9})?)?"
+)  # as numpy reads it
 _DAY = re.compile(
     r"(\d{1,2})[/.\s](\d{1,2})[/.\s](\d\d|\d{4})(?:[T ]+(\d{1,2})(?::(\d\d)(?::(\d\d(?:[.,]\d+)?))?)?)?"
     r"([+-]\d\d:?\d\d)?"
@@ -492,11 +494,7 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
     A cell that is neither has no time, if few are.
     """
     texts = [str(cell).strip() for cell in cells]
-    if (
-        texts
-        and all(map(_PLAIN.fullmatch, texts))
-        and YEARS[0] <= int(min(texts)[:4]) <= int(max(texts)[:4]) <= YEARS[1]
-    ):
+    if texts and all(map(_PLAIN.fullmatch, texts)):
         return _parsed(where, texts), ""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
     spelt, order = _as_iso(where, [*map(_spelt, texts)], cells)
