@@ -1866,9 +1866,10 @@ def test_a_column_in_degrees_that_jumps_by_a_turn_is_unwrapped(tmp_path):
     """The fit asked for it; a power that is switched by as much is none."""
     rng = np.random.default_rng(3)
     on = np.repeat(rng.choice([0.0, 350.0], size=60), 25)
-    columns = {"shaft_position_deg": np.cumsum(0.02 * on) % 360, "heater_power": on + rng.normal(size=1500)}
-    proposal = propose([table_of(tmp_path / "a.csv", columns)])
-    assert {c.path for c in proposal.states} == {"unwrap(shaft_position_deg, 360)", "heater_power"}, proposal.text
+    for name in ("shaft_position_deg", "Orient_x"):
+        columns = {name: np.cumsum(0.02 * on) % 360, "heater_power": on + rng.normal(size=1500)}
+        proposal = propose([table_of(tmp_path / "a.csv", columns)])
+        assert {c.path for c in proposal.states} == {f"unwrap({name}, 360)", "heater_power"}, proposal.text
 
 
 def test_channels_of_an_aircraft_and_inputs_are_controls_and_what_is_in_a_cabinet_is_measured():
