@@ -683,6 +683,28 @@ def test_a_counter_tells_no_runs_where_stamps_repeat(tmp_path):
     assert run_column(group_recordings([path])) == ""
 
 
+def test_the_finest_column_tells_the_runs_and_settings_of_a_run_are_no_states(tmp_path):
+    """A load was the run, so that each left out was one that nothing else showed, and numbers of runs were states."""
+    rng, rows = np.random.default_rng(0), []
+    for load, run, again in ((load, run, k) for load in (20, 40, -40) for run in range(4) for k in range(2)):
+        x, group = 0.0, len(rows) // 60
+        for k in range(60):
+            rows.append(f"{0.04 * k:.2f},{x},{(u := k // 9 % 2)},{load},{run},{group},{again}")
+            x += 0.2 * (u - x) + 0.01 * rng.normal()
+    path = write(tmp_path / "a.csv", "time,position,command,load,run,group,again", *rows)
+    assert run_column(group_recordings([path])) == "group"
+    assert [c.name for c in propose([path]).states] == ["position"]
+    path.write_text(path.read_text().replace("group", "row_of_it"))  # in any words
+    assert run_column(group_recordings([path])) == "row_of_it"
+    few = write(
+        tmp_path / "b.csv",
+        "time,position,command,run",
+        *(",".join(r.split(",")[i] for i in (0, 1, 2, 4)) for r in rows),
+    )
+    proposal = propose([few])
+    assert "runs" not in proposal.text and [c.name for c in proposal.states] == ["position"], proposal.text
+
+
 def test_an_unsigned_column_that_falls_is_no_time(tmp_path):
     np.savez(tmp_path / "a.npz", depth=np.array([9, 7, 4, 2], dtype=np.uint8), x=np.arange(4.0))
     refuses(BagError, "no column is called time", Table, tmp_path / "a.npz")

@@ -176,7 +176,9 @@ def run_column(bags: Sequence[Recording]) -> str:
     """Column of tables that tells the runs in one file apart."""
     tables = [bag for bag in bags if isinstance(bag, Table)]
     names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
-    return next((name for name in names if all(_tells_runs(table, name) for table in tables)), "")
+    found = {name: min(_runs_told(table, name) for table in tables) for name in names}
+    told = [name for name, runs in found.items() if runs]  # of a repetition of a load at a speed, the repetition
+    return max(told, key=lambda name: (_RUN.search(name.lower()) is not None, found[name]), default="")
 
 
 def _in_words(bags: Sequence[Recording], runs: str | None) -> list[str]:
@@ -190,17 +192,17 @@ def _in_words(bags: Sequence[Recording], runs: str | None) -> list[str]:
     return [f"{name} ({shortlist(words, 3)})" for name, words in few.items()]
 
 
-def _tells_runs(table: Table, name: str) -> bool:
+def _runs_told(table: Table, name: str) -> int:
     column = table.columns_by_field.get(name)
     if column is None or column.ndim != 1 or column.dtype.kind == "M" or len(column) < 2 * FEWEST:
-        return False
+        return 0
     if column.dtype.kind == "f" and not (column == np.rint(column)).all():
-        return False
+        return 0
     changes = 1 + np.flatnonzero(column[1:] != column[:-1])
     runs = len(changes) + 1
     if not 2 <= runs <= len(column) // FEWEST or len(set(column[[0, *changes]].tolist())) < runs:
-        return False
-    return bool(_RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] < 0).all())
+        return 0
+    return runs if _RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] < 0).all() else 0
 
 
 def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Source]:
@@ -314,7 +316,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return f"leaves its usual value in {moved} of {plural(len(finite), 'message')} only"
     known = [np.isfinite(values) for values in candidate.values]
     apart = [v[k] for v, k in zip(candidate.values, known, strict=True)]
-    if source.role != "control" and all(np.ptp(v) == 0 for v in apart if len(v)):
+    anew = [np.flatnonzero(np.diff(t[k]) < 0) + 1 for t, k in zip(source.arrival, known, strict=True)]
+    pieces = [piece for v, at in zip(apart, anew, strict=True) for piece in np.split(v, at)]  # where the time restarts
+    if source.role != "control" and all(np.ptp(piece) == 0 for piece in pieces if len(piece)):
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
