@@ -440,6 +440,7 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, cli):
     ("words", "said"),
     [
         (["fit", "a.mcap", "--signals", "s.yaml", "--outptu", "m"], "there is no --outptu (is --output meant?)"),
+        (["start", "--table", "unit=ms", "a.csv"], "required: BAG; --table takes all that follows it, so put it last"),
         (["check", "m", "a.mcap", "--jsn"], "unrecognized arguments: --jsn (is --json meant?)"),
         (
             ["topics", "a.mcap", "b.mcap"],

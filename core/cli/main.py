@@ -242,6 +242,8 @@ class _Parser(argparse.ArgumentParser):
             words = [word.partition("=")[0] for word in self._given if word.startswith("--")]
             odd = [w for w in words if not any(o.startswith(w) for o in self._option_string_actions)]
             message += "".join(f"; there is no {word}{meant(word, self._option_string_actions, 1)}" for word in odd)
+            takers = [w for w in words if getattr(self._option_string_actions.get(w), "nargs", None) == "+"]
+            message += f"; {takers[-1]} takes all that follows it, so put it last" if takers else ""
         elif message.startswith("unrecognized arguments: "):
             commands: dict[str, argparse.ArgumentParser]
             commands = dict(*(action.choices for action in self._actions if isinstance(action.choices, dict)))
