@@ -75,6 +75,7 @@ _LARGEST_ZONE = 14  # hours
 _CALENDARS = (20_000, 80_000, 25_569), (690_000, 800_000, 719_529)  # days of these decades: Excel, MATLAB; 1970-01-01
 _HARDLY = 1e-4  # s from row to row, below which numbers such as days of a spreadsheet hardly are s
 _UNLIKELY = 100, 1000  # s from row to row, not whole minutes, from which on it hardly is in s; the other: since 1970
+_MANY = 1000  # rows, from which on their numbers may be taken for a time unawares
 _ODD = 10  # the same of those that are no multiple of 5 s, not since 1970
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
@@ -140,6 +141,8 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
                 none = "has no unit, which may be s, ms or us"
                 raise BagError(f"{where}{doubt}: {none}; {ask} (in a signals file `table: {{unit: {likely}}}`)")
             doubt += f": for others {ask}"
+        elif unit == "s" and not stated and _counts_rows(values):
+            said.append("its numbers are those of the rows, taken for s: of another rate give `--table step=0.01`")
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
         if unit == "d" and (since := _first_day(values)):
@@ -443,6 +446,10 @@ def _first_day(values: Column) -> int:
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
     fits = (first for least, most, first in _CALENDARS if least < low and high < most)
     return next(fits, 0)
+
+
+def _counts_rows(values: Column) -> bool:
+    return len(values) >= _MANY and values[0] in (0, 1) and bool((np.diff(values) == 1).all())
 
 
 def _coarse(values: Column) -> float:
