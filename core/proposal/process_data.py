@@ -21,7 +21,7 @@ from uncertain_lti.identification.evidence import FASTEST, held_for
 from uncertain_lti.proposal.candidates import FEWEST, READ, SHOWS, TWO_VALUES, Candidate, Source, Steps, steps_of
 from uncertain_lti.proposal.choosing import drop_copies
 from uncertain_lti.proposal.signals_file import set_own_scale
-from uncertain_lti.recordings.table_times import field_name
+from uncertain_lti.recordings.table_text import field_name
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.values import TABLE
 

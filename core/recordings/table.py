@@ -32,15 +32,8 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import read_table
-from uncertain_lti.recordings.table_text import QUANTITY, Column, RawTable
-from uncertain_lti.recordings.table_times import (
-    NO_TIME,
-    field_name,
-    find_column,
-    instants,
-    may_be,
-    spread,
-)
+from uncertain_lti.recordings.table_text import QUANTITY, Column, RawTable, field_name, find_column
+from uncertain_lti.recordings.table_times import NO_TIME, instants, may_be, spread
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
 from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.text import once, plural, shortlist
+from uncertain_lti.base.text import meant, once, plural, shortlist
 
 _DELIMITERS = ",;\t|"
 _LOOK = 1 << 20  # bytes in which the shape of a CSV file is looked for
@@ -310,6 +310,22 @@ def left_out(odd: int, what: str, first: str) -> str:
 def unique(names: Iterable[str]) -> list[str]:
     """Names of columns as they are called, each once."""
     return once([" ".join(n.replace("\ufffd", "").split()) or f"column {i}" for i, n in enumerate(names, start=1)], " ")
+
+
+def field_name(column: str) -> str:
+    """Name of a column as a field path takes it: `Speed [rpm]` is `Speed_rpm`."""
+    name = re.sub(r"\W+", "_", column).strip("_") or "column"
+    return name if re.match(r"[A-Za-z_]", name) else f"c_{name}"
+
+
+def find_column(path: object, wanted: str, columns: Sequence[str], what: str) -> str:
+    """Find a column by its name in the file or as a field."""
+    for name in columns:
+        if wanted in (name, field_name(name)):
+            return name
+    near, there = meant(wanted, columns), shortlist(list(columns), 50)
+    none = f"there is no column '{wanted}', which the signals file names for {what}{near}"
+    raise BagError(f"{path}: {none}; columns there: {there}")
 
 
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:

@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.text import meant, shortlist
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
-from uncertain_lti.recordings.table_text import ODD_SHARE, YEARS, Column, RawTable, left_out
+from uncertain_lti.recordings.table_text import ODD_SHARE, YEARS, Column, RawTable, find_column, left_out
 from uncertain_lti.signals.values import UNITS, TableLayout
 
 NO_TIME = -(2**63)
@@ -78,22 +78,6 @@ _UNLIKELY = 100, 1000  # s from row to row, not whole minutes, from which on it 
 _MANY = 1000  # rows, from which on their numbers may be taken for a time unawares
 _ODD = 10  # the same of those that are no multiple of 5 s, not since 1970
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
-
-
-def field_name(column: str) -> str:
-    """Name of a column as a field path takes it: `Speed [rpm]` is `Speed_rpm`."""
-    name = re.sub(r"\W+", "_", column).strip("_") or "column"
-    return name if re.match(r"[A-Za-z_]", name) else f"c_{name}"
-
-
-def find_column(path: object, wanted: str, columns: Sequence[str], what: str) -> str:
-    """Find a column by its name in the file or as a field."""
-    for name in columns:
-        if wanted in (name, field_name(name)):
-            return name
-    near, there = meant(wanted, columns), shortlist(list(columns), 50)
-    none = f"there is no column '{wanted}', which the signals file names for {what}{near}"
-    raise BagError(f"{path}: {none}; columns there: {there}")
 
 
 def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, NDArray[np.int64], str]:
