@@ -964,6 +964,8 @@ def _of_tags(form, late=0.0):
         ("TagName,time,Value", ["", *_of_tags("{tag},{t},{x}")[::-1]]),
         ("ID,Name,time,Value", _of_tags("0x{i},{tag},{t:.3f},{x}", 0.004)),
         (",result,table,time,_value,_field", sorted(_of_tags(",,{i},{t:04},{x},{tag}"))),
+        ("Time,Series,Value", _of_tags("{t},{tag},{x}")),  # of Grafana
+        ("timestamp,topic,payload", _of_tags("{t},{tag},{x}")),  # of Node-RED
     ],
 )
 def test_rows_of_one_number_each_are_put_side_by_side(header, rows, tmp_path):
@@ -973,6 +975,60 @@ def test_rows_of_one_number_each_are_put_side_by_side(header, rows, tmp_path):
     np.testing.assert_array_equal(bag.columns_by_field["LT1_PV"], [k % 7 for k in range(60)])
     np.testing.assert_array_equal(bag.columns_by_field["V1_OP"], 5)
     assert "names the signal of each number in" in bag.warnings[-1]
+
+
+def test_the_archive_of_a_panel_is_read(tmp_path):
+    """WinCC: `Time_ms`, days in millionths, was the time in ms, and its last line the one row of a signal."""
+    rows = [f'"{tag}";"08.11.2026 11:{k // 60:02}:{k % 60:02}";{x};1;{46334458333.3 + k / 0.0864:.3f}'
+            for k in range(90) for tag, x in (("LT1", k % 7), ("V1", k // 50))]  # fmt: skip
+    header = '"VarName";"TimeString";"VarValue";"Validity";"Time_ms"'
+    bag = read_csv(tmp_path, header, [*rows, '"$RT_COUNT$";180;;;'])
+    assert {name: column[-1] for name, column in bag.columns_by_field.items()} == {"LT1": 5, "V1": 1}
+    assert set(np.diff(bag.times).tolist()) == {10**9}
+
+
+def test_signals_one_after_the_other_that_do_not_come_together_are_no_runs(tmp_path):
+    """The history of Home Assistant: all of its numbers were one state of as many runs, without a word."""
+    rows = [f"sensor.{name},{k % 7},2026-11-08T11:00:{k % 60:02}.{ms}Z" for name, ms, every in
+            (("p", 100, 1), ("q", 200, 2)) for k in range(0, 60, every)]  # fmt: skip
+    path = tmp_path / "history.csv"
+    path.write_text("\n".join(["entity_id,state,last_changed", *rows]) + "\n")
+    words = "column 'entity_id' names the signal of a row's one number, and they come at times of their"
+    refuses(BagError, words, propose, [path])
+
+
+def _of_influx(fields, tag=""):
+    """A table of each field with what InfluxDB writes above those of one type, a minute of 1 s."""
+    for i, (name, cells) in enumerate(fields):
+        kind = "double" if cells[0].isdigit() else "boolean"
+        above = f"#group,false,false,false,false,true,true|#datatype,string,long,dateTime:RFC3339,{kind},string,string|"
+        yield from (f"{above}#default,_result,,,,,|,result,table,_time,_value,_field,unit").split("|")
+        yield from (f",,{i},2026-11-03T06:00:{k:02}Z,{cell},{name},{tag or 'K'}" for k, cell in enumerate(cells))
+        yield ""
+
+
+def test_a_file_of_influxdb_with_numbers_of_several_types_is_read(tmp_path):
+    """What is above the second table was taken for rows, and `_time` was no time."""
+    fields = [("p", [str(k % 7) for k in range(60)]), ("on", ["true", "false"] * 30)]
+    first, *rest = _of_influx(fields)
+    bag = read_csv(tmp_path, first, rest)
+    found = {name: column.tolist() for name, column in bag.columns_by_field.items()}
+    assert found == {"p": [k % 7 for k in range(60)], "on": [1, 0] * 30} and len(bag.times) == 60
+
+
+def test_numbers_of_one_name_and_time_are_of_the_units_that_another_column_names(tmp_path):
+    """Of two compressors with fields of the same names the second one was lost without a word."""
+    rows = [f"{k},{unit},{name},{k % 7 + i}" for k in range(60)
+            for i, (unit, name) in enumerate([("K1", "p"), ("K1", "q"), ("K2", "p"), ("K2", "q")])]  # fmt: skip
+    found = read_csv(tmp_path, "time,unit,_field,_value", rows).columns_by_field
+    assert {name: column[0] for name, column in found.items()} == {"K1_p": 0, "K1_q": 1, "K2_p": 2, "K2_q": 3}
+
+
+def test_a_name_may_begin_with_any_letter(tmp_path):
+    """`Ángulo` was `c_Ángulo`, as if it began with a digit."""
+    bag = read_csv(tmp_path, "time,Ángulo (°),1. Stufe", [f"{k},{k % 7},{k % 5}" for k in range(50)])
+    assert list(bag.columns_by_field) == ["Ángulo", "c_1_Stufe"]
+    assert FieldPath("Ángulo").steps == (("attribute", "Ángulo"),)
 
 
 def test_a_signal_that_lacks_some_times_is_missing_there(tmp_path):

@@ -64,7 +64,7 @@ from uncertain_lti.proposal.signals_file import (
 from uncertain_lti.proposal.tune import Remembered, choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
-from uncertain_lti.recordings.table import Table
+from uncertain_lti.recordings.table import Table, names_signals
 from uncertain_lti.recordings.table_times import called_time, may_be
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
@@ -202,7 +202,9 @@ def _runs_told(table: Table, name: str) -> int:
     runs = len(changes) + 1
     if not 2 <= runs <= len(column) // FEWEST or len(set(column[[0, *changes]].tolist())) < runs:
         return 0
-    return runs if _RUN.search(name.lower()) or (np.diff(table.times)[changes - 1] < 0).all() else 0
+    of_signals = names_signals(name) and not all(topic.readable for topic in table.topics.values())
+    anew = not of_signals and (np.diff(table.times)[changes - 1] < 0).all()
+    return runs if _RUN.search(name.lower()) or anew else 0
 
 
 def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Source]:

@@ -33,7 +33,7 @@ from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import read_table
 from uncertain_lti.recordings.table_text import QUANTITY, Column, RawTable, field_name, find_column
-from uncertain_lti.recordings.table_times import NO_TIME, instants, may_be, spread
+from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
 from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout
@@ -47,9 +47,10 @@ _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
 _ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has, of a short log fewer
 _MOST_KINDS = 100  # of messages
-_NAMES = re.compile(
-    r"(?i)(.*[\W_])?(name|(tag|var(iable)?|signal|field|point|channel|sensor|item|parameter)([\W_]*name)?)"
+_OF_SIGNALS = (
+    r"(tag|var(iable)?|signal|field|point|channel|sensor|item|parameter|series|metric|topic|entity)([\W_]*(name|id))?"
 )
+_NAMES = re.compile(rf"(?i)(.*[\W_])?(name|{_OF_SIGNALS})")
 _TOGETHER = 0.9  # of the times, that have a number of each signal
 _SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
 
@@ -439,19 +440,24 @@ def _goes_on(column: Column) -> bool:
     return int(np.count_nonzero(same)) >= 0.9 * len(same)
 
 
+def names_signals(column: str) -> bool:
+    """Whether a column says by its name that it names the signal of a row's number."""
+    return re.fullmatch(rf"(?i)(.*[\W_])?{_OF_SIGNALS}", column) is not None
+
+
 def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[str, str, dict[str, NDArray[np.intp]]]:
     """The column that names the signal of each row's one number, as historians write it, that, and each name's rows.
 
     Few names change from row to row, or the time begins anew with each. Nothing for other tables.
     """
-    numbers = [name for name, column in columns.items() if column.dtype.kind in "iuf" and column.ndim == 1]
+    numbers = [n for n, c in columns.items() if c.dtype.kind in "iuf" and c.ndim == 1 and not called_time(n)]
     texts = [name for name, column in columns.items() if column.dtype.kind == "O"]
     for naming in sorted(texts, key=lambda name: not _NAMES.fullmatch(name)) if numbers else ():
         cells = columns[naming]
         few = set(cells.tolist())
         if not 2 <= len(few) <= len(times) // _ROWS_EACH or "" in few:
             continue
-        rows = _rows_of_each(cells.astype(str))
+        rows = _rows_of_each(_of_units(cells.astype(str), [columns[n] for n in texts if n != naming], times))
         order = np.concatenate([*rows.values()])
         first = np.cumsum([0, *map(len, rows.values())])[:-1]
         least, most = (of_each.reduceat(times[order], first) for of_each in (np.minimum, np.maximum))
@@ -464,14 +470,27 @@ def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[st
     return "", "", {}
 
 
+def _of_units(names: Column, others: Sequence[Column], times: NDArray[np.int64]) -> Column:
+    """Names with those of units, in other columns, before them, where numbers of one name and time are of several."""
+
+    def known(cells: Column) -> int:
+        of = np.unique(cells, return_inverse=True)[1]
+        order = np.lexsort((of, times))
+        return 1 + int(np.count_nonzero(np.diff(of[order]) | np.diff(times[order])))
+
+    found = known(names) if others else len(names)
+    for other in others if found < _TOGETHER * len(names) else ():
+        joined = np.char.add(np.char.add(other.astype(str), "_"), names)
+        if (more := known(joined)) > found:
+            names, found = joined, more
+    return names
+
+
 def _side_by_side(
     of_each: Mapping[str, NDArray[np.intp]], values: Column, times: NDArray[np.int64]
 ) -> tuple[dict[str, Column], NDArray[np.int64]] | None:
-    """A column for each name, and the times; nothing where the names do not come together, or one after the other.
-
-    Of rows of one name and time the first counts.
-    """
-    rows = {name: of[times[of] != NO_TIME] for name, of in of_each.items()}
+    """A column for each name, and the times; nothing where the names do not come together, or one after the other."""
+    rows = {name: timed for name, of in of_each.items() if len(timed := of[times[of] != NO_TIME])}
     stamps = np.unique(times[times != NO_TIME])
     count = min(map(len, rows.values()))
     if count < _TOGETHER * len(stamps) and all(len(of) == count for of in rows.values()):
@@ -481,7 +500,7 @@ def _side_by_side(
             return {name: values[of[np.argsort(times[of])]] for name, of in rows.items()}, stamps
     columns = {name: np.full(len(stamps), math.nan) for name in rows}
     for name, of in rows.items():
-        columns[name][np.searchsorted(stamps, times[of[::-1]])] = values[of[::-1]]
+        columns[name][np.searchsorted(stamps, times[of[::-1]])] = values[of[::-1]]  # of one time the first counts
     together = min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER
     return (columns, stamps) if together else None
 

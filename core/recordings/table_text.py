@@ -53,6 +53,7 @@ QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?P<unit>[^\W\d_]\S{0,7}|[%°]\S{0,7})"
 _MOST_COLUMNS = 20_000
 _ODD_CELL = re.compile(r"could not convert string .* at row (\d+), column (\d+)")  # of numpy.loadtxt
 _MOST_PASSED = 10**6  # rows that may be passed over again for such cells
+_ANNOTATIONS = "#group", "#datatype", "#default"  # of InfluxDB, above each table in a file
 YEARS = (1678, 2261)  # that ns since 1970 can say
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
 
@@ -195,6 +196,8 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
     known = {*header} - {""}
     first_odd = odd = line = again = 0
     for line, cells in _rows(path, encoding, shape):
+        if cells[0] in _ANNOTATIONS:
+            continue
         if known.intersection(map(str.strip, cells[:2])):
             plain = [cell.strip().lstrip("\ufeff") for cell in cells]  # of a file that was put behind another
             if 2 * len(known.intersection(plain)) > wide or (all(plain) and not any(map(_is_value, plain))):

@@ -30,8 +30,9 @@ NO_TIME = -(2**63)
 """Instant of a row without one."""
 
 _NAMES = (
-    r"(__|%)?time(_?stamp)?", r"ts?", r"stamp", r"date_?time", r"timestamp.*", r"(elapsed|rel(ative)?|abs(olute)?|unix|"
-    r"epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"((uhr|mess)_?)?zeit(stempel)?",
+    r"(__?|%)?time(_?stamp|string)?", r"ts?", r"stamp", r"date_?time", r"timestamp.*",
+    r"(elapsed|rel(ative)?|abs(olute)?|"
+    r"unix|epoch|header|log|sim(ulation)?|record(ing)?)_?time.*", r"time_.*", r"((uhr|mess)_?)?zeit(stempel)?",
     r"temps|tempo", r"t_.*", r"elapsed|up_?time", r"date|datum", r"sec(ond)?s?", r"m(illi)?s(ec(ond)?s?)?",
 )  # fmt: skip
 _LASTS = re.compile(r"time_(since|until|till|to|run|running|on|off|in|left|remaining|with(out)?)(_.*)?")
