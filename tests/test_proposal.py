@@ -31,11 +31,20 @@ from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.identification.evidence import functions
 from uncertain_lti.proposal import init
-from uncertain_lti.proposal.candidates import Candidate, Source, Steps, bare, role_by_name, role_of_column, steps_of
-from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, choose
+from uncertain_lti.proposal.candidates import (
+    Candidate,
+    Source,
+    Steps,
+    bare,
+    part_by_role,
+    role_by_name,
+    role_of_column,
+    steps_of,
+)
+from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, assign_roles, choose, drop_idle_controls
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.members import all_of_them
-from uncertain_lti.proposal.signals_file import name_signals, set_operating_point, signals_file
+from uncertain_lti.proposal.signals_file import _left_out, name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.signals.field_path import KINDS, FieldPath, Memory
@@ -518,6 +527,86 @@ def test_a_reading_that_flickers_is_no_switch_and_a_demand_a_command(tmp_path):
     proposal = propose([path])
     assert signals_of(proposal)[1] == [("/table", "I_req")], proposal.text
     assert "way: grows as a clock or a counter does" in proposal.text  # of three digits
+
+
+def test_hours_of_running_are_no_signal(tmp_path):
+    """Tenths of an hour, of which a recording has few, were a state, or a control that is set every six minutes."""
+    rng, x, rows = np.random.default_rng(2), 0.0, []
+    for k in range(1200):
+        on = k // 50 % 2
+        rows.append([k, f"{x:.3f}", on, f"{12345.2 + k // 360 / 10:.1f}"])
+        x += 0.1 * (on - x) + 0.01 * rng.normal()
+    proposal = propose([csv(tmp_path / "a.csv", ["time", "pressure", "K1_on", "K1_running_hours"], rows)])
+    assert signals_of(proposal) == ([("/table", "pressure")], [("/table", "K1_on")])
+    assert "K1_running_hours: grows as a clock or a counter does" in proposal.text
+
+
+def test_of_commands_of_which_one_is_made_of_the_other_the_nearer_one_is_the_control(tmp_path):
+    """Both were, and what came before the smoother, with a delay of its own, raised false alarms."""
+    rng, messages, asked, sent, speed = np.random.default_rng(2), [], 0.0, 0.0, 0.0
+    twist = "geometry_msgs/msg/Twist"
+
+    def command(topic, k, value):
+        ahead, none = (message("geometry_msgs/msg/Vector3", x=v, y=0.0, z=0.0) for v in (value, 0.0))
+        body = cdr(twist, linear=ahead, angular=none)
+        return Message(topic, at(k), body, at(k))
+
+    for k in range(1500):
+        asked = float(rng.uniform(-1, 1)) if k % 60 == 0 else asked
+        sent += float(np.clip(asked - sent, -0.02, 0.02))
+        names = {"/cmd_vel_nav": asked, "/cmd_vel": sent}
+        messages += [*(command(topic, k, u) for topic, u in names.items()), f64("/base/state", at(k), speed)]
+        speed += 0.1 * (sent - speed) + 1e-3 * float(rng.normal())
+    _, proposal = proposed(tmp_path, messages, dict.fromkeys(names, twist))
+    assert signals_of(proposal)[1] == [("/cmd_vel", "linear.x")]
+    assert "#   /cmd_vel_nav linear.x: /cmd_vel is made of it, and nearer to the machine" in proposal.text
+
+
+def test_a_trajectory_is_no_control_where_its_controller_tells_what_it_puts_out():
+    """Where it is to end was a control beside the output, so that each new goal was a combination never fitted."""
+    rng, kind = np.random.default_rng(2), "control_msgs/msg/JointTrajectoryControllerState"
+    u = np.repeat(rng.normal(size=40), 25)
+    x = np.zeros(1001)
+    for k in range(1000):
+        x[k + 1] = x[k] + 0.1 * (u[k] - x[k]) + 1e-3 * rng.normal()
+
+    def source(topic, kind, role, values):
+        found = Source(topic, kind, role, False, None, [np.arange(1000) * 20 * MS], [np.full(1000, -1)])
+        found.candidates = [Candidate(found, "data", [values])]
+        return found
+
+    state = source("/joint_states", JOINT, "state", x[:1000])
+    goal = source(
+        "/arm/joint_trajectory", GOAL["/arm_controller/joint_trajectory"], "control", np.repeat(u[24::50], 50)
+    )
+    output = source("/arm/controller_state", kind, "control", u)
+    assert assign_roles([state, goal, output]) == ([output], [state])
+    assert goal.reason == "/arm/controller_state is made of it, and nearer to the machine"
+    goal.reason = ""
+    assert assign_roles([state, goal]) == ([goal], [state])
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_a_slower_copy_of_the_states_is_not_said_to_be_unwatched(tmp_path, noise):
+    """Of what ros2_control publishes besides, which says the same, `init` told to make a second model."""
+    messages = driven(("/joint_states", "/plant/cmd"), 1500)
+    rng, states = np.random.default_rng(1), [m for m in messages if m.topic == "/joint_states"][::2]
+    values = [struct.unpack("<d", m.data[4:])[0] + noise * float(rng.normal()) for m in states]
+    messages += [f64("/dynamic_states", m.log_time, value) for m, value in zip(states, values, strict=True)]
+    _, proposal = proposed(tmp_path, messages)
+    assert ("#   /dynamic_states: says what /joint_states says already" in proposal.text) == (noise == 0.0)
+    assert bool(proposal.warnings) == (noise > 0.0)  # a second sensor
+
+
+def test_whether_a_target_is_reached_is_no_reference():
+    """`at_target` beside the height of a lift said so of the whole topic, of which nothing was a reference."""
+    lift = Source("/lift/state", "lift_msgs/msg/State", "state", False, None)
+    lift.candidates = [Candidate(lift, path) for path in ("height", "at_target", "target_height")]
+    (target,) = part_by_role(lift)
+    assert [c.path for c in target.candidates] == ["target_height"]
+    target.reason = "a reference"
+    (line,) = (line for line in _left_out([lift, target], {*lift.candidates}) if "reference" in line)
+    assert line == "#   /lift/state target_height: a reference"
 
 
 def test_the_number_of_a_picture_is_no_state_and_a_coarse_reading_no_switch(tmp_path):
@@ -2166,3 +2255,14 @@ def test_motors_at_rest_are_no_missing_numbers(tmp_path):
     columns = ["time", "height_m", *(f"servo_output_raw.servo{n}_raw" for n in range(1, 5))]
     proposal = propose([csv(tmp_path / "a.csv", columns, rows)])
     assert proposal.controls and "ignore" not in proposal.text
+
+
+@pytest.mark.parametrize(("changes", "kept"), [(20, False), (1000, True)])
+def test_a_command_that_hardly_moves_and_shows_faintly_is_no_control(changes, kept):
+    """A lift's beside the drive's, which showed by chance: each of its levels was a combination never fitted."""
+    rng = np.random.default_rng(6)
+    U = np.column_stack([rng.normal(size=4000), np.repeat(rng.uniform(size=changes), 4000 // changes)])
+    source = Source("/commands", ARRAY, "control", False, None)
+    used = [Candidate(source, "data[0]"), Candidate(source, "data[1]")]
+    drop_idle_controls(Steps(U[:, :1], U, U[:, :1]), used, np.array([9000.0, 12.0]))
+    assert [not c.reason for c in used] == [True, kept]

@@ -327,7 +327,7 @@ _LABEL = re.compile(
 _LABELS = 30  # values that a label takes, at most
 
 _REFERENCE = re.compile(
-    r"(setpoint|desired|target|goal|referen[cz]|consign[ae]|(^|_)(soll|ziel)|demand|request|(^|_)req(_|$)|ref$|_des(_|\d|$)|"
+    r"(setpoint|desired|(?<!at_)(target|goal)|referen[cz]|consign[ae]|(^|_)(soll|ziel)|demand|request|(^|_)req(_|$)|ref$|_des(_|\d|$)|"
     r"(^|_)(sp|ref|des)_|_sp$)"
 )
 _STATE = re.compile(

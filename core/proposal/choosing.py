@@ -14,11 +14,11 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from itertools import permutations
 
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.text import shortlist
 from uncertain_lti.identification.evidence import (
     LONGEST_DELAY,
     NOISE,
@@ -109,6 +109,9 @@ def drop_noise(pool: list[Candidate], used: Sequence[Candidate]) -> tuple[list[C
     return [c for c in pool if not c.reason], ""
 
 
+_SET_NOW_AND_THEN = 0.01  # of the steps, in which a command changes at most that shows faintly by chance
+
+
 def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) -> None:
     """Leave out controls that show nowhere given the others, and those that move with another one; `shows` (m,)."""
     if len(steps.X) < FEWEST or len(used) < 2:
@@ -116,13 +119,14 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
     moving = np.ptp(steps.U, axis=0) > 0
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(np.corrcoef(steps.U.T)) > 0.99
+    held = np.mean(np.diff(steps.U, axis=0) != 0, axis=0) < _SET_NOW_AND_THEN
     for j, candidate in enumerate(used):
         twin = next((i for i in range(j) if alike[i, j] and not used[i].reason), None)
         if not moving[j]:
             candidate.reason = "does not move while the states are there"
         elif twin is not None:
             candidate.reason, candidate.ready = f"moves with {used[twin].topic} {used[twin].path}", "control"
-        elif shows[j] < FAINT and shows.max() > SHOWS:
+        elif shows[j] < (SHOWS if held[j] and shows.max() > STEERS * SHOWS else FAINT) and shows.max() > SHOWS:
             candidate.reason, candidate.ready = "shows in the next step of none of the states", "control"
 
 
@@ -262,6 +266,7 @@ _REACHED = re.compile(r"^(?!.*(cmd|command|set)).*_(position|pos|angle)(_(deg|ra
 """Name of what an actuator has reached, where something else says what it is to reach."""
 ONE_NUMBER = {f"std_msgs/msg/{kind}" for kind in ("Float32", "Float64", "Int16", "Int32", "Int64", "UInt16", "UInt32")}
 """Messages of one number, which only their topic names."""
+_FOLLOWED = "trajectory_msgs/msg/JointTrajectory", "control_msgs/msg/JointTrajectoryControllerState"
 FEWEST_SET, MOST_SET = 3, 0.2
 """A column without a name of a command may be one if it changes so often, and in at most this share of the rows."""
 
@@ -301,22 +306,36 @@ def _within_loops(
     unmoved = [s for s in states if references and not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
     moved = {c: max(STEERS, most_shown([c], sent)) for c in reached}
     inner = [r for r in references if any(most_shown([c], r.free) > by for c, by in moved.items())]
-    outer = [r for r in references if r not in inner and any(_answers(s, r) for s in controls)]
+    outer = [r for r in references if r not in inner and any(_shown(s, r) > SHOWS for s in controls)]
     inner += [r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved)]
     return [*controls, *dict.fromkeys(inner)], states
 
 
-def _answers(command: Source, reference: Source) -> bool:
-    """Whether a reference shows in the next command, or in the one that comes with it."""
-    every = reference.free
-    steps = (steps_of(command.free, every, [lag] * len(every)) for lag in (0, -1))
-    return any(float(np.max(some.effects()[0], initial=0.0)) > SHOWS for some in steps)
+def _nearest(controls: Sequence[Source]) -> list[Source]:
+    """Commands less those of which another is made: a trajectory, or `cmd_vel_nav` where a smoother sends `cmd_vel`."""
+    for one, other in permutations(controls, 2):
+        made = (one.type, other.type) == _FOLLOWED and one.topic.rpartition("/")[0] == other.topic.rpartition("/")[0]
+        alike = is_physical(one.type) and one.type.removesuffix("Stamped") == other.type.removesuffix("Stamped")
+        if alike and (one.topic.startswith(other.topic) or other.topic.startswith(one.topic)):
+            made = _shown(other, one) > max(SHOWS, _shown(one, other))
+        if made:
+            one.reason = f"{other.topic} is made of it, and nearer to the machine"
+    return [s for s in controls if not s.reason]
 
 
-def assign_roles(sources: Sequence[Source], asked: bool = False) -> tuple[list[Source], list[Source]]:
-    """Which topics are controls, and which may be the state; `asked`: a person says which, as far as names do not."""
+def _shown(command: Source, reference: Source) -> float:
+    """How clearly a reference shows in the next command, or in the one that comes with it."""
+    steps = (steps_of(command.free, reference.free, [lag] * len(reference.free)) for lag in (0, -1))
+    return max(float(np.max(some.effects()[0], initial=0.0)) for some in steps)
+
+
+def assign_roles(
+    sources: Sequence[Source], asked: bool = False, sent: bool = False
+) -> tuple[list[Source], list[Source]]:
+    """Which topics are controls, and which may be the state; `asked`, `sent`: a person says which, or the controls."""
     moving = [s for s in sources if s.free]
     controls = [s for s in moving if s.role == "control"]
+    controls = controls if sent else _nearest(controls)
     references = [s for s in moving if s.role == "reference"]
     if not controls:
         controls, references = references, []
@@ -376,8 +395,10 @@ def choose(
             continue
         source.reason = "the controls do not show in it"
         if source in shown:
-            source.reason = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
-            source.apart = "slower than the states"
+            copied = all(any(np.isin(c.finite, o.finite).mean() > 0.9 for o in main.candidates) for c in source.free)
+            slow = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
+            source.reason = f"says what {main.topic} says already" if copied else slow
+            source.apart = "slower than the states" * (not copied)
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it
             for candidate in source.free:
                 candidate.reason, candidate.ready = source.reason, "state"
@@ -408,17 +429,6 @@ def choose(
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
         keep.append(candidate)
     return keep, doubt
-
-
-def as_unwatched(sources: Sequence[Source]) -> list[str]:
-    """What is said of topics of the machine of which no state is, as they are slower or of none of its members."""
-    found = []
-    for why in dict.fromkeys(s.apart for s in sources if s.apart):
-        topics = [s.topic for s in sources if s.apart == why]
-        verb, them = ("is", "it") if len(topics) == 1 else ("are", "them")
-        remedy = f"for a second model `init` the same recordings with --states {' '.join(topics)}"
-        found.append(f"{shortlist(topics, 3)} {verb} {why}, so nothing watches {them}; {remedy}")
-    return found
 
 
 def _slowest(states: Sequence[Source], used: Sequence[Candidate]) -> float:

@@ -45,7 +45,7 @@ from uncertain_lti.proposal.candidates import (
     set_aside_labels,
     take_switches,
 )
-from uncertain_lti.proposal.choosing import as_unwatched, assign_roles, choose
+from uncertain_lti.proposal.choosing import assign_roles, choose
 from uncertain_lti.proposal.members import all_of_them, moves_per
 from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
@@ -89,6 +89,7 @@ _RUN = re.compile(
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
 _CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
+_CLOCK |= {"hours", "runtime", "betriebsstunden", "horas"}  # of running
 _COMPUTER = re.compile(
     r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum)(_|$)|^dt$"
 )  # what it took for a cycle, how busy it is
@@ -443,6 +444,17 @@ class Proposal:
 
 
 @np.errstate(all="ignore")
+def _unwatched(sources: Sequence[Source]) -> list[str]:
+    """What is said of topics of the machine of which no state is, as they are slower or of none of its members."""
+    found = []
+    for why in dict.fromkeys(s.apart for s in sources if s.apart):
+        topics = [s.topic for s in sources if s.apart == why]
+        verb, them = ("is", "it") if len(topics) == 1 else ("are", "them")
+        remedy = f"for a second model `init` the same recordings with --states {' '.join(topics)}"
+        found.append(f"{shortlist(topics, 3)} {verb} {why}, so nothing watches {them}; {remedy}")
+    return found
+
+
 def propose(
     paths: Sequence[str | os.PathLike[str]],
     progress: Progress | None = None,
@@ -513,7 +525,7 @@ def propose(
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     switches = [] if controls else take_switches(sources)
-    commands, measured = assign_roles(sources, bool(states or controls))
+    commands, measured = assign_roles(sources, bool(states or controls), bool(controls))
     commands += switches
     sources += [s for s in [*commands, *measured] if s not in sources]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
@@ -541,7 +553,7 @@ def propose(
     set_operating_point([c for c in chosen if c not in levels] or chosen, used)
     for candidate in [*ready, *levels]:
         set_own_scale(candidate)
-    warnings += [*[doubt] * bool(doubt), *as_unwatched(sources)]
+    warnings += [*[doubt] * bool(doubt), *_unwatched(sources)]
     if not commands:
         unread = (s for s in sources if s.role == "control" and s.unreadable)
         warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]

@@ -14,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, count, zip_longest
@@ -30,7 +31,7 @@ from uncertain_lti.sampling.reading import of_another_clock
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
 from uncertain_lti.signals.signal_map import Signal
-from uncertain_lti.signals.values import CHOICES_TEXT, TABLE, TableLayout, of_table
+from uncertain_lti.signals.values import CHOICES_TEXT, TableLayout, of_table
 
 _PARTS = re.compile(r"[A-Z]+(?![^\W\d_A-Z])|[A-Z]?[^\W\d_A-Z]+|\d+")  # letters of any alphabet
 
@@ -416,14 +417,14 @@ def _number(value: float, exact: bool = False) -> str:
 
 
 def _left_out(sources: Sequence[Source], chosen: set[Candidate]) -> list[str]:
-    lines = []
+    lines, parts = [], Counter(source.topic for source in sources)
     for source in sources:
         groups: dict[str, list[str]] = {}
         for candidate in source.candidates:
             if candidate not in chosen and not candidate.ready:
                 groups.setdefault(candidate.reason or source.reason, []).append(candidate.path)
         of = {reason: f" {shortlist(paths, 6)}" for reason, paths in groups.items()}
-        if source.reason and set(groups) <= {source.reason} and source.type != TABLE:  # whose roles have columns
+        if source.reason and set(groups) <= {source.reason} and parts[source.topic] == 1:
             of = {source.reason: ""}
         lines += [f"#   {source.topic}{paths}: {' '.join(reason.split())}" for reason, paths in of.items()]
     return lines
