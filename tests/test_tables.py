@@ -1024,13 +1024,6 @@ def test_numbers_of_one_name_and_time_are_of_the_units_that_another_column_names
     assert {name: column[0] for name, column in found.items()} == {"K1_p": 0, "K1_q": 1, "K2_p": 2, "K2_q": 3}
 
 
-def test_a_name_may_begin_with_any_letter(tmp_path):
-    """`Ángulo` was `c_Ángulo`, as if it began with a digit."""
-    bag = read_csv(tmp_path, "time,Ángulo (°),1. Stufe", [f"{k},{k % 7},{k % 5}" for k in range(50)])
-    assert list(bag.columns_by_field) == ["Ángulo", "c_1_Stufe"]
-    assert FieldPath("Ángulo").steps == (("attribute", "Ángulo"),)
-
-
 def test_a_signal_that_lacks_some_times_is_missing_there(tmp_path):
     rows = [row for k, row in enumerate(_of_tags("{tag},{t},{x}")) if k not in (10, 33)]
     bag = read_csv(tmp_path, "tag,time,value", rows)

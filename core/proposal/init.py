@@ -49,6 +49,7 @@ from uncertain_lti.proposal.choosing import assign_roles, choose
 from uncertain_lti.proposal.members import all_of_them, moves_per
 from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
+    as_unwatched,
     columns_of,
     endless,
     entry,
@@ -444,17 +445,6 @@ class Proposal:
 
 
 @np.errstate(all="ignore")
-def _unwatched(sources: Sequence[Source]) -> list[str]:
-    """What is said of topics of the machine of which no state is, as they are slower or of none of its members."""
-    found = []
-    for why in dict.fromkeys(s.apart for s in sources if s.apart):
-        topics = [s.topic for s in sources if s.apart == why]
-        verb, them = ("is", "it") if len(topics) == 1 else ("are", "them")
-        remedy = f"for a second model `init` the same recordings with --states {' '.join(topics)}"
-        found.append(f"{shortlist(topics, 3)} {verb} {why}, so nothing watches {them}; {remedy}")
-    return found
-
-
 def propose(
     paths: Sequence[str | os.PathLike[str]],
     progress: Progress | None = None,
@@ -553,7 +543,7 @@ def propose(
     set_operating_point([c for c in chosen if c not in levels] or chosen, used)
     for candidate in [*ready, *levels]:
         set_own_scale(candidate)
-    warnings += [*[doubt] * bool(doubt), *_unwatched(sources)]
+    warnings += [*[doubt] * bool(doubt), *as_unwatched(sources)]
     if not commands:
         unread = (s for s in sources if s.role == "control" and s.unreadable)
         warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]

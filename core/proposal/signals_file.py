@@ -428,3 +428,14 @@ def _left_out(sources: Sequence[Source], chosen: set[Candidate]) -> list[str]:
             of = {source.reason: ""}
         lines += [f"#   {source.topic}{paths}: {' '.join(reason.split())}" for reason, paths in of.items()]
     return lines
+
+
+def as_unwatched(sources: Sequence[Source]) -> list[str]:
+    """What is said of topics of the machine of which no state is, as they are slower or of none of its members."""
+    found = []
+    for why in dict.fromkeys(s.apart for s in sources if s.apart):
+        topics = [s.topic for s in sources if s.apart == why]
+        verb, them = ("is", "it") if len(topics) == 1 else ("are", "them")
+        remedy = f"for a second model `init` the same recordings with --states {' '.join(topics)}"
+        found.append(f"{shortlist(topics, 3)} {verb} {why}, so nothing watches {them}; {remedy}")
+    return found
