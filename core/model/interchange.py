@@ -302,7 +302,6 @@ def load_mat(model_class: Any, path: str | os.PathLike[str]) -> Any:
 
 
 def _variables(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """What a MATLAB file holds."""
     from scipy.io import loadmat
 
     try:

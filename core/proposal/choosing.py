@@ -131,7 +131,7 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
 
 
 _WITHIN = "answers within a step; add it if it has a memory of its own"
-_EFFORT = "an effort answers within a step; with it, friction and load show that a position loop hides"
+_EFFORT = "an effort answers within a step; taken in, it shows friction and load, which a position loop hides"
 _BESIDE = (
     (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist beside it"),
     (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", f"an acceleration {_WITHIN}"),
