@@ -110,6 +110,16 @@ def test_an_alarm_without_a_violation_is_told():
     assert rest.endswith("every one inside all bounds")
 
 
+def test_of_many_recordings_those_in_alarm_are_told_first():
+    facts = judged([0.9, 0.9])
+    quiet, alarm = ({"recording": f"{state}.mcap", "state": state, "text": "told"} for state in ("quiet", "alarm"))
+    for count in (20, 150):
+        lines = findings_text({**facts, "happened": [quiet] * (count - 1) + [alarm]}).splitlines()
+        told = [line for line in lines if line.endswith(".mcap: told")]
+        assert len(told) == 20 and (told[0 if count > 20 else -1] == "  alarm.mcap: told")
+        assert ("  and 130 more; the page and --json have all" in lines) == (count > 20)
+
+
 @given(st.floats(1.0, 1e6, exclude_min=True), st.sampled_from([-1.0, 1.0]))
 def test_a_violation_reads_as_beyond_its_bound(size, sign):
     text = beyond(sign * size)

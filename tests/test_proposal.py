@@ -1558,7 +1558,7 @@ def test_the_angle_of_a_wheel_is_no_state_beside_its_rate(tmp_path):
     assert "position[wheel_left_joint]: grows with the way" in proposal.text
     assert "position[steering_wheel]: grows" not in proposal.text
     offered = re.findall(
-        r'  # - .* field: "effort\[(\w+)\]".* # an effort answers within a step; taken in, it shows friction', proposal.text
+        r'  # - .* field: "effort\[(\w+)\]".* # an effort answers within a step; taken in, it', proposal.text
     )
     assert sorted(offered) == sorted(names)
 

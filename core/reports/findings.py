@@ -38,7 +38,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import times_text
 from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.check import check_data, instant_text, raised_by
+from uncertain_lti.reports.check import OUTCOMES, check_data, instant_text, raised_by
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -51,6 +51,8 @@ OUTSIDE_DOMAIN, WITHOUT_VERDICT = 0.05, 0.2
 """Shares of the verdicts outside the fitted ranges, and of the samples without a verdict."""
 MOST_VIOLATED = 0.5
 """Share of the verdicts violated from which on a model is refused of which nothing shows that it ever holds."""
+_MOST_TOLD = 20
+"""Recordings of which a line is printed each; of more, those in alarm first."""
 YES, CARE, UNKNOWN, NO = "yes", "with care", "unknown", "no"
 WEIGHTS = (NO, UNKNOWN, CARE, YES)
 """From what weighs most: the answer is the first that some reason has."""
@@ -143,7 +145,11 @@ def findings_text(facts: Mapping[str, Any]) -> str:
     lines = [f"may I rely on it? {facts['rely']['answer']}"]
     lines += [f"  {r['weight']}: {r['text']}" for r in facts["rely"]["reasons"]]
     lines.append("what happened?")
-    lines += [f"  {h['recording']}: {h['text']}" for h in facts["happened"]]
+    happened = facts["happened"]
+    if (more := len(happened) - _MOST_TOLD) > 0:
+        happened = sorted(happened, key=lambda h: OUTCOMES.index(h["state"]))[:_MOST_TOLD]
+    lines += [f"  {h['recording']}: {h['text']}" for h in happened]
+    lines += [f"  and {more} more; the page and --json have all"] * (more > 0)
     lines.append(f"which faults would it see? {facts['sees']['answer']}")
     return "\n".join(lines + [f"  {text}" for text in facts["sees"]["texts"]])
 
