@@ -28,8 +28,8 @@ from uncertain_lti.cli.main import build_parser, main
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.plants.leibov import STATE_TOPIC
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.reports.check import check_data, check_text, overview
-from uncertain_lti.reports.findings import findings
+from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.reports.findings import findings, overview
 
 
 def refused(cli, *words):

@@ -366,6 +366,8 @@ def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     u[400:600] = u.max()
     verdicts = replace(verdicts, transient=parked.replace(u=u))  # by its own verdicts it would be frozen
     assert f"{said}while {model.control_names[0]} moved" in check_text(check_data(model, verdicts))
+    data = check_data(model, EnvelopeMonitor(model).check(run(5, seconds=12.0, rest=(2.0, 3.2))))
+    assert data["repeats"] and "warning: " not in check_text(data), "a little longer than the 0.99 s of the fit"
 
 
 def test_a_frozen_state_breaks_the_windows_of_the_horizons() -> None:

@@ -149,7 +149,8 @@ _SLOW = "say what took how long"
 def check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.monitor.deployed import drift_in_words
-    from uncertain_lti.reports.check import check_data, check_text, outcome, overview
+    from uncertain_lti.reports.check import check_data, check_text, outcome
+    from uncertain_lti.reports.findings import overview
 
     judged = Judged(options, load_model(options.model), options.bags)
     model, bags, deployed = judged.model, judged.bags, judged.deployed

@@ -40,7 +40,7 @@ from uncertain_lti.model.domain import STRANGE, jump_words, jumps, outside_in_wo
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Raised, back_and_restarts, times_text
+from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
 from uncertain_lti.monitor.reason import why_not
 from uncertain_lti.monitor.verdict import NUMBERS, Verdicts
@@ -61,6 +61,8 @@ MOST_EPISODES, MOST_EXPLAINED = 1000, 100
 _TOGETHER = 1000  # samples whose verdicts are made into plain data at once
 MOST_SHOWN = 5
 """Frozen repeats, patterns and rules that the text names."""
+_FAR_LONGER = 1.5
+"""Times the longest repeat of the fit, which one in three healthy recordings passes a little."""
 _REMEDIES = {
     Status.FIRST: "a verdict needs two samples: check a longer recording",
     Status.GAP: "every step is longer than max_gap: is a topic slower than in the fit? see `uncertain-lti topics`",
@@ -261,6 +263,13 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
                 }
             )
     return sorted(found, key=lambda repeat: (repeat["k"], repeat["state"]))
+
+
+def long_repeats(data: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """The longest repeat of each state, if far longer than any of the fit; the longest first."""
+    far = [r for r in data["repeats"] if r["seconds"] > _FAR_LONGER * r["longest_in_fit"]]
+    every = {r["state"]: r for r in sorted(far, key=lambda repeat: repeat["seconds"])}
+    return sorted(every.values(), key=lambda repeat: -repeat["seconds"])
 
 
 def _explained(model: UncertainLTI, verdicts: Verdicts) -> Iterator[dict[str, Any]]:
@@ -537,12 +546,10 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     jumps.sort(key=lambda j: j["largest_in_fit"] / abs(j["change"]))
     blocks += _first([f"{j['text']} at {instant_text(j)}" for j in jumps], "jump")
     frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
-    every = {r["state"]: r for r in sorted(data["repeats"], key=lambda repeat: repeat["seconds"])}
-    longest = dict(sorted(every.items(), key=lambda item: -item[1]["seconds"]))
     blocks += _first(frozen, "frozen repeat")
     rest = "as of a machine at rest: the model does not move it"
-    moves = {name: f"while {shortlist(r['moving'], 3)} moved" if r["moving"] else rest for name, r in longest.items()}
-    blocks += _first([f"warning: {r['text']}, {moves[name]}" for name, r in longest.items()], "warning")
+    longest = [(r["text"], f"while {shortlist(r['moving'], 3)} moved" * bool(r["moving"])) for r in long_repeats(data)]
+    blocks += _first([f"warning: {text}, {moved or rest}" for text, moved in longest], "warning")
     told = [f"the alarm from {instant_text(like)} {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
     if alarms := data["alarms"]:
@@ -559,18 +566,6 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
         blocks += [f"nearest to an alarm: {near['words']}, at {instant_text(near)}"] if near else []
         blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
     return blocks
-
-
-def overview(recordings: Sequence[Mapping[str, Any]]) -> Table:
-    """What came of each of several recordings, a row each."""
-    rows = []
-    for r in recordings:
-        first = instant_text(r["alarms"][0]) if r["alarms"] else "-"
-        size, of = (times_text(far["value"]), far["what"]) if (far := r["farthest"]) else ("", "")
-        came = "ALARM" if r["alarm"] else "UNKNOWN" if r["reason"] else "no alarm"
-        rows.append([r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size, of])
-    header = ("recording", "outcome", "first alarm", "largest", "times the threshold of")
-    return Table(header, rows, left=(1, 4), most=1000)
 
 
 def _when(alarm: Mapping[str, Any]) -> str:

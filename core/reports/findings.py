@@ -20,6 +20,7 @@ from typing import Any
 from uncertain_lti import __version__
 from uncertain_lti.base.files import sha256
 from uncertain_lti.base.text import (
+    Table,
     finite_data,
     lasting,
     list_of,
@@ -38,7 +39,7 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import times_text
 from uncertain_lti.monitor.deployed import drift_in_words
 from uncertain_lti.monitor.verdict import Verdicts
-from uncertain_lti.reports.check import OUTCOMES, check_data, instant_text, raised_by
+from uncertain_lti.reports.check import OUTCOMES, check_data, instant_text, long_repeats, raised_by
 from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, detectable_words, readable_validation
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
@@ -154,6 +155,18 @@ def findings_text(facts: Mapping[str, Any]) -> str:
     return "\n".join(lines + [f"  {text}" for text in facts["sees"]["texts"]])
 
 
+def overview(recordings: Sequence[Mapping[str, Any]]) -> Table:
+    """What came of each of several recordings, a row each."""
+    rows = []
+    for r in recordings:
+        first = instant_text(r["alarms"][0]) if r["alarms"] else "-"
+        size, of = (times_text(far["value"]), far["what"]) if (far := r["farthest"]) else ("", "")
+        came = "ALARM" if r["alarm"] else "UNKNOWN" if r["reason"] else "no alarm"
+        rows.append([r["recording"], came + ", beware" * bool(r["alarm"] and r["reason"]), first, size, of])
+    header = ("recording", "outcome", "first alarm", "largest", "times the threshold of")
+    return Table(header, rows, left=(1, 4), most=1000)
+
+
 def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
     """One sentence, and whether there is something to look at."""
     judged, bad, state = recording["verdicts"], recording["violated"], recording["outcome"]
@@ -175,9 +188,8 @@ def _happened(recording: Mapping[str, Any]) -> dict[str, Any]:
         text += f", but {recording['reason']}"
     if frozen := [f"{repeat['text']}, {repeat['why']}" for repeat in recording["frozen"]]:
         text = f"frozen: {shortlist(frozen, 1)}. {text}"
-    elif held := [repeat for repeat in recording["repeats"] if repeat["moving"]]:
-        longest = max(held, key=lambda repeat: repeat["seconds"])
-        text += f". {longest['text']}, while {shortlist(longest['moving'], 3)} moved"
+    elif held := [repeat for repeat in long_repeats(recording) if repeat["moving"]]:
+        text += f". {held[0]['text']}, while {shortlist(held[0]['moving'], 3)} moved"
     if alarms := recording["alarms"]:
         by = "".join(f", by {words}" for words in raised_by(alarms[0])[:1])
         if (far := recording["farthest"]) and far["k"] != alarms[0]["k"]:

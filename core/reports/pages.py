@@ -40,8 +40,8 @@ from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Spans
-from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks, overview
-from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES
+from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks
+from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES, overview
 from uncertain_lti.reports.model_text import model_blocks, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 
