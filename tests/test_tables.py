@@ -1024,6 +1024,30 @@ def test_numbers_of_one_name_and_time_are_of_the_units_that_another_column_names
     assert {name: column[0] for name, column in found.items()} == {"K1_p": 0, "K1_q": 1, "K2_p": 2, "K2_q": 3}
 
 
+@pytest.mark.parametrize("by", ["time", "tag"])
+def test_a_number_beside_that_named_value_is_a_quality_or_of_a_unit(tmp_path, by):
+    """Sorted by tags all were one state of as many runs, without a word."""
+    rows = [(k, f"{tag},{k % 7},{192 - k % 40 // 39}") for k in range(80) for tag in ("p", "q")]
+    rows = [f"{k},{cells}" for k, cells in (rows if by == "time" else sorted(rows, key=lambda row: row[1][0]))]
+    assert {*read_csv(tmp_path, "time,tag,value,quality", rows).columns_by_field} == {"p", "q"}
+    rows = [f"{k},{unit},{tag},{k % 7 + unit}" for k in range(60) for unit in (1, 2) for tag in ("p", "q")]
+    found = read_csv(tmp_path, "time,unit,tag,value", rows).columns_by_field
+    assert {name: column[0] for name, column in found.items()} == {"c_1_p": 1, "c_1_q": 1, "c_2_p": 2, "c_2_q": 2}
+
+
+def test_what_is_not_put_side_by_side_is_counted_and_no_name_takes_the_place_of_another(tmp_path):
+    """Rows without a name had all tags read as runs of one state; those without a time, and a tag `time`, were lost."""
+    rows = [f"{k},{tag},{k % 7}" for tag in ("p", "time") for k in range(60)]
+    rows[5], rows[70] = ",p,5", "10,,3"
+    bag = read_csv(tmp_path, "time,tag,value", [*rows, "4,p,9"])
+    assert {name: int(np.isfinite(c).sum()) for name, c in bag.columns_by_field.items()} == {"p": 59, "time_2": 59}
+    assert "3 rows left out without a name, a time or a number" in bag.warnings[-1]
+    units = [f"{k},{unit},{tag},{k % 7}" for k in range(60) for unit, tag in (("a", "b_c"), ("a_b", "c"), ("a", "c"))]
+    assert len(read_csv(tmp_path, "time,unit,tag,value", units).columns_by_field) == 3
+    refuses(BagError, "column 'tag' names the signal", propose, [write(tmp_path / "r.csv", "time,tag,value", "7,z,1",
+            *(f"{k},{tag},{k % 7}" for tag in ("p", "q") for k in range(60)))])  # fmt: skip
+
+
 def test_a_signal_that_lacks_some_times_is_missing_there(tmp_path):
     rows = [row for k, row in enumerate(_of_tags("{tag},{t},{x}")) if k not in (10, 33)]
     bag = read_csv(tmp_path, "tag,time,value", rows)
@@ -1105,6 +1129,14 @@ def test_a_file_read_at_once_is_that_read_line_by_line(tmp_path, delimiter, odd)
     assert [*found[0].columns] == [*found[1].columns] and found[0].notes == found[1].notes[1:]
     for one, other in zip(*(table.columns.values() for table in found), strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_blank_before_a_quote_or_behind_the_last_delimiter_changes_nothing(tmp_path):
+    """Numbers in such quotes were lost where the first rows had none, and text kept its quotes."""
+    rows = [f"2026-03-01 00:{k // 60:02}:{k % 60:02},{k},on,{k}," for k in range(80)]
+    table = read_table(write(tmp_path / "a.csv", "time,x,mode,y", *rows, '2026-03-01 00:01:20, "80", "off",80,  '))
+    assert table.columns["x"].tolist() == [*range(81)] and table.columns["mode"].tolist() == [1] * 80 + [0]
+    assert [*table.columns] == ["time", "x", "mode", "y"] and not table.notes
 
 
 def test_a_parquet_without_rows_or_with_a_name_twice(tmp_path):

@@ -32,7 +32,7 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import read_table
-from uncertain_lti.recordings.table_text import QUANTITY, Column, RawTable, field_name, find_column
+from uncertain_lti.recordings.table_text import ODD_SHARE, QUANTITY, Column, RawTable, field_name, find_column, unique
 from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
@@ -51,6 +51,7 @@ _OF_SIGNALS = (
     r"(tag|var(iable)?|signal|field|point|channel|sensor|item|parameter|series|metric|topic|entity)([\W_]*(name|id))?"
 )
 _NAMES = re.compile(rf"(?i)(.*[\W_])?(name|{_OF_SIGNALS})")
+_VALUES = re.compile(r"(?i)_?((var|tag)?[\W_]*value|val|payload|reading|wert)")
 _TOGETHER = 0.9  # of the times, that have a number of each signal
 _SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
 
@@ -83,8 +84,12 @@ class Table(Recording):
         called = _NAMES.fullmatch(naming) and rows is None
         wide = _side_by_side(of_each, signals[value], times) if called else None
         if wide is not None:
-            raw, times = RawTable({time: wide[1], **wide[0]}), wide[1]
             self._warnings.append(f"{file}: column '{naming}' names the signal of each number in '{value}'")
+            if left := len(times) - sum(int(np.isfinite(column).sum()) for column in wide[0].values()):
+                why = "without a name, a time or a number, or of a name and time that another row has"
+                self._warnings.append(f"{file}: {plural(left, 'row')} left out {why}")
+            names, times = unique([time, *wide[0]]), wide[1]
+            raw = RawTable(dict(zip(names, [times, *wide[0].values()], strict=True)))
         kept = np.arange(len(times)) if rows is None else rows
         known = times[kept] != NO_TIME
         if missing_time := int(np.count_nonzero(~known)):
@@ -450,23 +455,28 @@ def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[st
 
     Few names change from row to row, or the time begins anew with each. Nothing for other tables.
     """
-    numbers = [n for n, c in columns.items() if c.dtype.kind in "iuf" and c.ndim == 1 and not called_time(n)]
+    every = [n for n, c in columns.items() if c.dtype.kind in "iuf" and c.ndim == 1 and not called_time(n)]
+    value = [name for name in every if _VALUES.fullmatch(name)]
     texts = [name for name, column in columns.items() if column.dtype.kind == "O"]
-    for naming in sorted(texts, key=lambda name: not _NAMES.fullmatch(name)) if numbers else ():
-        cells = columns[naming]
-        few = set(cells.tolist())
-        if not 2 <= len(few) <= len(times) // _ROWS_EACH or "" in few:
+    for naming in sorted(texts, key=lambda name: not _NAMES.fullmatch(name)) if every else ():
+        numbers = value if len(value) == 1 and _NAMES.fullmatch(naming) else every  # beside a quality, or of units
+        named = np.flatnonzero(columns[naming] != "")
+        cells, when = columns[naming][named], times[named]
+        few = len(set(cells.tolist()))
+        if not 2 <= few <= len(named) // _ROWS_EACH or len(named) < (1 - ODD_SHARE) * len(times):
             continue
-        rows = _rows_of_each(_of_units(cells.astype(str), [columns[n] for n in texts if n != naming], times))
+        beside = [n for n in [*texts, *every] if n != naming and n not in numbers]
+        rows = _rows_of_each(_of_units(cells.astype(str), [columns[n][named] for n in beside], when))
         order = np.concatenate([*rows.values()])
         first = np.cumsum([0, *map(len, rows.values())])[:-1]
-        least, most = (of_each.reduceat(times[order], first) for of_each in (np.minimum, np.maximum))
-        anew = most.min() > least.max() and _NAMES.fullmatch(naming)
+        least, most = (of_each.reduceat(when[order], first) for of_each in (np.minimum, np.maximum))
+        usual = np.diff(first, append=len(order)) >= _ROWS_EACH  # a name of few rows says nothing
+        anew = sum(usual) > 1 and most[usual].min() > least[usual].max() and _NAMES.fullmatch(naming)
         if 2 * np.count_nonzero(cells[1:] != cells[:-1]) > len(cells) or anew:
-            of_rows = {name: columns[name][order] for name in numbers}
+            of_rows = {name: columns[name][named][order] for name in numbers}
             moving = [n for n, c in of_rows.items() if (np.fmax.reduceat(c, first) > np.fmin.reduceat(c, first)).any()]
             if len(moving) == 1:  # others, such as an identifier, are the same in all rows of a name
-                return naming, moving[0], rows
+                return naming, moving[0], {name: named[of] for name, of in rows.items()}
     return "", "", {}
 
 
@@ -480,7 +490,9 @@ def _of_units(names: Column, others: Sequence[Column], times: NDArray[np.int64])
 
     found = known(names) if others else len(names)
     for other in others if found < _TOGETHER * len(names) else ():
-        joined = np.char.add(np.char.add(other.astype(str), "_"), names)
+        if other.dtype.kind == "f":
+            other = np.array([f"{number}".removesuffix(".0") for number in other.tolist()])
+        joined = np.char.add(np.char.add(other.astype(str), "\t"), names)
         if (more := known(joined)) > found:
             names, found = joined, more
     return names

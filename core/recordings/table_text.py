@@ -139,7 +139,7 @@ def _read_at_once(
                 return None
             numbers[int(odd[2]) - 1], passed = False, passed + int(odd[1])
     wholes = ["".join(cells) if cells.dtype.kind == "O" else "" for cells in columns]
-    if not columns or any(mark in whole for whole in wholes for mark in ",\n\r"):
+    if not columns or any(mark in whole for whole in wholes for mark in ',\n\r"'):
         return None  # 1.234 may be another number where commas part decimals; a quote may not be closed
     read = _columns(names, columns, wholes, shape.delimiter)
     return replace(read, exact=partial(_texts, path, encoding, shape, names))
@@ -237,7 +237,7 @@ def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[s
         if cells.dtype.kind != "O":
             found[name] = cells
             continue
-        if name.startswith("column ") and not whole:
+        if name.startswith("column ") and not whole.strip():
             continue  # a delimiter at the end of each line
         # 1.234 is one number to all, and another here; `1_0` is 10 to Python alone
         if "_" not in whole and not (commas and any(_GROUPED.match(cell.strip()) for cell in cells)):
