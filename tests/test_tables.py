@@ -582,6 +582,15 @@ def test_objects_in_a_file_are_not_loaded(tmp_path):
     assert not (tmp_path / "exploded").exists()
 
 
+def test_bytes_that_are_no_text_and_names_that_run_together_are_columns(tmp_path):
+    """The first ended in a traceback; of `a.b` and `a_b` the second took the other's place."""
+    t = np.arange(4) * 0.1
+    np.savez(tmp_path / "a.npz", t=t, label=np.array([b"\xff\xfe", b"on", b"", b"\xc3\xa4"]))
+    assert read_table(tmp_path / "a.npz").columns["label"].tolist() == ["\ufffd\ufffd", "on", "", "ä"]
+    columns = _of_arrays(tmp_path / "a.mat", {"t": t, "a": {"b": t + 1}, "a_b": t + 2}).columns
+    assert {name: column[0] for name, column in columns.items()} == {"t": 0, "a_b": 1, "a_b_2": 2}
+
+
 @pytest.mark.parametrize("kind", [".csv", ".npz"])
 def test_damage_anywhere_is_read_or_a_sentence(tables, kind, tmp_path):
     data = tables[kind].read_bytes()

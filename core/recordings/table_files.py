@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import BagError, absent
-from uncertain_lti.base.text import shortlist
+from uncertain_lti.base.text import once, shortlist
 from uncertain_lti.recordings.table_text import YEARS, Column, RawTable, read_csv, unique
 from uncertain_lti.recordings.unreadable import aside, most_inflated, one_line, os_error
 
@@ -184,7 +184,8 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
         elif array.dtype.kind == "m":
             array = array / np.timedelta64(1, "s")
         elif array.dtype.kind in "US":
-            array = array.astype(str).astype(object)
+            array = np.char.decode(array, "utf-8", "replace") if array.dtype.kind == "S" else array
+            array = array.astype(object)
         elif array.dtype.kind in "bf":
             array = array.astype(np.float64)
         elif array.dtype.kind not in "iu" and not _is_text(array):
@@ -192,7 +193,8 @@ def _of_arrays(path: Path, variables: Mapping[str, Any]) -> RawTable:
             continue
         if array.ndim in (1, 2) and array.shape[0] > 1:
             short = re.sub(r"_signals((?:_\d+)?)_values$", r"\1", name)  # as Simulink logs a signal beside its time
-            found[name if short in found else short] = array
+            name = name if short in found else short
+            found[once([*found, name], "_")[-1] if name in found else name] = array  # `a.b` beside `a_b`
         elif array.ndim:
             notes.setdefault("no vector", []).append(name)
     return _of_one_length(path, found, notes)
