@@ -180,6 +180,14 @@ def test_points_part_thousands_where_commas_part_decimals_in_another_column(tmp_
     assert np.array_equal(bag.columns_by_field["y"], 1 + np.arange(9) / 8)
 
 
+def test_commas_part_thousands_where_they_do_in_another_column(tmp_path):
+    """1,010 was 1.01 beside 980 and behind 12,345.5, without a word."""
+    rows = [f"{k};{980 + 10 * k:,};{1000 + k:,};{12345.5 + k:,.1f};{1 + k / 8:.3f}" for k in range(9)]
+    columns = read_csv(tmp_path, "time;x;y;z;w", rows).columns_by_field
+    assert np.array_equal(columns["x"], 980 + 10 * np.arange(9)) and np.array_equal(columns["y"], 1000 + np.arange(9))
+    assert np.array_equal(columns["w"], 1 + np.arange(9) / 8)
+
+
 @pytest.mark.parametrize(
     ("cells", "numbers"),
     [

@@ -231,8 +231,14 @@ def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[s
     """Columns of cells by what all of them tell, and what was done; those of numbers as they are."""
     found: dict[str, Column] = {}
     noted: dict[str, list[str]] = {}
-    texts = (cells for cells, whole in zip(columns, wholes, strict=True) if "," in whole)
-    commas = any("," in cell and _has_comma(cell.strip()) for cells in texts for cell in cells)
+    texts = [cells for cells, whole in zip(columns, wholes, strict=True) if "," in whole]
+    point = ""  # what parts decimals, if a cell tells
+    for cell in (cell.strip() for cells in texts for cell in cells if "," in cell):
+        if _has_comma(cell):
+            point = ","
+            break
+        if (match := _GROUPED.match(cell)) and match["by"] == "," and _tells(match):
+            point = "."
     for name, cells, whole in zip(names, columns, wholes, strict=True):
         if cells.dtype.kind != "O":
             found[name] = cells
@@ -240,24 +246,24 @@ def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[s
         if name.startswith("column ") and not whole.strip():
             continue  # a delimiter at the end of each line
         # 1.234 is one number to all, and another here; `1_0` is 10 to Python alone
-        if "_" not in whole and not (commas and any(_GROUPED.match(cell.strip()) for cell in cells)):
+        if "_" not in whole and not (point == "," and any(_GROUPED.match(cell.strip()) for cell in cells)):
             with suppress(ValueError):
                 found[name] = np.where(cells == "", "nan", cells).astype(np.float64)
                 continue
-        found[name], note = _column(cells.tolist(), commas, delimiter)
+        found[name], note = _column(cells.tolist(), point, delimiter)
         if note:
             noted.setdefault(note, []).append(name)
     words = ((note, shortlist([repr(name) for name in of], 6), "s" * (len(of) > 1)) for note, of in noted.items())
     return RawTable(found, [f"column{several} {of}: {note}" for note, of, several in words])
 
 
-def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str]:
-    """Numbers where most cells are some, else text; and what was done; `commas`: whether they part its decimals."""
+def _column(cells: list[str], point: str, delimiter: str) -> tuple[Column, str]:
+    """Numbers where most cells are some, else text; and what was done; `point`: what parts decimals in the file."""
     plain = [cell.strip().replace("\u2212", "-") for cell in cells]  # the minus of some languages
     numbers = np.full(len(plain), np.nan)
-    if by := _thousands(plain, commas):
+    if by := _thousands(plain, point):
         plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]
-    decimal = delimiter != "," or commas  # in quotes between commas they may part thousands
+    decimal = point == "," or not (point or delimiter == ",")  # in quotes between commas they may part thousands
     comma = missing = odd = truths = 0
     first = ""
     for i, cell in enumerate(plain):
@@ -282,7 +288,7 @@ def _column(cells: list[str], commas: bool, delimiter: str) -> tuple[Column, str
         written = (QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING)
         if not unit or len({*plain}) < 2 or not all(match and match["unit"] == unit for match in written):
             return np.array(plain, dtype=object), ""
-        numbers, note = _column([cell.removesuffix(unit) for cell in plain], commas, delimiter)
+        numbers, note = _column([cell.removesuffix(unit) for cell in plain], point, delimiter)
         return numbers, " and ".join(filter(None, [note, f"'{unit}' taken off each number"]))
     read = [f"'{by}' between thousands taken out"] * bool(by) + ["decimal commas read as points"] * bool(comma)
     return numbers, " and ".join([left_out(odd, "number", first)] * bool(odd) + read)
@@ -293,13 +299,18 @@ def _has_comma(cell: str) -> bool:
     return bool(_WITH_COMMA.match(cell)) and not _GROUPED.match(cell)
 
 
-def _thousands(cells: Sequence[str], commas: bool) -> str:
+def _tells(grouped: re.Match[str]) -> bool:
+    """Whether what is between its digits parts thousands for certain."""
+    return bool(grouped["rest"]) or grouped[0].count(grouped["by"]) > 1
+
+
+def _thousands(cells: Sequence[str], point: str) -> str:
     """What parts thousands in a column, if cells tell (`1,234.5`, `1 234`, `1.234.567`) and none denies; else ""."""
     grouped = [m for m in map(_GROUPED.match, cells) if m]
     alone = [cell for cell in cells if _is_value(cell) and not _GROUPED.match(cell)] if grouped else []
     other = {by for by, decimal in (",.", ".,") if any(decimal in cell for cell in alone)}  # no decimals are behind it
-    other |= {"."} if commas and alone else set()  # without any they may be numbers of three decimals each
-    marks = [(m["by"], m["rest"] or m[0].count(m["by"]) > 1) for m in grouped]
+    other |= {","} if point == "." else {"."} if point and alone else set()  # or they have three decimals each
+    marks = [(m["by"], _tells(m)) for m in grouped]
     found = {by for by, telling in marks if telling or by not in ",." or by in other}
     by = found.pop() if len(found) == 1 else ""
     return by if by and all(by not in cell or _GROUPED.match(cell) for cell in cells) else ""
