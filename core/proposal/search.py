@@ -285,7 +285,6 @@ def chosen_of(candidates: Sequence[KnotCandidate]) -> KnotCandidate:
 
 
 def _reason_for_knots(candidates: Sequence[KnotCandidate], chosen: KnotCandidate) -> str:
-    """Why this one, in words."""
     base, *others = candidates
     if base.score is None:
         return f"nothing can be left out: {base.refused}"
@@ -451,7 +450,6 @@ def _decided(
 def _reason_for_horizons(
     chosen: Mapping[int, Widths], found: Mapping[int, Sequence[HorizonCandidate]], dropped: Mapping[int, str]
 ) -> str:
-    """Why these, in words."""
     if not found:
         reason = "none has an envelope that is worth having" if dropped else "no recording is long enough for a horizon"
     elif not chosen:
