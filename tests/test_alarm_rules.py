@@ -221,3 +221,12 @@ def test_a_rule_of_all_states_looks_at_residuals_of_the_form_of_its_horizon(rela
     arrays = ZEROS, ZEROS[:, :1], ZEROS, ZEROS[:, :1]
     model = UncertainLTI(*arrays, v=[0.3, 0.3], residuals=one, horizons=[Horizon(4, *arrays, v=[1, 1], residuals=four)])
     assert [row_of(StatisticRule("chi2", 0.0, 1.0, horizon), model) for horizon in (1, 4)] == rows
+
+
+def test_numbers_of_numpy_are_those_of_python():
+    """As of a search over windows; a model file holds no others."""
+    contained = AlarmRule(np.int64(2), np.int32(5), np.float32(1.5), np.int64(3))
+    assert contained == AlarmRule(2, 5, 1.5, 3) and type(contained.window) is int
+    statistic = StatisticRule("cusum", np.float32(0.5), np.float64(2.0), np.int64(3), np.float32(0.25))
+    assert statistic == StatisticRule("cusum", 0.5, 2.0, 3, 0.25)
+    assert {type(value) for value in statistic.to_dict().values()} == {str, int, float}

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import reprlib
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -61,9 +61,7 @@ class AlarmRule:
     horizon: int = 1
 
     def __post_init__(self) -> None:
-        for name in ("violations", "window", "horizon"):
-            if isinstance(value := getattr(self, name), np.integer):
-                object.__setattr__(self, name, int(value))
+        _as_in_python(self)
         m, n = self.violations, self.window
         if not (is_whole(m) and is_whole(n) and 1 <= m <= n <= LONGEST_WINDOW):
             raise ModelError(
@@ -128,6 +126,7 @@ class StatisticRule:
     allowance: float = 0.0
 
     def __post_init__(self) -> None:
+        _as_in_python(self)
         if self.kind not in KINDS:
             raise _wrong("kind", self.kind, _ONE_OF)
         sums = self.kind == "cusum"
@@ -199,6 +198,13 @@ def labels(rules: Sequence[Rule]) -> tuple[str, ...]:
 def containment(rules: Iterable[Rule]) -> AlarmRule | None:
     """The rule that judges one-step bounds."""
     return next((rule for rule in rules if isinstance(rule, AlarmRule) and rule.horizon == 1), None)
+
+
+def _as_in_python(rule: Rule) -> None:
+    """Put numbers of Python, which a model file holds, in place of those of numpy."""
+    for one in fields(rule):
+        if isinstance(value := getattr(rule, one.name), np.generic):
+            object.__setattr__(rule, one.name, value.item())
 
 
 def with_containment(rules: Sequence[Rule], rule: AlarmRule) -> tuple[Rule, ...]:

@@ -116,25 +116,25 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
     """Leave out controls that show nowhere given the others, and those that move with another one; `shows` (m,)."""
     if len(steps.X) < FEWEST or len(used) < 2:
         return
-    moving = np.ptp(steps.U, axis=0) > 0
     with np.errstate(invalid="ignore", divide="ignore"):
         alike = np.abs(np.corrcoef(steps.U.T)) > 0.99
     held = np.mean(np.diff(steps.U, axis=0) != 0, axis=0) < _SET_NOW_AND_THEN
+    faint = np.where(held & (shows.max() > STEERS * SHOWS), SHOWS, FAINT)
     for j, candidate in enumerate(used):
         twin = next((i for i in range(j) if alike[i, j] and not used[i].reason), None)
-        if not moving[j]:
+        if not np.ptp(steps.U[:, j]) > 0:
             candidate.reason = "does not move while the states are there"
         elif twin is not None:
             candidate.reason, candidate.ready = f"moves with {used[twin].topic} {used[twin].path}", "control"
-        elif shows[j] < (SHOWS if held[j] and shows.max() > STEERS * SHOWS else FAINT) and shows.max() > SHOWS:
+        elif shows[j] < faint[j] and shows.max() > SHOWS:
             candidate.reason, candidate.ready = "shows in the next step of none of the states", "control"
 
 
-_WITHIN = "answers within a step; add it if it has a memory of its own"
+_ACCELERATION = "an acceleration answers within a step; add it if it has a memory of its own"
 _EFFORT = "an effort answers within a step; taken in, it shows friction and load, which a position loop hides"
 _BESIDE = (
     (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist beside it"),
-    (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", f"an acceleration {_WITHIN}"),
+    (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", _ACCELERATION),
     (r"^velocity\[.*wheel", r"^position\[(?!.*steer).*wheel", "grows with the way; its rate of change is beside it"),
     (r"^(position|velocity)\[", r"^effort\[", _EFFORT),
 )
@@ -147,7 +147,7 @@ def prefer_rates(source: Source) -> None:
     for there, left, reason in _BESIDE:
         if any(re.search(there, path) for path in moves):
             for candidate in (c for c in source.free if re.search(left, c.path)):
-                candidate.reason, candidate.ready = reason, "state" * (reason is _EFFORT)
+                candidate.reason, candidate.ready = reason, "state" * (reason == _EFFORT)
 
 
 _ROWS = 1 << 14

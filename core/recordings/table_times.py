@@ -534,8 +534,7 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
     text = f"{day}T{(clock or '00:00').replace(',', '.')}"
     if not YEARS[0] <= int(day[:4]) <= YEARS[1]:
         raise BagError(f"{where}: '{text[:40]}' is before {YEARS[0]} or after {YEARS[1]}; mend it")
-    midnight = "T24" in text and re.search(r"T24:00(:00([.]0*)?)?$", text)  # how a day ends in ISO 8601
-    late = 86_400 * 10**9 * bool(midnight)
+    late = 86_400 * 10**9 * bool(re.search(r"T24:00(:00([.]0*)?)?$", text))  # how a day ends in ISO 8601
     text = text.replace("T24:", "T00:") if late else text
     if not zone or zone in ("Z", "UTC"):
         return text, -late

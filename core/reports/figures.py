@@ -451,7 +451,6 @@ def _heat_maps(grids: Sequence[_Grid], note: str) -> Any:
 
 
 def _scale(values: Array, kind: str) -> dict[str, Any]:
-    """Colours and their norm."""
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm, Normalize, SymLogNorm
 

@@ -148,11 +148,16 @@ def findings_text(facts: Mapping[str, Any]) -> str:
     lines.append("what happened?")
     happened = facts["happened"]
     if (more := len(happened) - _MOST_TOLD) > 0:
-        happened = sorted(happened, key=lambda h: OUTCOMES.index(h["state"]))[:_MOST_TOLD]
+        happened = by_outcome(happened)[:_MOST_TOLD]
     lines += [f"  {h['recording']}: {h['text']}" for h in happened]
     lines += [f"  and {more} more; the page and --json have all"] * (more > 0)
     lines.append(f"which faults would it see? {facts['sees']['answer']}")
     return "\n".join(lines + [f"  {text}" for text in facts["sees"]["texts"]])
+
+
+def by_outcome(happened: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """What happened in recordings, those in alarm first."""
+    return sorted(happened, key=lambda one: OUTCOMES.index(one["state"]))
 
 
 def overview(recordings: Sequence[Mapping[str, Any]]) -> Table:

@@ -316,7 +316,6 @@ def _unit(data: Mapping[str, Any]) -> str:
 
 
 def _how_many(data: Mapping[str, Any]) -> str:
-    """How many there are of it."""
     parts, groups = plural(data["parts"], _part(data)), data["groups"]
     return f"{parts} in {plural(groups['count'], 'group')}, by {groups['key']}" if groups else parts
 

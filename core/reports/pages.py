@@ -40,8 +40,8 @@ from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
 from uncertain_lti.reports import charts
 from uncertain_lti.reports.charts import Columns, Panel, Spans
-from uncertain_lti.reports.check import APART, OUTCOMES, check_blocks
-from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES, overview
+from uncertain_lti.reports.check import APART, check_blocks
+from uncertain_lti.reports.findings import CARE, NO, UNKNOWN, YES, by_outcome, overview
 from uncertain_lti.reports.model_text import model_blocks, validation_blocks
 from uncertain_lti.sampling.transient import Transient
 
@@ -152,8 +152,7 @@ def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     answer = rely["answer"]
     yield _card("May I rely on it?", _TONE[answer], answer, items, 6, "trust")
     what, look = _headline(facts)
-    order = sorted(facts["happened"], key=lambda h: OUTCOMES.index(h["state"]))
-    items = [{"lead": charts.base_name(h["recording"]), "text": f"{h['text']}."} for h in order]
+    items = [{"lead": charts.base_name(h["recording"]), "text": f"{h['text']}."} for h in by_outcome(facts["happened"])]
     card = _card("What happened?", look, what, items, 5, "recordings")
     if answer == NO and look == "bad":
         card["list"].append({"text": "The model is not to be relied on: the machine may be well, and the model wrong."})
