@@ -156,31 +156,29 @@ def fit(
     if criterion is not None:
         check_criterion(criterion)
     _check_alarm(alarm, false_alarms)
-    first, signals = transients[0], transients[0].signals
-    names = [*first.state_names, *first.control_names, *first.scheduling_names]
+    signals = transients[0].signals
     if additive is None and signals is not None:
         additive = signals.additive
     options: dict[str, Any] = {"criterion": criterion or "lp", "additive": additive or "noise", "count": count}
     messages: list[str] = []
-    for_controls_as_they_are = (weights, transient_weights, operating_point, structure)
     learns = alarm == "panel" and method == "working-set"
     if learns:
         refuse_copies(transients)
+    for_controls_as_they_are = (weights, transient_weights, operating_point, structure)
     if learns and all(given is None for given in for_controls_as_they_are):
         at, why = choose_ends(transients, groups=groups, **options)
         if why:
             transients = [t.controls_at(at) for t in transients]
             messages.append(why)
-            first, signals = transients[0], transients[0].signals
+            signals = transients[0].signals
     options |= {"weights": weights, "operating_point": operating_point, "structure": structure}
     options |= {"discard": discard, "method": method}
     asked = schedule
     if asked is None:
         asked = {} if signals is None else asked_by(signals)
-    chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
-    check_names(chosen, names)
+    given = asked if isinstance(asked, Mapping) else {}
+    automatic = [name for name, knots in given.items() if isinstance(knots, str) and knots == "auto"]
     rule = _horizons_asked_for(signals, horizons, widths)
-    automatic = [name for name, knots in chosen.items() if isinstance(knots, str) and knots == "auto"]
     leaves_out = alarm == "panel" or automatic or (rule is not None and rule.leaves_out)
     if groups is not None and not leaves_out:
         raise FitError("groups are given, and the fit leaves nothing out; leave them out, or take the panel as alarm")
@@ -191,34 +189,19 @@ def fit(
         )
     if automatic and structure is None:
         _no_knots_named(signals, automatic[0])
-    added: dict[str, Any] = {}
-    for number, name in enumerate(automatic):
-        others = {other: knots for other, knots in chosen.items() if other not in automatic[number:]}
-        best, table = choose_knots(transients, name, others, groups=groups, progress=progress, **options)
-        assert best.model is not None, "without a fit to everything with one knot it raises"
-        added.setdefault("schedule", []).append(table)
-        messages.append(f"schedule: {plural(best.count, 'knot')} on {name}: {table['reason']}")
-        chosen = {**chosen, name: knots_of(best.model, name) or 1}
-        asked = best.model.schedule or {}  # to the bit as it was judged
-    on = signals_of(asked, names)
-    messages += unused(first.scheduling_names, [*on, *automatic])
+    choosing = {"groups": groups, "progress": progress}
+    asked, added, said = _with_knots(transients, asked, automatic, options | choosing)
+    messages += said
     lengths: dict[int, Widths] = {}
     if rule is not None:
-        steps = lengths_of(rule, transients)
-        if not rule.leaves_out:
-            lengths = dict.fromkeys(steps, "growing" if rule.widths == "growing" else "constant")
-        elif transient_weights is not None:
+        if rule.leaves_out and transient_weights is not None:
             raise FitError(
                 "horizons are chosen by leaving recordings out, and transient_weights are for all of them; give steps "
                 "or seconds with widths, or count='transient'"
             )
-        else:
-            point = operating_point and operating_point.scheduled_on([n in on for n in first.scheduling_names])
-            own = {**options, "operating_point": point, "schedule": asked, "groups": groups, "progress": progress}
-            lengths, choice = choose_horizons([t.scheduled_on(on) for t in transients], rule, steps, **own)
-            added["horizon_choice"] = choice
-            listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
-            messages.append(f"{listed}: {choice['reason']}")
+        lengths, facts, said = _over(transients, rule, options | choosing | {"schedule": asked})
+        added |= facts
+        messages += said
     options |= {"schedule": asked, "horizons": list(lengths), "widths": lengths, "transient_weights": transient_weights}
     options["drop_horizons"] = not (rule and (rule.steps or rule.seconds))
     options |= {"describe_data": describe_data, "seek_carriers": seek_carriers, "progress": progress}
@@ -238,6 +221,47 @@ def fit(
         if not isinstance(alarm, str):
             model = model.replace(alarm=alarm)
     return _saying(model, messages, added)
+
+
+def _with_knots(
+    transients: Sequence[Transient],
+    asked: Schedule | Mapping[str, Knots],
+    automatic: Sequence[str],
+    options: Mapping[str, Any],
+) -> tuple[Schedule | Mapping[str, Knots], dict[str, Any], list[str]]:
+    """A schedule with the knots of the automatic signals chosen, one after the other; the tables, and sentences."""
+    first = transients[0]
+    names = [*first.state_names, *first.control_names, *first.scheduling_names]
+    chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
+    check_names(chosen, names)
+    tables: list[Any] = []
+    messages: list[str] = []
+    for number, name in enumerate(automatic):
+        others = {other: knots for other, knots in chosen.items() if other not in automatic[number:]}
+        best, table = choose_knots(transients, name, others, **options)
+        assert best.model is not None, "without a fit to everything with one knot it raises"
+        tables.append(table)
+        messages.append(f"schedule: {plural(best.count, 'knot')} on {name}: {table['reason']}")
+        chosen = {**chosen, name: knots_of(best.model, name) or 1}
+        asked = best.model.schedule or {}  # to the bit as it was judged
+    messages += unused(first.scheduling_names, [*signals_of(asked, names), *automatic])
+    return asked, {"schedule": tables} if tables else {}, messages
+
+
+def _over(
+    transients: Sequence[Transient], rule: HorizonRule, options: Mapping[str, Any]
+) -> tuple[dict[int, Widths], dict[str, Any], list[str]]:
+    """Half-widths of each number of steps that a rule asks for, or that is chosen; then with the table, and why."""
+    steps = lengths_of(rule, transients)
+    if not rule.leaves_out:
+        return dict.fromkeys(steps, "growing" if rule.widths == "growing" else "constant"), {}, []
+    first, point = transients[0], options["operating_point"]
+    on = signals_of(options["schedule"], [*first.state_names, *first.control_names, *first.scheduling_names])
+    point = point and point.scheduled_on([name in on for name in first.scheduling_names])
+    own = {**options, "operating_point": point}
+    lengths, choice = choose_horizons([t.scheduled_on(on) for t in transients], rule, steps, **own)
+    listed = f"horizons of {', '.join(map(str, sorted(lengths)))} steps" if lengths else "no horizons"
+    return lengths, {"horizon_choice": choice}, [f"{listed}: {choice['reason']}"]
 
 
 def _saying(model: UncertainLTI, messages: Sequence[str], added: Mapping[str, Any]) -> UncertainLTI:

@@ -77,59 +77,27 @@ class Table(Recording):
         file, raw, (time, times, words), rows = run or _one_run(path, layout)
         self.path, self.parts, self.layout = path, (file,), layout
         self.size = file.stat().st_size
-        self._warnings = [f"{file}: {note}" for note in [*raw.notes, *([words] if words else [])]]
+        of_file = [*raw.notes, *([words] if words else [])]
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
         signals = {name: column for name, column in raw.columns.items() if name not in apart}
         naming, value, of_each = _naming(signals, times)
         called = _NAMES.fullmatch(naming) and rows is None
         wide = _side_by_side(of_each, signals[value], times) if called else None
         if wide is not None:
-            self._warnings.append(f"{file}: column '{naming}' names the signal of each number in '{value}'")
+            of_file.append(f"column '{naming}' names the signal of each number in '{value}'")
             if left := len(times) - sum(int(np.isfinite(column).sum()) for column in wide[0].values()):
                 why = "without a name, a time or a number, or of a name and time that another row has"
-                self._warnings.append(f"{file}: {plural(left, 'row')} left out {why}")
+                of_file.append(f"{plural(left, 'row')} left out {why}")
             names, times = unique([time, *wide[0]]), wide[1]
             raw = RawTable(dict(zip(names, [times, *wide[0].values()], strict=True)))
-        kept = np.arange(len(times)) if rows is None else rows
-        known = times[kept] != NO_TIME
-        if missing_time := int(np.count_nonzero(~known)):
-            self._warnings.append(f"{path}: {plural(missing_time, 'row')} without a time left out")
-            kept = kept[known]
-        steps = np.diff(times[kept])
-        if (steps < 0).any() and (steps <= 0).all():
-            kept = kept[::-1]
-            self._warnings.append(f"{path}: the newest row comes first; read from its last row to its first")
-        elif (older := np.count_nonzero(steps < 0)) > 0.1 * len(kept):
-            remedy = f"sort the rows by '{time}', or name a column of runs in a signals file, `table: {{runs: COLUMN}}`"
-            self._warnings.append(f"{path}: {older} of {len(kept)} rows are older than the row before: {remedy}")
-        elif older and raw.columns[time].dtype.kind in "OM" and (abs(steps + _HOUR) <= 2 * np.median(steps)).any():
-            autumn = "its time goes back by an hour, as at the end of summer time, and a new segment begins there"
-            self._warnings.append(f"{path}: {autumn}; write times in UTC, or with their zone")
+        every = np.arange(len(times)) if rows is None else rows
+        written = time in raw.columns and raw.columns[time].dtype.kind in "OM"
+        kept, of_run = _rows_in_order(every, times, time, written)
         names = [name for name in raw.columns if name not in apart]
-        for name in (name for name in names if raw.columns[name].dtype.kind == "O" and not may_be(raw.columns[name])):
-            cells = [str(cell).strip() for cell in raw.columns[name] if cell]
-            cells = cells[:: len(cells) // 100 + 1]
-            units = {found and found["unit"] for found in map(QUANTITY.fullmatch, cells)}
-            packed = list(filter(_PACKED.fullmatch, cells))
-            odd = cells if len(units) == 1 < len(set(cells)) and None not in units else packed
-            if 2 * len(odd) > len(cells):
-                unread = f"column '{name}' left out, as most cells are no number alone, such as '{odd[0][:40]}'"
-                self._warnings.append(f"{file}: {unread}: write one in each, without unit or separator of thousands")
-        self.times = times[kept]
-        if (equal := np.count_nonzero(steps == 0)) > 0.1 * len(kept):
-            of_rows = {name: raw.columns[name][kept] for name in names}
-            number, unit = _for_each_time(self.times, of_rows)
-            flow = number > 1 and not unit and (np.diff(self.times) >= 0).all() and _flows(of_rows.values(), number)
-            each = f"are the {number} rows of a time one for each of {number} units? then "
-            each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
-            if flow:
-                usual = float(np.median(np.diff(np.unique(self.times)))) * 1e-9
-                self.times, taken = spread(self.times), f"they are taken to come evenly in the {usual:g} s after it: "
-            else:
-                taken = f"only the first of such rows counts: {f'{each}write a file for each; else ' * (number > 1)}"
-            same = f"{equal} of {len(kept)} rows have the time of a row before in column '{time}'"
-            remedy = "write times with more decimals, or take another, `--table time=COLUMN`"
-            self._warnings.append(f"{path}: {same}, and {taken}{remedy}")
+        self.times, notes = _times_of_rows(times[kept], time, {name: raw.columns[name][kept] for name in names})
+        self._warnings = [f"{file}: {note}" for note in of_file] + [f"{path}: {note}" for note in of_run]
+        self._warnings += [f"{file}: {note}" for note in _no_numbers({name: raw.columns[name] for name in names})]
+        self._warnings += [f"{path}: {note}" for note in notes]
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
         fields = zip(once(map(field_name, names), "_"), names, strict=True)
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
@@ -141,14 +109,18 @@ class Table(Recording):
             reason = f"column '{naming}' names the signal of a row's one number"
             reason += ", and they come at times of their own: export them at one interval" if called else ""
             reason += "; write a column for each signal" + ", or call it `signal`" * (not called)
-        every = _by_message(self.columns_by_field, len(kept))
+        self._tell_topics(reason, file.suffix[1:].lower())
+
+    def _tell_topics(self, reason: str, kind: str) -> None:
+        """Rows and columns of each topic, of a table of such a kind, and the reason why it cannot be read, if any."""
+        every = _by_message(self.columns_by_field, len(self.times))
         one = len(every) == 1 and not reason
         texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
-        turns = ((name, _take_turns(column.tolist())) for name, column in texts if len(texts) < len(names))
+        some = len(texts) < len(self.columns_by_field)
+        turns = ((name, _take_turns(column.tolist())) for name, column in texts if some)
         if of := next((f"{number} '{name}'" for name, number in turns if number), ""):
             say = "say so in the signals file, `table: {runs: COLUMN}`, or write a file for each"
-            self._warnings.append(f"{path}: the rows are of {of} by turns: if they are units, {say}")
-        kind = file.suffix[1:].lower()
+            self._warnings.append(f"{self.path}: the rows are of {of} by turns: if they are units, {say}")
         others = [name for name, column in self.columns_by_field.items() if column.dtype.kind in "OM"]
         words = reason or f"text or instants, which are no signals: {', '.join(others)}" * bool(others)
         self._fields = {topic: fields for topic, (fields, _) in every.items()}
@@ -278,6 +250,63 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
             remedy = "if each of them is of another signal of one machine, write them as columns of one file"
             other._warnings.append(f"{other.path}: is of the time of {alone[0].path}; {remedy}")
     return tables
+
+
+def _rows_in_order(
+    rows: NDArray[np.intp], times: NDArray[np.int64], time: str, written: bool
+) -> tuple[NDArray[np.intp], list[str]]:
+    """Rows that have a time, the oldest first, and what there is to say of their order; `written`: as dates or text."""
+    notes = []
+    known = times[rows] != NO_TIME
+    if missing_time := int(np.count_nonzero(~known)):
+        notes.append(f"{plural(missing_time, 'row')} without a time left out")
+        rows = rows[known]
+    steps = np.diff(times[rows])
+    if (steps < 0).any() and (steps <= 0).all():
+        rows = rows[::-1]
+        notes.append("the newest row comes first; read from its last row to its first")
+    elif (older := np.count_nonzero(steps < 0)) > 0.1 * len(rows):
+        remedy = f"sort the rows by '{time}', or name a column of runs in a signals file, `table: {{runs: COLUMN}}`"
+        notes.append(f"{older} of {len(rows)} rows are older than the row before: {remedy}")
+    elif older and written and (abs(steps + _HOUR) <= 2 * np.median(steps)).any():
+        autumn = "its time goes back by an hour, as at the end of summer time, and a new segment begins there"
+        notes.append(f"{autumn}; write times in UTC, or with their zone")
+    return rows, notes
+
+
+def _no_numbers(columns: Mapping[str, Column]) -> list[str]:
+    """A sentence for each column of text whose cells are numbers with a unit, or several in one."""
+    notes = []
+    for name, column in ((n, c) for n, c in columns.items() if c.dtype.kind == "O" and not may_be(c)):
+        cells = [str(cell).strip() for cell in column if cell]
+        cells = cells[:: len(cells) // 100 + 1]
+        units = {found and found["unit"] for found in map(QUANTITY.fullmatch, cells)}
+        packed = list(filter(_PACKED.fullmatch, cells))
+        odd = cells if len(units) == 1 < len(set(cells)) and None not in units else packed
+        if 2 * len(odd) > len(cells):
+            unread = f"column '{name}' left out, as most cells are no number alone, such as '{odd[0][:40]}'"
+            notes.append(f"{unread}: write one in each, without unit or separator of thousands")
+    return notes
+
+
+def _times_of_rows(
+    times: NDArray[np.int64], time: str, columns: Mapping[str, Column]
+) -> tuple[NDArray[np.int64], list[str]]:
+    """Times in which rows of the same time come evenly, if they flow, and what there is to say of such rows."""
+    equal = np.count_nonzero(np.diff(times) == 0)
+    if not equal > 0.1 * len(times):
+        return times, []
+    number, unit = _for_each_time(times, columns)
+    if number > 1 and not unit and (np.diff(times) >= 0).all() and _flows(columns.values(), number):
+        usual = float(np.median(np.diff(np.unique(times)))) * 1e-9
+        even, taken = spread(times), f"they are taken to come evenly in the {usual:g} s after it: "
+    else:
+        each = f"are the {number} rows of a time one for each of {number} units? then "
+        each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
+        each += "write a file for each; else "
+        even, taken = times, f"only the first of such rows counts: {each * (number > 1)}"
+    same = f"{equal} of {len(times)} rows have the time of a row before in column '{time}'"
+    return even, [f"{same}, and {taken}write times with more decimals, or take another, `--table time=COLUMN`"]
 
 
 def _numbers(columns: Mapping[str, Column]) -> list[Column]:
