@@ -83,42 +83,21 @@ def fit(
     to nearly the same transitions, from which one of many unknowns a row starts.
     """
     transients = listed_transients(transients)
-    check_criterion(criterion)
-    if method not in ("working-set", "cvxpy"):
-        raise FitError(f"method is {method!r}; it must be working-set or cvxpy")
-    if horizons and method != "working-set":
-        raise FitError("method cvxpy states one step; leave horizons out, or use the working-set method")
-    if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
-        raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
-    for given, kind in ((operating_point, OperatingPoint), (structure, Structure)):
-        if given is not None:
-            refuse_other(given, kind, kind.__name__, f"give one, as {kind.__name__}(...) makes it", FitError)
+    _refuse_wrong(criterion, method, horizons, operating_point, structure)
     signals = common_signals(transients)
     schedule = asked_by(signals) if schedule is None else schedule
     on = signals_of(schedule, [s.name for s in signals.signals])
     if operating_point is not None:
         operating_point = operating_point.scheduled_on([s.name in on for s in signals.scheduling])
     transients, signals = [t.scheduled_on(on) for t in transients], signals.scheduled_on(on)
-    n, m = len(signals.states), len(signals.controls)
-    if operating_point is None:
-        operating_point = OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
-    elif (len(operating_point.x_s), len(operating_point.u_s)) != (n, m):
-        raise FitError(
-            f"the operating point has {plural(len(operating_point.x_s), 'state')} and "
-            f"{plural(len(operating_point.u_s), 'control')}, "
-            f"the transients {n} and {m}"
-        )
-    elif len(operating_point.s_s) != (q := len(signals.scheduling)):
-        raise FitError(
-            f"the operating point has {plural(len(operating_point.s_s), 'further scheduling signal')}, the transients "
-            f"{q}; give s_s and S"
-        )
+    operating_point = _point_of(signals, operating_point)
     signals = _at(signals, operating_point)
     if additive is None:
         additive = signals.additive or "none"
     scheduled = scheduled_by(schedule, signals, lambda: assemble(transients, operating_point, None, additive))
     structure = structure or structure_of(signals, scheduled)
     if structure is not None:
+        n, m = len(signals.states), len(signals.controls)
         if (structure.n, structure.m) != (n, m):
             raise FitError(
                 f"structure is for {plural(structure.n, 'state')} and {plural(structure.m, 'control')}, not {n} and {m}"
@@ -142,7 +121,7 @@ def fit(
     whole = Fleet([problem])
     whole.check_solvable(where, [s.name for s in signals.states])
 
-    discarded: list[dict[str, Any]] = []
+    discarded: list[tuple[int, float]] = []
     if budget := _budget(discard, problem.N):
         if (left := problem.N - budget) < (unknowns := problem.columns.unknowns(problem.p)):
             raise FitError(
@@ -150,12 +129,8 @@ def fit(
                 f"discard {problem.N - unknowns} at most, or record more"
             )
         before = fit_fleet(whole, signals, criterion, structure=structure, describe_data=False, where=where)
-        chosen = choose_discards(problem, criterion, structure, budget, progress)
-        for index, effect in chosen:
-            of, k = transients[problem.source[index]], int(problem.k[index])
-            when = {"t": float(of.t[k]), "t_ns": int(of.t_ns[k])}
-            discarded.append({"file": of.name, "k": k, **when, "effect": effect})
-        problem = problem.without(np.array([index for index, _ in chosen], dtype=np.intp))
+        discarded = choose_discards(problem, criterion, structure, budget, progress)
+        every, problem = problem, problem.without(np.array([index for index, _ in discarded], dtype=np.intp))
     fleet = Fleet.of(problem) if method == "working-set" else Fleet([problem])
     plain = scheduled is None and problem.weights.ndim == 1 and not budget and method == "working-set"
     keeps = plain and describe_data and not horizons
@@ -192,7 +167,7 @@ def fit(
         facts["structure"] = structure.to_dict()
     if budget:
         facts["discard"] = discard
-        facts["discarded"] = discarded
+        facts["discarded"] = [_discarded(every, transients, *one) for one in discarded]
         keys = ("objective", "mean_width", "max_width", "mean_width_recorded")
         facts["with_discarded"] = {key: before.fit_summary[key] for key in keys}
     if not horizons:
@@ -206,6 +181,44 @@ def fit(
         facts["messages"] = [*facts.get("messages", []), *dropped]
     facts["versions"] = versions({*facts["solver"]["names"], *solvers})
     return model.replace(fit_summary=facts, horizons=over, run=model.run if over else None)
+
+
+def _refuse_wrong(criterion: str, method: str, horizons: Sequence[Any], operating_point: Any, structure: Any) -> None:
+    """Refuse what is asked for of a fit where no recording is needed to see that it is wrong."""
+    check_criterion(criterion)
+    if method not in ("working-set", "cvxpy"):
+        raise FitError(f"method is {method!r}; it must be working-set or cvxpy")
+    if horizons and method != "working-set":
+        raise FitError("method cvxpy states one step; leave horizons out, or use the working-set method")
+    if any(isinstance(h, bool) or not isinstance(h, (int, np.integer)) or not 2 <= h <= MOST_STEPS for h in horizons):
+        raise FitError(f"horizons are {list(horizons)}; give whole numbers of steps, 2 to {MOST_STEPS}")
+    for given, kind in ((operating_point, OperatingPoint), (structure, Structure)):
+        if given is not None:
+            refuse_other(given, kind, kind.__name__, f"give one, as {kind.__name__}(...) makes it", FitError)
+
+
+def _point_of(signals: SignalMap, given: OperatingPoint | None) -> OperatingPoint:
+    """The operating point that is given, if it has the sizes of the signals; default that of the signals."""
+    if given is None:
+        return OperatingPoint.of(signals.states, signals.controls, signals.scheduling)
+    n, m, q = len(signals.states), len(signals.controls), len(signals.scheduling)
+    if (len(given.x_s), len(given.u_s)) != (n, m):
+        raise FitError(
+            f"the operating point has {plural(len(given.x_s), 'state')} and {plural(len(given.u_s), 'control')}, "
+            f"the transients {n} and {m}"
+        )
+    if len(given.s_s) != q:
+        raise FitError(
+            f"the operating point has {plural(len(given.s_s), 'further scheduling signal')}, the transients {q}; "
+            f"give s_s and S"
+        )
+    return given
+
+
+def _discarded(problem: Problem, transients: Sequence[Transient], index: int, effect: float) -> dict[str, Any]:
+    """A transition that was left out, for the model file."""
+    of, k = transients[problem.source[index]], int(problem.k[index])
+    return {"file": of.name, "k": k, "t": float(of.t[k]), "t_ns": int(of.t_ns[k]), "effect": effect}
 
 
 def _memory(

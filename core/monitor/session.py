@@ -81,41 +81,9 @@ class Session(Stream):
     def _report_monitor(self, period: Period, now: float, timeout: float, problems: Sequence[str]) -> Report:
         without, never = self.without_verdict(now), self._unheard()
         complaints, calm = list(problems), list[str]()
-        lacking = self.lacking(period.counters)
-        came_late = self.came_late(period.counters)
-        if period.last_unknown is not None:
-            why = self.model.why_unknown(period.last_unknown.before)
-            complaints.append(f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}")
-        if outside := period.outside - period.unknown:
-            where = period.last_outside and self.model.why_outside(period.last_outside.before)
-            text = f"outside the fitted domain in {outside} of {period.verdicts} verdicts"
-            (complaints if outside > self._vouched * period.verdicts else calm).append(
-                f"{text}: {where}" if where else text
-            )
-        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
-            if count := period.statuses[status]:
-                why = why_not(status, self.model)
-                if status is Status.MODE and period.last_unlisted is not None:
-                    why = self.model.why_unlisted(period.last_unlisted.before)
-                if status is Status.MISSING:
-                    names = shortlist([signal.name for signal in lacking], SHOWN)
-                    why = f"{why} ({names})" if names else TOO_LARGE
-                complaints.append(f"{count} samples without a verdict: {why}")
-        complaints += self.absent(lacking)
-        complaints += self.ceased(now, timeout).values()
-        if dropped := Counter({status.value: n for status, n in period.statuses.items() if status.dropped}):
-            which = ", ".join(f"{kind} {n}" for kind, n in dropped.items())
-            coarse = self.coarse_clock(period.statuses[Status.EQUAL])
-            complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
-        if came_late:
-            complaints.append(f"{came_late} messages came too late")
-        if period.unreadable:
-            complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
-        if period.future:
-            complaints.append(f"{period.future} stamps lie over {FUTURE:g} s in the future")
-        if off := self.arming.why_off():
-            (complaints if self.arming.on is None else calm).append(off)
-        complaints += [jump for jump in period.jumps[:SHOWN] if jump not in self.reasons.by]
+        for some, quiet in (self._judged_in(period), self._taken_in(period, now, timeout)):
+            complaints += some
+            calm += quiet
         if self.monitor.masked:
             calm.append(f"masked: {', '.join(self.monitor.masked)}")
         if self.latched and not self.monitor.alarm:
@@ -146,6 +114,52 @@ class Session(Stream):
         well = f"{period.verdicts} verdicts" if period.verdicts else f"last verdict {without:.1f} s ago"
         message = "; ".join([*(complaints or [f"{well}, all well"]), *calm])
         return Report(level, "monitor", message, self.counts(now))
+
+    def _judged_in(self, period: Period) -> tuple[list[str], list[str]]:
+        """What there is to say of the verdicts of a period that is a warning, and what is none."""
+        unknown = []
+        if period.last_unknown is not None:
+            why = self.model.why_unknown(period.last_unknown.before)
+            unknown = [f"regime not fitted in {period.unknown} of {period.verdicts} verdicts: {why}"]
+        outside = period.outside - period.unknown
+        if not outside:
+            return unknown, []
+        text = f"outside the fitted domain in {outside} of {period.verdicts} verdicts"
+        if where := period.last_outside and self.model.why_outside(period.last_outside.before):
+            text += f": {where}"
+        many = outside > self._vouched * period.verdicts
+        return (unknown + [text], []) if many else (unknown, [text])
+
+    def _taken_in(self, period: Period, now: float, timeout: float) -> tuple[list[str], list[str]]:
+        """What there is to say of the messages of a period that is a warning, and what is none."""
+        complaints, calm = list[str](), list[str]()
+        lacking = self.lacking(period.counters)
+        came_late = self.came_late(period.counters)
+        for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
+            if count := period.statuses[status]:
+                why = why_not(status, self.model)
+                if status is Status.MODE and period.last_unlisted is not None:
+                    why = self.model.why_unlisted(period.last_unlisted.before)
+                if status is Status.MISSING:
+                    names = shortlist([signal.name for signal in lacking], SHOWN)
+                    why = f"{why} ({names})" if names else TOO_LARGE
+                complaints.append(f"{count} samples without a verdict: {why}")
+        complaints += self.absent(lacking)
+        complaints += self.ceased(now, timeout).values()
+        if dropped := Counter({status.value: n for status, n in period.statuses.items() if status.dropped}):
+            which = ", ".join(f"{kind} {n}" for kind, n in dropped.items())
+            coarse = self.coarse_clock(period.statuses[Status.EQUAL])
+            complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
+        if came_late:
+            complaints.append(f"{came_late} messages came too late")
+        if period.unreadable:
+            complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
+        if period.future:
+            complaints.append(f"{period.future} stamps lie over {FUTURE:g} s in the future")
+        if off := self.arming.why_off():
+            (complaints if self.arming.on is None else calm).append(off)
+        complaints += [jump for jump in period.jumps[:SHOWN] if jump not in self.reasons.by]
+        return complaints, calm
 
     def reason(self, now: float, timeout: float) -> str:
         """What holds the alarm, or why there is no verdict, as published on ~/reason."""

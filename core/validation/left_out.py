@@ -139,17 +139,11 @@ def leave_out(
         name = f"group {names[out[0]]}" if grouping else name
         if progress is not None:
             progress(CountedStep(f"fit {number + 1} of {len(together)}: without {name}", number + 1, len(together)))
-        absent = {id(cuts[i][0]): cuts[i][1:] for i in out}
-        pieces, kept = [], []
-        for i, transient in enumerate(transients):
-            gone = absent.get(id(transient))
-            for a, b in [(0, len(transient))] if gone is None else remaining_spans(transient, *gone, gap):
-                if b - a >= 2:
-                    pieces.append(cut(transient, a, b))
-                    if isinstance(own, list):
-                        kept.append(own[i][a : b - 1])
+        kept = _kept(transients, [cuts[i] for i in out], gap)
+        pieces = [cut(transients[i], a, b) for i, a, b in kept]
+        factors = [own[i][a : b - 1] for i, a, b in kept] if isinstance(own, list) else weights
         try:
-            model = fit(pieces, weights=kept or weights, describe_data=False, near=full, **options)
+            model = fit(pieces, weights=factors, describe_data=False, near=full, **options)
         except FitError as error:
             raise FitError(f"without {name} no model can be fitted: {error}") from None
         model, level = model.with_residuals_of(full), Reach(model, pieces).level
@@ -158,6 +152,19 @@ def leave_out(
     kind = "blocks" if blocks else "transients"
     hint = "" if grouping or blocks else likely_groups(transients)
     return Validation(full, tuple(parts[i] for i in sorted(parts)), kind, float(gap), confidence, grouping, hint)
+
+
+def _kept(
+    transients: Sequence[Transient], out: Sequence[tuple[Transient, int, int]], gap: float
+) -> list[tuple[int, int, int]]:
+    """What is fitted to where some are left out: number of the transient, first sample, and the one behind the last."""
+    absent = {id(transient): (a, b) for transient, a, b in out}
+    kept = []
+    for i, transient in enumerate(transients):
+        gone = absent.get(id(transient))
+        spans = [(0, len(transient))] if gone is None else remaining_spans(transient, *gone, gap)
+        kept += [(i, a, b) for a, b in spans if b - a >= 2]
+    return kept
 
 
 def validate(
