@@ -1637,3 +1637,34 @@ def test_an_index_or_a_label_of_each_row_does_not_make_messages_by_turns_one(tmp
     assert list(open_recording(one).topics) == ["/table"]
     named = _by_turns(400, lambda k: f",{('ATT', 'CMD')[k % 2]}")
     assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.r,ATT.p,type", *named)).warnings  # no units
+
+
+@pytest.mark.parametrize(("good", "bad"), [(192, 24), (216, 64), ("Good", "Bad"), ("good, annotated", "Uncertain (LUV)")])
+def test_numbers_that_a_historian_does_not_call_good_are_left_out(tmp_path, good, bad):
+    """A sensor that was off had 0 in such rows, which the bounds then had to contain."""
+    said = [bad if k in (7, 8, 30) else good for k in range(80)]
+    told = {7, 8, 30}
+    rows = [f'{k},{0 if k in told else k % 7 + 1},{k % 5},"{q}"' for k, q in enumerate(said)]
+    for names in ("time,Level,Flow,Level_Q", "time,Level.Value,Flow,Level.Quality", "time,level,Flow,LEVEL quality"):
+        bag = read_csv(tmp_path, names, rows)
+        level, flow = list(bag.columns_by_field.values())[:2]
+        assert set(np.flatnonzero(np.isnan(level))) == told and np.nanmin(level) == 1 and np.isfinite(flow).all()
+        name, quality = names.split(",")[1::2]
+        assert f"3 numbers of '{name}' left out, not good by '{quality}'" in bag.warnings[0]
+    long = [f'{k},{tag},{0 if k in told and tag == "p" else k % 7 + 1},"{q if tag == "p" else good}"'
+            for k, q in enumerate(said) for tag in ("p", "q")]  # fmt: skip
+    bag = read_csv(tmp_path, "time,tag,value,quality", long)
+    assert {name: np.flatnonzero(np.isnan(c)).tolist() for name, c in bag.columns_by_field.items()} == {
+        "p": sorted(told),
+        "q": [],
+    }
+    assert not any("without a name" in text for text in bag.warnings)
+
+
+@pytest.mark.parametrize("said", ["Good,Bad", "3,7", "192,191", "0,64", "good,good"])
+def test_what_is_no_quality_of_a_number_leaves_it_alone(tmp_path, said):
+    """Labels of products, numbers that are no codes of OPC, or none that is good."""
+    good, bad = said.split(",")
+    quality = "quality" if good == "Good" else "Level_Q"
+    rows = [f"{k},{k % 7},{bad if k == 9 else good}" for k in range(80)]
+    assert np.isfinite(read_csv(tmp_path, f"time,Level,{quality}", rows).columns_by_field["Level"]).all()

@@ -66,6 +66,7 @@ from uncertain_lti.proposal.tune import Remembered, choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
 from uncertain_lti.recordings.table import Table, names_signals
+from uncertain_lti.recordings.table_text import QUALITY, rated
 from uncertain_lti.recordings.table_times import called_time, may_be
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.sampling.transient import Transient
@@ -97,8 +98,6 @@ _COMPUTER = re.compile(
 _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
-_QUALITY = re.compile(r"(^|_)(q|qc|qual|quality)\d*$")  # column of what OPC thinks of the value beside it
-_QUALITIES = (0, 4, 8, 12, 16, 20, 24, 28, 64, 68, 80, 84, 88, 192, 216)  # bad, uncertain, good
 _APART = "not in every recording"
 MOST_WORDS = 8
 """Words of a column that is switched, at most."""
@@ -279,8 +278,7 @@ def _sift(source: Source) -> None:
             c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
     for candidate in source.free if source.type == TABLE else ():  # before its usual value is taken for none
-        quality = _QUALITY.search("_".join(words_of(candidate.path))) and np.isin(candidate.finite, _QUALITIES).all()
-        if quality and candidate.finite.max(initial=0.0) >= 192:
+        if QUALITY.fullmatch("_".join(words_of(candidate.path))) and rated(candidate.finite)[0].any():
             candidate.reason = "a quality code, by its name and values"
     each = {id(c): np.concatenate([np.empty(0), *c.values]) for c in source.free}
     measured = source.type == TABLE and source.role != "control"  # a command stands at its least, and no sensor failed

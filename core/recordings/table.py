@@ -18,6 +18,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from itertools import chain, pairwise, product
 from os.path import commonprefix
 from pathlib import Path
@@ -32,7 +33,16 @@ from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
 from uncertain_lti.recordings.table_files import read_table
-from uncertain_lti.recordings.table_text import ODD_SHARE, QUANTITY, Column, RawTable, field_name, find_column, unique
+from uncertain_lti.recordings.table_text import (
+    ODD_SHARE,
+    QUANTITY,
+    Column,
+    RawTable,
+    field_name,
+    find_column,
+    unique,
+    without_bad,
+)
 from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
@@ -82,10 +92,16 @@ class Table(Recording):
         signals = {name: column for name, column in raw.columns.items() if name not in apart}
         naming, value, of_each = _naming(signals, times)
         called = _NAMES.fullmatch(naming) and rows is None
+        good, doubts = without_bad(signals, value if called else "")
+        of_file += doubts
+        doubted = int(np.isnan(good[value]).sum() - np.isnan(signals[value]).sum()) if value in good else 0
+        signals |= good
+        raw = replace(raw, columns={**raw.columns, **good})
         wide = _side_by_side(of_each, signals[value], times) if called else None
         if wide is not None:
             of_file.append(f"column '{naming}' names the signal of each number in '{value}'")
-            if left := len(times) - sum(int(np.isfinite(column).sum()) for column in wide[0].values()):
+            known = sum(int(np.isfinite(column).sum()) for column in wide[0].values())
+            if left := len(times) - doubted - known:
                 why = "without a name, a time or a number, or of a name and time that another row has"
                 of_file.append(f"{plural(left, 'row')} left out {why}")
             names, times = unique([time, *wide[0]]), wide[1]

@@ -332,6 +332,42 @@ def field_name(column: str) -> str:
     return name if re.match(r"[A-Za-z_]", name) else f"c_{name}"
 
 
+QUALITY = re.compile(r"(?i)(?P<of>(.*[\W_])?)(q|qc|qual|quality)\d*")
+"""Name of a column that says what OPC thinks of the number beside it."""
+_QUALITIES = (0, 4, 8, 12, 16, 20, 24, 28, 64, 68, 80, 84, 88, 192, 216)  # bad, uncertain, from _GOOD on good
+_GOOD = 192
+
+
+def rated(column: Column) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Cells of a column of qualities, as OPC has them, that are good, and those that are not; none where it is none."""
+    if column.dtype.kind == "O":
+        words = np.array([str(cell).strip().casefold()[:4] for cell in column])
+        good, bad = words == "good", ~np.isin(words, ["good", ""])
+    else:
+        there = np.isfinite(column) & bool(np.isin(column[np.isfinite(column)], _QUALITIES).all())
+        good, bad = there & (column >= _GOOD), there & (column < _GOOD)
+    return good, bad & good.any()
+
+
+def without_bad(columns: Mapping[str, Column], value: str) -> tuple[dict[str, Column], list[str]]:
+    """Columns without the numbers that the quality beside them does not call good, and how many there are.
+
+    `value`: the column that any quality is of; default that of its name (`Level` or `Level_Value` of `Level_Q`).
+    """
+    found: dict[str, Column] = {}
+    notes = []
+    numbers = {name: c for name, c in columns.items() if c.dtype.kind in "iuf" and c.ndim == 1}
+    qualities = {name: named["of"] for name, c in columns.items() if c.ndim == 1 and (named := QUALITY.fullmatch(name))}
+    for quality, of in qualities.items():
+        kin = (value,) if value else [n for n in numbers if re.fullmatch(rf"(?i){re.escape(of[:-1])}([\W_]value)?", n)]
+        if columns[quality].dtype.kind in "Oiuf" and kin:
+            good, bad = rated(columns[quality])
+            if good.sum() > bad.sum() > 0:
+                found |= {name: np.where(bad, np.nan, found.get(name, numbers[name])) for name in kin}
+                notes.append(f"{plural(int(bad.sum()), 'number')} of '{kin[0]}' left out, not good by '{quality}'")
+    return found, notes
+
+
 def find_column(path: object, wanted: str, columns: Sequence[str], what: str) -> str:
     """Find a column by its name in the file or as a field."""
     for name in columns:
