@@ -1639,7 +1639,10 @@ def test_an_index_or_a_label_of_each_row_does_not_make_messages_by_turns_one(tmp
     assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.r,ATT.p,type", *named)).warnings  # no units
 
 
-@pytest.mark.parametrize(("good", "bad"), [(192, 24), (216, 64), ("Good", "Bad"), ("good, annotated", "Uncertain (LUV)")])
+_RATED = [(192, 24), (216, 64), ("Good", "Bad"), ("good, annotated", "Uncertain (LUV)")]
+
+
+@pytest.mark.parametrize(("good", "bad"), _RATED)
 def test_numbers_that_a_historian_does_not_call_good_are_left_out(tmp_path, good, bad):
     """A sensor that was off had 0 in such rows, which the bounds then had to contain."""
     said = [bad if k in (7, 8, 30) else good for k in range(80)]
