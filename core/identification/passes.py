@@ -418,10 +418,7 @@ def moving_from_rest(part: Partition, offset: int = 0) -> tuple[int, int, int, f
 
 
 def steps(part: Partition) -> Array:
-    """Step of every transition.
-
-    Returns (N,): Δt, s.
-    """
+    """Step of every transition, (N,): Δt, s."""
     return np.concatenate([block.dt for block in part.blocks()])
 
 

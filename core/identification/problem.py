@@ -198,10 +198,7 @@ class Block:
         return self.z[: self.n] if self.base is None else self.base
 
     def root_weights(self) -> Array:
-        """Roots of the diagonal weights.
-
-        Returns (n, K): √w_ii(t_{k+1}).
-        """
+        """Roots of the diagonal weights, √w_ii(t_{k+1}), (n, K)."""
         if self.weights.ndim == 1:
             return np.sqrt(self.weights)[:, None]
         diagonal = np.diagonal(self.weights, axis1=1, axis2=2) if self.weights.ndim == 3 else self.weights
@@ -262,31 +259,19 @@ class Problem(Block):
             yield replace(self.subset(slice(start, start + BLOCK)), start=start)
 
     def rate(self) -> Array:
-        """(x_next - x) / Δt with samples in rows.
-
-        Returns (N, n): 1/s.
-        """
+        """(x_next - x) / Δt with samples in rows, (N, n), 1/s."""
         return ((self.x_next - self.origin) / self.dt).T
 
     def phi(self) -> Array:
-        """Regressors of the nominal row with samples in rows.
-
-        Returns (N, r): as of `Columns.phi`.
-        """
+        """Regressors of the nominal row with samples in rows, (N, r), as of `Columns.phi`."""
         return self.columns.phi(self.z, self.s).T
 
     def psi(self) -> Array:
-        """Regressors of the half-width with samples in rows.
-
-        Returns (N, q): as of `Columns.psi`.
-        """
+        """Regressors of the half-width with samples in rows, (N, q), as of `Columns.psi`."""
         return self.columns.psi(self.z, self.dt, self.s).T
 
     def row_weights(self) -> Array:
-        """Diagonal weights with samples in rows.
-
-        Returns (N, n): w_ii(t_{k+1}).
-        """
+        """Diagonal weights w_ii(t_{k+1}) with samples in rows, (N, n)."""
         return np.broadcast_to(self.root_weights().T ** 2, (self.N, self.n))
 
     def subset(self, index: Index | NDArray[np.bool_] | slice) -> Self:
