@@ -2145,6 +2145,21 @@ def test_four_numbers_of_a_body_and_not_of_joints_are_a_quaternion(tmp_path):
     assert FieldPath("yaw(q)").read(live) == pytest.approx(yaw[9], abs=1e-9)
 
 
+@pytest.mark.parametrize("names", [("att_quat_{}", "1234"), ("ATT.Q{}", "1234"), ("est[{}]", "0123")])
+def test_four_numbers_of_an_attitude_that_name_no_axis_are_no_states(tmp_path, names):
+    """As spacecraft write them, whose fourth is w: each was a state, and q and -q are one attitude."""
+    rng = np.random.default_rng(3)
+    u = np.repeat(rng.normal(size=60), 25)
+    rate = answers(rng, u[:, None])[:, 0]
+    yaw = np.cumsum(rate) / 10
+    parts = [0.6 * np.sin(yaw / 2), 0.8 * np.sin(yaw / 2), 0.6 * np.cos(yaw / 2), 0.8 * np.cos(yaw / 2)]
+    name, numbers = names
+    columns = {name.format(i): part for i, part in zip(numbers, parts, strict=True)} | {"rate": rate, "torque_cmd": u}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 2.0 * np.arange(len(u)))])
+    assert [c.path for c in proposal.states] == ["rate"], proposal.text
+    assert "of an attitude, as the squares of the four add up to 1" in proposal.text
+
+
 def test_the_phase_of_a_flight_is_no_state_where_there_is_no_command(tmp_path):
     """It took the place of a voltage that moved with it, and the next phase, never seen, was an alarm."""
     rng = np.random.default_rng(3)

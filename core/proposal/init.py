@@ -49,11 +49,13 @@ from uncertain_lti.proposal.choosing import assign_roles, choose
 from uncertain_lti.proposal.members import all_of_them, moves_per
 from uncertain_lti.proposal.process_data import is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
+    ATTITUDE,
     as_unwatched,
     columns_of,
     endless,
     entry,
     name_signals,
+    of_attitude,
     of_compass,
     of_wheel,
     set_operating_point,
@@ -270,13 +272,15 @@ def _sift(source: Source) -> None:
     bases = {m[2] for c in source.candidates if (m := re.fullmatch(rf"({OF_QUATERNION})\((.+)\)", c.path))}
     for base in bases:
         part = re.compile(rf"{re.escape(base)}(\.[xyzw]|\[[0-3]\]|_?[0-3])").fullmatch
-        read = [c.values for c in source.candidates if part(c.path) and c.values]
-        norm = np.sqrt(sum(np.concatenate(values) ** 2 for values in read)) if len(read) == 4 else np.zeros(1)
-        unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
-        is_rotation = len(unit) > 0 and unit.mean() > 0.9
+        is_rotation = of_attitude([c for c in source.candidates if part(c.path) and c.values])
         source.candidates = [  # the other form of the same numbers has its line
             c for c in source.candidates if not (part(c.path) if is_rotation else c.path.endswith(f"({base})"))
         ]
+    numbered = [c for c in source.candidates if c.values and re.search(r"\d\]?$", c.path)]
+    for of in {c.path.rstrip("]")[:-1] for c in numbered}:
+        if of_attitude(parts := [c for c in numbered if c.path.rstrip("]")[:-1] == of]):
+            for candidate in parts:
+                candidate.reason, candidate.ready = ATTITUDE, "state"
     for candidate in source.free if source.type == TABLE else ():  # before its usual value is taken for none
         if QUALITY.fullmatch("_".join(words_of(candidate.path))) and rated(candidate.finite)[0].any():
             candidate.reason = "a quality code, by its name and values"

@@ -113,11 +113,19 @@ def of_wheel(candidate: Candidate) -> bool:
 _BITS = [*np.exp2(range(8, 17)).tolist(), 2.0**32]
 
 
-def turn_of_count(candidate: Candidate) -> float:
-    """After how much the count of a wheel begins anew, by the bits that it fills, if it did; else 0.
+ATTITUDE = "of an attitude, as the squares of the four add up to 1; its angles are read if x, y, z, w end the names"
+"""Why numbers that nothing says the order of are no states: a quaternion turns by products."""
 
-    It goes on there as it does between, which a count that is set to 0 does not.
-    """
+
+def of_attitude(parts: Sequence[Candidate]) -> bool:
+    """Whether numbers are the four of a quaternion."""
+    norm = np.sqrt(sum(np.concatenate(c.values) ** 2 for c in parts)) if len(parts) == 4 else np.zeros(1)
+    unit = np.abs(norm[np.isfinite(norm)] - 1.0) < 0.02
+    return len(unit) > 0 and bool(unit.mean() > 0.9)
+
+
+def turn_of_count(candidate: Candidate) -> float:
+    """After how much the count of a wheel begins anew, by the bits that it fills, if it did; else 0."""
     if not of_wheel(candidate):
         return 0.0
     counts = [v[np.isfinite(v)] for v in candidate.values if np.isfinite(v).sum() > 1]
@@ -125,6 +133,7 @@ def turn_of_count(candidate: Candidate) -> float:
         jumps = [np.abs(np.diff(v)) > 0.8 * turn for v in counts]
         if any(map(np.any, jumps)) and max(map(np.ptp, counts)) < turn:
             steps = [np.abs(np.diff(np.unwrap(v, period=turn))) for v in counts]
+            # it goes on there as it does between, which a count that is set to 0 does not
             jumped, others = (np.concatenate([s[j == of] for s, j in zip(steps, jumps, strict=True)]) for of in (1, 0))
             return turn if jumped.max() <= 1.5 * others.max(initial=1.0) else 0.0
     return 0.0
