@@ -418,6 +418,39 @@ def test_a_monitor_that_sees_large_jumps_alone_is_not_praised(learnt, shares, ki
         assert worth(full, panel)[0] == "some" and "expect an alarm in most" in worth(full, panel)[1]
 
 
+def one_noisier(seed: int, noisier: int, states: int = 12) -> Transient:
+    """States of their own, of which one has half as much noise again."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.normal(size=(60, 1)), 25, axis=0)
+    noise = 0.02 * rng.normal(size=(len(u), states))
+    noise[:, noisier] *= 1.5
+    x = np.zeros((len(u), states))
+    for k in range(len(u) - 1):
+        x[k + 1] = 0.9 * x[k] + 0.1 * u[k] + noise[k]
+    return Transient(DT * np.arange(len(u)), x, u)
+
+
+def test_thresholds_rise_where_nearly_every_recording_passes_those_of_the_others(learnt):
+    """Of a hexapod with 36 states 5 of 6 did, and 6 of 9 healthy recordings were in alarm."""
+    runs = [one_noisier(seed, seed) for seed in range(6)]
+    model = fit(runs, "lp", additive="noise")
+    evidence = Evidence.from_dict(model.memory["evidence"])
+    what = model.fit_summary["alarm"]["what"]
+    plain = model.replace(alarm=replace(evidence, factor=1.0).learnt(model.alarm, what))
+    far = evidence.apart(plain.alarm, what)
+    assert (far > 1.0).sum() > 4 and evidence.factor == far.max() < 1.5
+    for rule, lower in zip(model.alarm, plain.alarm, strict=True):
+        raised = np.divide(rule.thresholds(12), lower.thresholds(12))
+        assert raised == pytest.approx(evidence.factor ** (1 if rule.kind == "mean" else 2), rel=1e-12)
+    told = model.fit_summary["alarm"]["promises"][1]
+    assert f"{evidence.factor - 1.0:.0%} higher as most pass them, none of 6 recordings would alarm" in told
+    further = [one_noisier(seed, 6 + seed % 6) for seed in range(30)]
+    loud, quiet = (sum(EnvelopeMonitor(one).check(run).alarm.any() for run in further) for one in (plain, model))
+    assert loud > 20 and quiet == 0
+    assert Evidence.from_dict(model.update([*runs, further[0]]).memory["evidence"]).factor > 1.0
+    assert learnt[2].evidence.factor == 1.0  # of recordings that are alike
+
+
 @pytest.mark.parametrize("moved", [0.0, 0.002, None])
 def test_quiet_of_a_machine_that_is_parked_says_nothing(model, moved):
     """The bounds of a drone on the ground were 140 times as wide as all that it did."""

@@ -23,7 +23,8 @@ p of each of G (three at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
 
-at most MOST times the former, and MOST times it of one or two recordings.
+at most MOST times the former, and MOST times it of one or two recordings. If more than NEARLY_ALL of the
+recordings pass what the others give, an alarm would say little: all thresholds rise until none does, by MOST at most.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -72,6 +73,8 @@ TELLING = 4
 """Recordings or groups from which on slow rules know how far they differ."""
 MOST = 1.5
 """That limit over the threshold without it at most, as parts at rest and parts that move are not alike."""
+NEARLY_ALL = 2 / 3
+"""Share of recordings or groups that would alarm at thresholds of the others beyond which thresholds rise."""
 UNLIKE = 1 / 3
 """Share of a left-out stretch outside the range of the others from which on it does not repeat them."""
 ALONE = 1 / 3
@@ -101,7 +104,7 @@ class Evidence:
     `peaks` (G, S): the largest sizes on each recording, group or block that was left out; `top`, `median` (S,): on all
     healthy data, left out or fitted; `verdicts`: of those; `widths` (2, n): usual and median width where left out,
     recorded units; `judged`: verdicts there; `hours`: those of them within what the others cover; `dt`: typical step,
-    s; `factor`: on the thresholds, for a rate; `counts`, `near` (units,): alarms left out at the thresholds, and
+    s; `factor`: on the thresholds; `counts`, `near` (units,): alarms left out at the thresholds, and
     somewhat below.
     """
 
@@ -229,8 +232,8 @@ class Panel:
         thresholds = evidence.thresholds(rules, n, what)
         energies = [i for i, rule in enumerate(rules) if (rule.kind, rule.horizon) == ("energy", 1)]
         usual, median = evidence.widths / 2.0
-        sample, window = (evidence.factor * thresholds[i] for i in (energies[0], energies[-1]))
-        biases = usual * (sample + 2.0 * evidence.median[:n])
+        sample, window = (thresholds[i] for i in (energies[0], energies[-1]))
+        biases = usual * (evidence.factor * sample + 2.0 * evidence.median[:n])
         for rule, size in zip(rules, thresholds, strict=True):
             if (rule.kind, rule.horizon) == ("chi2", 1) and residuals is not None:
                 room = evidence.factor * size * math.sqrt(max(round(rule.window_s / evidence.dt), 1))
@@ -238,6 +241,7 @@ class Panel:
                 certain = np.linalg.norm(residuals.whitening(np.ones(n, dtype=bool)), axis=0)
                 with np.errstate(all="ignore"):  # no limit for a state that it says nothing of
                     biases = np.fmin(biases, unit * room / certain)
+        window = window if asked is None else evidence.factor * window
         figure = float(np.exp(np.log(np.maximum(median * window, 1e-300)).mean()))
         learnt, limit = evidence.learnt(rules, what), _limit(evidence, len(rules))
         return cls(learnt, limit, what, biases, figure, evidence, tuple(unlike), asked, residuals)
@@ -354,11 +358,12 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     model, left, fitted = _narrowest(validation, rules, parts, fitted, dt)
     rules = rules_for(model, stretch, dt, apart)
     evidence, shown, unlike = _gathered(rules, left, fitted, dt)
+    if rate is None:
+        evidence = _raised(evidence, rules, validation.what)
     found = evidence.with_alarms(rules, validation.what, shown)
     beyond = rate is not None and _limit(found, len(rules)) > rate
     if beyond:
-        factor = float(np.clip(evidence.apart(rules, validation.what).max(), 1.0, MOST))
-        found = replace(evidence, factor=factor).with_alarms(rules, validation.what, shown)
+        found = _raised(evidence, rules, validation.what, 0.0).with_alarms(rules, validation.what, shown)
     while rate is not None and not beyond and found.factor > _LEAST:
         lower = replace(evidence, factor=found.factor / _FINE).with_alarms(rules, validation.what, shown)
         if _limit(lower, len(rules)) > rate:
@@ -366,6 +371,13 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
         found = lower
     names = {unit: part.group or part.name for unit, part in zip(unit_numbers(parts), parts, strict=True)}
     return replace(Panel.of(model, found, rules, validation.what, unlike, rate), names=tuple(names.values()))
+
+
+def _raised(evidence: Evidence, rules: Sequence[StatisticRule], what: str, beyond: float = NEARLY_ALL) -> Evidence:
+    """With a factor such that none passes the thresholds of the others, where more than this share of them does."""
+    far = evidence.apart(rules, what)
+    many = (far > 1.0).sum() > beyond * len(far) and (what != "block" or not beyond)
+    return replace(evidence, factor=float(np.clip(far.max(), 1.0, MOST)) if many else 1.0)
 
 
 def _narrowest(
@@ -407,7 +419,8 @@ def extended(
     if sizes != len(evidence.top) or evidence.learnt(rules, what) != model.alarm:
         return None
     new, shown, unlike = _gathered(rules, parts, fitted, evidence.dt)
-    both = (evidence + new).with_alarms(rules, what, shown)
+    both = evidence + new
+    both = (both if asked is not None else _raised(both, rules, what)).with_alarms(rules, what, shown)
     return Panel.of(model, both, rules, what, [*alarm["unlike"], *unlike], asked)
 
 
@@ -559,12 +572,13 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
             far = int(panel.reached.argmax())
             one = f", {panel.names[far]} farthest at {panel.reached[far]:.3g} times" if panel.names else ""
             further = f"expect {further} of further ones"
-            if panel.alarming and panel.asked is None:
+            higher = panel.asked is None and evidence.factor > 1.0
+            if panel.alarming and panel.asked is None and not higher:
                 low = float(f"{min(0.1 * most, _LOW):.1g}")  # one above the limit lowers the thresholds
                 further += f"; to have fewer, ask for a low rate (--false-alarms {low:g})"
-            found.append(
-                f"at thresholds of the others alone {alarming} would alarm{one * (panel.alarming > 0)}: {further}"
-            )
+            how = f", {evidence.factor - 1.0:.0%} higher as most pass them," if higher else " alone"
+            would = f"{alarming} would alarm{one * (panel.alarming > 0)}"
+            found.append(f"at thresholds of the others{how} {would}: {further}")
     else:
         found = ["false alarms: one stretch says nothing of their rate; record more"]
     found.append(f"sees within {evidence.dt:.3g} s {'; '.join(sees)}")
@@ -572,6 +586,6 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
         more = panel.needed_hours - evidence.hours
         remedy = f"{lasting(more)} more without an alarm would" if more > 0 else "record more"
         share = evidence.factor - 1.0
-        higher = f"the thresholds are {share:.0%} higher, as the parts differ; " * (share > 0.0)
-        found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {higher}{remedy}")
+        differ = f"the thresholds are {share:.0%} higher, as the parts differ; " * (share > 0.0)
+        found.append(f"asked for at most {panel.asked:g} per hour: the recordings cannot show that; {differ}{remedy}")
     return found
