@@ -333,7 +333,7 @@ cdef class Judge:
             raise ValueError("the runs do not fit the transitions")
         at_schedule = z[[self.positions[i] for i in range(self.blocks.axes)]]
         cdef Tiles tiles = Tiles(size + 1, p, z[:size], dt, runs, None, self.blocks, at_schedule)
-        cdef double* rates = room_for(n or 1)
+        cdef double* rates = room_for(n)
         cdef double* start = tiles.start
         with nogil:
             for low from first <= low < last by _SORTED:

@@ -190,7 +190,6 @@ cdef class Sampler:
         self.late, self.dropped = np.zeros(len(self.topics), dtype=np.intp), np.zeros(_UNSTAMPED + 1, dtype=np.intp)
         self.old, self.lacking, self.invalid = np.zeros((3, self.total), dtype=np.intp)
         self.open.values = self.clock_topic.left_one.values  # which no other use is made of
-        self.open_status, self.open_dt = _FIRST, NAN
         self._room = np.full(3 * self.total + self.n, NAN)
         cdef double[::1] room = self._room
         self.z, self.before, self.departure = &room[0], &room[self.total], &room[2 * self.total]
