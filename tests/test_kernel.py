@@ -17,6 +17,7 @@ import pytest
 from refusals import refuses
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
+from uncertain_lti.base.arrays import LARGEST
 from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION, Repeating
 from uncertain_lti.model.alarm_rule import StatisticRule
@@ -221,6 +222,22 @@ def test_what_does_not_fit_together_is_refused_before_it_is_read() -> None:
         refuses(ValueError, "fit", judge.judge_rows, *samples, [0], [0.1], numbers, some)
     for k in ([-1], [3], [4]):
         refuses(ValueError, "fit the recording", judge.judge_rows, *samples, k, [0.1], two, marks)
+    for thresholds, counted, margin in ((6, 2, 1.0), (7, 1, 1.0), (7, 2, 0.0), (7, 2, math.nan)):
+        watch = np.ones((2, thresholds)), 3, 1.0, [True] * counted, margin
+        refuses(ValueError, "the thresholds do not fit the states", Repeating, *watch)
+
+
+def test_rows_become_columns_with_the_sum_of_their_squares() -> None:
+    values, steady, scale = np.arange(12.0).reshape(6, 2), np.array([1.0, 2.0]), np.array([2.0, 4.0])
+    columns = np.empty((2, 3))
+    total = arithmetic.normalised_columns(values, np.array([0, 2, 5]), steady, scale, columns)
+    assert columns.tolist() == [[-0.5, 1.5, 4.5], [-0.25, 0.75, 2.25]] and total == 28.4375
+
+
+def test_numbers_up_to_the_largest_are_carried_and_one_beyond_is_enough() -> None:
+    assert arithmetic.all_carried([0.0, LARGEST, -LARGEST]) and arithmetic.all_carried([])
+    for value in (math.nan, math.inf, np.nextafter(LARGEST, math.inf), -2.0 * LARGEST):
+        assert not arithmetic.all_carried([value, 0.0])
 
 
 def test_judges_share_the_pairs_that_were_seen_and_numbers_alone_need_none() -> None:
@@ -351,6 +368,38 @@ def test_boxes_hold_what_their_transitions_have(each: int, limited: bool) -> Non
         assert np.array_equal(room[:, b], np.vstack(left)[:, inside].min(axis=1))
     given = (model.tables, z, dt, after, None, widest, numbers, boxes - 1)
     refuses(ValueError, "the boxes do not fit the transitions", arithmetic.boxes_of, *given)
+
+
+def test_sums_over_several_tiles_are_those_of_numpy() -> None:
+    rng = np.random.default_rng(5)
+    n, p, count = 2, 3, 300
+    elements = [draw(size=(n, k)) for draw in (rng.normal, rng.uniform) for k in (n, p - n)]
+    model = UncertainLTI(*elements, v=[0.1, 0.2])
+    z, dt, after = rng.normal(size=(p, count)), rng.uniform(0.1, 0.2, count), rng.normal(size=(n, count))
+    phi, moved = dt * np.vstack([z, np.ones(count)]), after - z[:n]
+    psi, given = np.abs(phi), (z, dt, after, None)
+    squares, _, regressors, targets, distance, sizes, visits = arithmetic.sums_of(n, *given, None, None, 1, [1], None)
+    for found, sums in (
+        (squares, psi @ psi.T), (regressors, phi @ phi.T), (targets, phi @ moved.T),
+        (distance, np.square(moved).sum(axis=1)), (sizes, psi.sum(axis=1)), (visits, [count]),
+    ):  # fmt: skip
+        np.testing.assert_allclose(found, sums, rtol=1e-12, atol=1e-12)
+    s, blocks = rng.uniform(size=(1, count)), arithmetic.Blocks((Axis("s", knots=(0.0, 1.0)),))
+    squares, _, regressors, *_, visits = arithmetic.sums_of(n, *given, blocks, s, 1, [1], None)
+    for found, columns in ((squares, psi), (regressors, phi)):
+        of_blocks = np.vstack([(1.0 - s) * columns, s * columns])
+        np.testing.assert_allclose(found, of_blocks @ of_blocks.T, rtol=1e-12, atol=1e-12)
+    assert visits.tolist() == [np.sum(s <= 0.5), np.sum(s > 0.5)]
+    centre, half = model.columns_centre_and_half(z, dt)
+    u = (after - centre) / half
+    outside, width, _, total, products, *_ = arithmetic.verdicts(model.tables, *given, None, None, np.ones((n, 1)))
+    assert outside.tolist() == (np.abs(u) > 1.0).sum(axis=1).tolist()
+    np.testing.assert_allclose(width, 2.0 * half.max(axis=1), rtol=1e-15)
+    np.testing.assert_allclose(total, u.sum(axis=1), rtol=1e-12)
+    np.testing.assert_allclose(products, u @ u.T, rtol=1e-12)
+    for short in (after[:1], after[:, :9]):
+        fit = z, dt, short, None, None, None, 1, [1], None
+        refuses(ValueError, "the samples do not fit the terms", arithmetic.sums_of, n, *fit)
 
 
 def test_what_a_tile_is_filled_up_with_counts_nowhere_and_on_a_bound_is_not_outside() -> None:
