@@ -294,7 +294,7 @@ def test_a_value_that_the_bounds_cannot_carry_has_no_verdict_live_as_offline(val
 
 def test_a_duration_beyond_64_bits_is_the_longest():
     assert to_ns(1e308) == to_ns(np.float64(1e300)) == to_ns(1e10) == to_ns(np.inf) == LONGEST_NS
-    assert to_ns(-1e308) == -LONGEST_NS and to_ns(1.5) == 1_500_000_000
+    assert to_ns(-1e308) == -LONGEST_NS and to_ns(1.5) == 1_500_000_000 and to_ns(4e9) == 4 * 10**18
 
 
 def test_info_on_odd_leaves_of_the_fit_is_no_defect(folder, tmp_path):

@@ -41,7 +41,7 @@ from test_sampler import Reference, cases
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.proposal.init import propose
-from uncertain_lti.sampling.reading import read_as_fitted, read_transients, unused
+from uncertain_lti.sampling.reading import load_signals, loses_much, read_as_fitted, read_transients, unused
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -368,6 +368,16 @@ def test_a_signal_that_the_recording_lacks_is_named(signal: tuple[str, str, str]
     assert str(path) in sentence or signal[1] in sentence
 
 
+def test_where_a_signals_file_contradicts_itself_a_misspelt_topic_is_the_cause(tmp_path: Path) -> None:
+    path, file = float_bag(tmp_path, "a.mcap", range(0, 100 * MS, 10 * MS), [0]), tmp_path / "signals.yaml"
+    for topic, error, words in (
+        ("/xx", BagError, "a.mcap: there is no topic /xx .is /x meant"),
+        ("/u", SignalError, "clock is /x, which carries no state"),
+    ):
+        file.write_text(f"clock: /x\nstates: [{{name: x, topic: {topic}, field: data}}]\n")
+        refuses(error, words, load_signals, file, [path])
+
+
 def test_a_name_or_an_index_that_comes_later_is_no_error(tmp_path: Path) -> None:
     late = [("/x", k * 10 * MS, joint_state((k + 1) * 10 * MS, [1.0], ["fan"])) for k in range(3)]
     late += [("/x", k * 10 * MS, joint_state((k + 1) * 10 * MS, [1.0, 7.0], ["fan", "core"])) for k in range(3, 9)]
@@ -388,6 +398,14 @@ def test_values_that_are_nan_or_infinite_cost_the_transitions_that_need_them(tmp
     all_nan = save(tmp_path, {"/x": FLOAT64}, [("/x", k * 10 * MS, float64(NAN)) for k in range(5)], "nan.mcap")
     (transient,) = read_transients(all_nan, SignalMap((Signal("x", "/x", "data", "auto", "auto"),)))
     assert not transient.usable.any()
+
+
+def test_a_dropped_message_and_more_than_one_sample_in_a_hundred_without_a_transition_are_worth_a_line() -> None:
+    t, x, u = np.arange(1000.0), np.zeros((1000, 1)), np.zeros((1000, 1))
+    ten, eleven, twice = x.copy(), x.copy(), t.copy()
+    ten[:10], eleven[:11], twice[500] = math.nan, math.nan, 499.0
+    assert not loses_much(Transient(t, x, u)) and not loses_much(Transient(t, ten, u))
+    assert loses_much(Transient(t, eleven, u)) and loses_much(Transient(twice, x, u))
 
 
 def test_recordings_of_other_types_are_neither_fitted_together_nor_judged(tmp_path: Path) -> None:
@@ -498,7 +516,7 @@ def test_a_clock_topic_that_stops_before_the_recording_does_is_said(
 ) -> None:
     """By over a second, and over 5 % of the recording."""
     sent = [("/x", k * 1000 * MS, float64(k)) for k in range(length - quiet + 1)]
-    sent += [("/u", k * 1000 * MS, float64(k)) for k in range(length + 1)]
+    sent += [("/u", k * 1000 * MS, float64(k)) for k in range(length // 2, length + 1)]  # it begins later
     path = save(tmp_path, {"/x": FLOAT64, "/u": FLOAT64}, sent)
     (run,) = read_transients(path, SignalMap((Signal("x", "/x", "data"),), (Signal("u", "/u", "data"),)))
     said = [note for note in run.notes if f"the last message of /x comes {quiet} s before the recording ends" in note]

@@ -25,7 +25,7 @@ from test_reading import FLOAT64, JOINT_STATE, MS, joint_state, save
 import uncertain_lti.sampling.reading
 from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.sampling.reading import children_ignore_ctrl_c, processes_for, read_transients
+from uncertain_lti.sampling.reading import _pool, children_ignore_ctrl_c, processes_for, read_transients
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 XU = SignalMap((Signal("x", "/x", "position[0]"),), (Signal("u", "/u", "data"),))
@@ -167,3 +167,13 @@ def test_small_recordings_are_read_without_processes(tmp_path: Path, monkeypatch
     assert processes_for(bags) == 3
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(2), raising=False)
     assert processes_for(bags) == 1  # which reads ahead on the other core
+
+
+def test_processes_that_still_read_are_ended_where_the_reading_breaks_off() -> None:
+    with pytest.raises(BagError), _pool(1) as pool:
+        busy = pool.submit(time.sleep, 60.0)
+        while not busy.running():
+            time.sleep(0.01)
+        broke_off = time.monotonic()
+        raise BagError("one of them is damaged")
+    assert time.monotonic() - broke_off < 30.0

@@ -612,11 +612,22 @@ def test_what_is_as_new_as_the_chosen_message_comes_late_and_what_is_older_does_
         assert sampler.counters["late /u"] == late
 
 
+def test_a_message_comes_late_for_one_of_the_last_hundred_closed_samples_alone() -> None:
+    sampler = Sampler(two_topics(max_gap=1e6))
+    for k in range(1, 301):
+        sampler.push(*at("/u", k, k))
+        sampler.push(*at("/c", k, k))
+    for stamp, late in ((199, 0), (200, 1)):  # the sample at 300 is open
+        sampler.push(*at("/u", 301, stamp))
+        assert sampler.counters["late /u"] == late
+
+
 STEPS_BACK = [
     "c105 u106 u101 c107 c108",
     "c101 u101 u52 u103 c54 u55 c7",
     "u50 u1 c6 u11 u12 u-33 u19 c21 c23 c28",
     "u100 c100 u50 c50 c52 u58 u51 c53",  # back with the clock and before it: the sample keeps what it had
+    "c104 c51 u51 u54 u7 c54",  # back after the clock, and not to follow it: likewise
 ]
 """Stamps that tell a rule of a step back from its neighbour; so few streams do that drawn ones seldom show it."""
 
@@ -699,6 +710,15 @@ def test_the_held_value_outlives_any_number_of_messages_while_its_sample_is_open
     assert step.u.tolist() == [-7.0] and step.status is Status.OK
     (step,) = sampler.push("/c", 2 * 10**6, 2 * 10**6, [0.0])
     assert step.u.tolist() == [3 * BUFFERED_MESSAGES - 1.0]
+
+
+def test_ten_thousand_messages_wait_for_a_sample_and_of_one_more_the_later_half_stays() -> None:
+    sampler = Sampler(two_topics())
+    for k in range(1, 10_001):
+        sampler.push(*at("/u", k, k))
+    assert len(sampler.kept("/u")) == 10_000
+    sampler.push(*at("/u", 10_001, 10_001))
+    assert len(sampler.kept("/u")) == 5_001
 
 
 def test_what_has_been_forgotten_is_missing_and_not_replaced_by_something_older() -> None:

@@ -163,6 +163,16 @@ def test_a_control_acts_as_it_was_recorded_at_the_departure_or_at_the_arrival_of
     refuses(TransientError, "control 'u1' is at the arrival", arrival.controls_at, {"u1": "both"})
 
 
+def test_a_control_that_is_delayed_or_taken_from_earlier_samples_stays_at_the_departure() -> None:
+    fields = [("now", "data[0]", 0), ("late", "data[1]", 2), ("before", "lag(data[0], 1)", 0)]
+    signals = SignalMap(
+        [Signal("x", "/x", "data")], [Signal(name, "/u", at, delay=delay) for name, at, delay in fields]
+    )
+    plain = Transient(np.arange(3.0), np.zeros((3, 1)), np.zeros((3, 3)), signals=signals)
+    taken = plain.controls_at("arrival")
+    assert taken.ends == tuple(c.at for c in taken.signals.controls) == ("arrival", "departure", "departure")
+
+
 def test_a_model_takes_controls_from_the_ends_that_it_was_fitted_to(tmp_path: Path) -> None:
     """x follows the mean of u over the step, so both ends of it are needed; the file of the model says so."""
     rng = np.random.default_rng(3)
