@@ -22,7 +22,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.kernel.arithmetic import Window
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule, labels
 from uncertain_lti.model.horizon import Horizon, Residuals
-from uncertain_lti.monitor.alarm import Alarm, Arming, Condition, Nearest, back_and_restarts, row_of, steps_back
+from uncertain_lti.monitor.alarm import Alarm, Arming, Condition, Nearest, Raised, back_and_restarts, row_of, steps_back
 
 ZEROS = np.zeros((2, 2))
 RULES = (
@@ -128,6 +128,17 @@ def test_the_nearest_statistic_is_the_one_with_the_largest_share_of_its_threshol
     assert alarm.nearest(alarm.values()) == {"mean": Nearest("x2", pytest.approx(-0.4), 0.5)}
 
 
+def test_the_farthest_statistic_is_that_of_all_verdicts_and_of_states_that_count() -> None:
+    rules = [StatisticRule("energy", 0.1, 0.5), AlarmRule(2, 3), StatisticRule("mean", 0.0, 0.5)]
+    values = np.array([[0.2, 0.3, 0.1, 5.0], [0.9, 3.0, -2.0, np.nan], [np.nan, np.nan, 1.0, -6.0]])
+    for counted, k, raised in (
+        ([True, True], 2, Raised("mean", "mean", 1, "x2", -6.0)),
+        ([True, False], 1, Raised("mean", "mean", 1, "x1", -2.0)),
+    ):
+        assert Alarm(rules, two_states(), np.array(counted)).farthest(values) == (k, raised)
+    assert Alarm(rules, two_states(), np.ones(2, dtype=bool)).farthest(np.full((3, 4), np.nan)) is None
+
+
 def test_time_has_stepped_back_where_an_instant_is_not_after_the_one_before_the_last() -> None:
     """One stamp ahead, and one behind, end nothing."""
     assert [steps_back(t, 20, 10) for t in (9, 10, 11, 20, 21)] == [True, True, False, False, False]
@@ -174,6 +185,13 @@ def test_a_verdict_counts_while_the_condition_holds_and_its_grace_is_over() -> N
     assert [arming.at(t) for t in (201, 219, 220)] == [False, False, True]
     arming.restart()
     assert [arming.at(t) for t in (300, 319, 320)] == [False, False, True]
+
+
+def test_over_a_recording_a_value_counts_from_the_first_sample_decided_after_it() -> None:
+    arming = Arming(Condition.parse("/machine/mode data == 3"), 0)
+    armed = arming.over(np.arange(6), [2, 4], [3.0, 1.0])
+    assert armed.counts.tolist() == [False, False, True, True, False, False]
+    assert armed.cleared.tolist() == [True, True, False, False, True, True] and armed.asked.all()
 
 
 def test_without_a_condition_alarms_count_from_the_first_verdict_or_after_the_grace() -> None:

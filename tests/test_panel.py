@@ -78,6 +78,13 @@ def test_fit_alone_gives_a_panel_that_is_quiet_on_what_it_saw_and_sees_what_it_p
     assert alarm["within"] == pytest.approx(DT) and seen >= 36  # nine of ten, as promised
 
 
+@pytest.mark.parametrize(("long", "windows"), [(8, [1, 6, 30]), (9, [1, 10, 100])])
+def test_of_ten_recordings_one_may_be_too_short_for_the_windows(long, windows):
+    """Sixty verdicts hold ten windows of six, and two of thirty."""
+    learnt = fit([plant(60, 60), *(plant(seed, 300) for seed in range(long))], "lp", additive="noise")
+    assert [round(rule.window_s / DT - 0.5) if rule.window_s else 1 for rule in learnt.alarm] == windows
+
+
 @pytest.mark.parametrize("count", [2, 3])
 def test_what_few_short_recordings_promise_is_by_the_bounds_that_judge(count):
     """The models that leave one of them out have narrower ones."""
@@ -90,7 +97,9 @@ def test_a_slow_average_takes_four_recordings_that_say_how_far_they_differ(runs)
     for count, slow in ((1, {"mewma", "chi2"}), (3, {"mewma", "chi2"}), (4, {"ewma"})):
         assert {rule.kind for rule in fit(runs[:count], "lp", additive="noise").alarm} == {"energy", *slow}
     alone = [Transient(run.t, run.x[:, :1], run.u) for run in runs]
-    assert [rule.kind for rule in fit(alone, "lp", additive="noise").alarm] == ["energy", "energy", "ewma"]
+    one_state = fit(alone, "lp", additive="noise")
+    assert [rule.kind for rule in one_state.alarm] == ["energy", "energy", "ewma"]
+    assert len(one_state.residuals.forms) == 1  # no rule of it asks which form is better: the first is kept
 
 
 def test_the_form_of_the_residuals_is_that_whose_threshold_encloses_less(runs):
@@ -488,6 +497,15 @@ def test_what_has_no_range_to_leave_is_never_far():
     reach = Reach(none, [Transient(t, count, u)])
     assert not reach.level(Transient(t, count + 1e4, u).transitions()).any()
     assert (reach.level(Transient(t, count, u + 9.0).transitions()) == 2).all()
+
+
+@pytest.mark.parametrize(("share", "named"), [(0.3, 0), (0.4, 1)])
+def test_a_recording_of_which_more_than_a_third_is_beyond_the_others_does_not_repeat_them(learnt, runs, share, named):
+    full, left, _ = learnt
+    first, *others = left.parts
+    far = (np.arange(first.judged) < share * first.judged).astype(np.intp)
+    given = replace(left, parts=[replace(first, extrapolated=far), *others])
+    assert learn(given, fitted_parts(full, runs)).unlike == (first.name,) * named
 
 
 def test_recordings_that_do_not_repeat_one_another_are_named(runs):
