@@ -23,11 +23,16 @@ from perturbed import session_of
 
 from uncertain_lti import UncertainLTI
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
+from uncertain_lti.model.domain import Sampling
+from uncertain_lti.model.schedule import Axis, Schedule
+from uncertain_lti.model.terms import ARRAYS
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from test_live import CONTROL, EPOCH_NS, STATE, STEP_NS, by_hand, float64, joint_state, vector
 
+from uncertain_lti.monitor.intake import Intake, Sender
+from uncertain_lti.monitor.outputs import FALSE, REASON, TRUE, VIOLATION, VerdictMessages, names_of, text_message
 from uncertain_lti.monitor.session import OK, STALE, WARN, EventLog, Rule
 
 TIMEOUT = 1.0
@@ -100,6 +105,90 @@ def test_the_first_verdict_is_told_and_nothing_after_it() -> None:
     rig = Rig(masked="b")
     rig.send(1000)
     assert rig.lines == ["judging a, b; alarm when at least 2 of 5 verdicts violated; masked: b"]
+
+
+def test_a_message_of_the_clock_that_is_dropped_opens_no_sample() -> None:
+    """So nothing is predicted from it a second time."""
+    rig = Rig.at_work()
+    for after, opens in ((0, True), (0, False), (STEP_NS, True)):
+        data = joint_state(rig.t_ns + after, rig.x)
+        assert rig.session.take(STATE, rig.t_ns + after, data, rig.now)[1] == opens
+
+
+def test_a_stamp_more_than_a_second_ahead_of_its_arrival_is_of_the_future() -> None:
+    rig = Rig()
+    for ahead, count in ((10**9, 0), (10**9 + 1, 1)):
+        rig.session.take(STATE, EPOCH_NS, joint_state(EPOCH_NS + ahead, rig.x), rig.now)
+        assert rig.session.future[STATE] == count
+
+
+class Listener:
+    """Hears one topic."""
+
+    listeners = 1
+
+    def __init__(self) -> None:
+        self.heard: list[bytes] = []
+        self.send = self.heard.append
+
+
+class NoSnapshots:
+    recent = None
+
+    def alarm_over(self, now: float) -> None:
+        pass
+
+
+class Publishing(Rig):
+    def __init__(self) -> None:
+        super().__init__([AlarmRule(1, 1)])
+        self.sender, messages = Sender(self.now), VerdictMessages(names_of(("a", "b")))
+        self.failures: list[Exception] = []
+        failed = lambda _, error: self.failures.append(error)  # noqa: E731
+        self.intake = Intake(self.sender, NoSnapshots(), self.event_log.turned, failed)
+        self.intake.session, self.intake.active, self.intake.clock = self.session, True, lambda: self.t_ns
+        self.listeners = {name: Listener() for name in (VIOLATION.name, REASON.name, *messages.outputs)}
+        self.sender.open(self.listeners)
+        self.sender.prepare(messages)
+
+    def take(self, topic: str, data: bytes) -> None:
+        self.intake.message(topic, data)
+        self.at_once = [*self.said]
+
+
+def test_who_listens_hears_each_sample_once_and_the_alarm_with_each_verdict() -> None:
+    rig = Publishing()
+    rig.send(3)
+    rig.said.clear()
+    rig.x = rig.x + [9.0, 0.0]
+    rig.send(1)
+    assert not rig.failures and [level for level, line in rig.at_once if line.startswith("alarm, at")] == [WARN]
+    heard = {name: listener.heard for name, listener in rig.listeners.items()}
+    assert {len(heard[name]) for name in ("lower", "upper", "state", "utilisation")} == {3}
+    assert {len(heard[name]) for name in ("flags", "predicted_lower", "predicted_upper")} == {4}
+    assert heard[VIOLATION.name] == [FALSE, FALSE, TRUE]
+    assert rig.session.violations == [1, 0]
+    assert heard[REASON.name][-1] == text_message(rig.session.reasons.text) and "a" in rig.session.reasons.text
+
+
+def test_more_than_two_tenths_of_a_millisecond_for_a_message_are_slow_and_of_flags_three() -> None:
+    rig = Publishing()
+
+    def slow(_: bytes) -> None:
+        end = time.thread_time() + 2.1e-4
+        while time.thread_time() < end:
+            pass
+
+    rig.listeners["flags"].send = rig.listeners["state"].send = slow
+    rig.send(200)
+    assert rig.sender.slow_topics() == ["state"] and rig.sender.held_back > 0
+
+
+def test_verdicts_are_two_of_the_longest_fitted_steps_apart_at_most() -> None:
+    rig = Rig()
+    assert rig.session.between_verdicts == pytest.approx(2 * STEP)  # the model knows its median step alone
+    rig.session.model = rig.model.replace(sampling=Sampling(STEP, dt_max=0.7))
+    assert rig.session.between_verdicts == pytest.approx(1.4)
 
 
 def test_a_state_that_drifts_from_day_to_day_is_told_once_a_day() -> None:
@@ -262,6 +351,31 @@ def test_a_new_rule_keeps_what_is_known_and_a_standing_alarm_where_it_latches() 
     assert session.alarm
     session.follow(replace(session.rule, latch=False))
     assert not session.alarm
+
+
+def test_the_topic_of_the_enable_condition_is_one_to_listen_to_once_its_type_is_known() -> None:
+    session, kind = Rig().session, "std_msgs/msg/Float64"
+    session.follow(Rule(enable="/mode data == 3", enable_type=kind))
+    assert session.types["/mode"] == kind
+    session.follow(Rule(enable="/state data == 3"))
+    assert not {"/mode", "/state"} & set(session.types)
+    session.found_enable_type(kind)
+    session.follow(Rule(enable="/state data == 4"))
+    assert session.types["/state"] == kind
+
+
+def test_a_report_names_the_mode_that_the_model_does_not_list() -> None:
+    rig = Rig()
+    p, q = (replace(control, steady=0.0, scale=1.0) for control in rig.model.signals.controls)
+    both = {name: np.stack([getattr(rig.model, name)] * 2) for name in ARRAYS}
+    signals, gears = replace(rig.model.signals, controls=(p, q)), Schedule((Axis("p", modes=(1.0, 2.0)),))
+    rig.watch(rig.model.replace(**both, signals=signals, schedule=gears, block_data=None), Rule())
+    for gear in (1.0, 4.0, 4.0):
+        rig.take(CONTROL, vector(rig.t_ns, gear, 0.0))
+        rig.take(STATE, joint_state(rig.t_ns, rig.x))
+        rig.wait(STEP)
+    said = rig.session.report(rig.now, TIMEOUT)[0].message
+    assert "1 samples without a verdict: p = 4 is not among the modes of the model, 1, 2" in said
 
 
 def test_an_enable_condition_without_a_number_is_told_from_one_that_is_silent() -> None:

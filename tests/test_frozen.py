@@ -514,6 +514,8 @@ def test_a_session_names_what_is_frozen() -> None:
     assert "every state needs one that is frozen" in monitor.message and b.message.startswith("frozen: repeats exactly")
     assert a.level != ERROR and int(monitor.values["frozen"]) > 30 and monitor.values["alarm"] == "1"
     rig.send(30, frozen=1)
+    _, a, _ = rig.session.report(rig.now, 10.0)
+    assert (a.level, a.message) == (WARN, "no verdict: it needs a state that is frozen")
     monitor, *_ = rig.session.report(rig.now + 20.0, 10.0)
     assert "frozen" not in monitor.message.split(";")[0], "nothing arrives, so nothing is known to be frozen"
     rig.send(5)
