@@ -343,7 +343,7 @@ class MatchedSubscription:
         message, info = given if len(given) == 2 else given[0]
         self.received += 1
         number, before = info["publication_sequence_number"], self._number
-        if before is not None and number is not None:
+        if before is not None:  # a middleware numbers all messages, or none
             if number <= before:  # they come from several publishers
                 self._alone = False
             elif self._alone:
