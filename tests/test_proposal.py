@@ -1821,6 +1821,22 @@ def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_pa
     assert "its level is judged, how it moves needs faster rows" in remedies(noise, "noise", "Temp")
 
 
+@pytest.mark.parametrize("switched", [False, True])
+def test_a_plant_whose_load_nobody_tells_is_said_to_lack_it(tmp_path, switched):
+    """Of a genset's ambient temperature and count of starts were the controls, and 10 of 12 faults were early."""
+    rng, rows, heat = np.random.default_rng(1), [], 0.0
+    for k in range(600):
+        load = 100 + 50 * (k // 60 % 3) + rng.normal()
+        heat += 0.05 * (load - heat)
+        rows.append([k, load, heat + rng.normal(), 20 + 0.01 * k + rng.normal(), 211, k // 40 % 2])
+    names = ["time", "Power", "Exhaust", "Ambient temp", "Num starts", "Fan on"]
+    path = csv(tmp_path / "genset.csv", names[: 5 + switched], [row[: 5 + switched] for row in rows])
+    proposal = propose([path])
+    assert {c.name for c in proposal.controls} >= {"Ambient_temp", "Num_starts"}
+    said = [text for text in proposal.warnings if "nothing in it is set or switched; what loads the machine" in text]
+    assert len(said) == (not switched), proposal.text
+
+
 def test_what_a_fast_table_measures_is_judged_also_where_it_is_noise(tmp_path):
     """Of a motor on a stand at 10 rows a second the temperatures, which a fault shows in, were left out."""
 

@@ -47,7 +47,7 @@ from uncertain_lti.proposal.candidates import (
 )
 from uncertain_lti.proposal.choosing import assign_roles, choose
 from uncertain_lti.proposal.members import all_of_them, moves_per
-from uncertain_lti.proposal.process_data import is_plant, plant_signals
+from uncertain_lti.proposal.process_data import ALWAYS, WEATHER, is_plant, plant_signals
 from uncertain_lti.proposal.signals_file import (
     ATTITUDE,
     as_unwatched,
@@ -512,6 +512,9 @@ def propose(
         chosen, used = plant_signals(sources)
         if not chosen:
             raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
+        if all(c.why.startswith((ALWAYS, WEATHER)) for c in used):
+            load = "what loads the machine, such as a power that others draw, is a control: move its line to `controls`"
+            warnings.append(f"nothing in it is set or switched; {load}")
         text = signals_file(bags, sources, chosen, used, "", layout=layout, plant=True)
         return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
     if states or controls:

@@ -33,6 +33,8 @@ LASTS = 0.5
 """Share of what they do not tell that the row before tells, from which on it has a memory of its own."""
 RARE = 0.05
 """Share of the rows in which a set point changes, up to which nothing before tells of its changes."""
+ALWAYS, WEATHER = "always ", "the weather, by its name, which is no fault of the machine"
+"""Why a column is a control that nobody sets."""
 _BY_NAME = "set by a controller or a person, by its name; "
 HELD = 0.8
 """Share of an analyser's changes that come after the same number of rows, two or more."""
@@ -69,7 +71,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
             candidate.why = f"0 whenever {on.path} is off"
             controls.append(candidate)
     stem = {c: re.sub(r"\d+", "*", c.path) for c in free}  # of `F_PU1` and `F_PU2`, and not of one unit's
-    stems = [stem[c] for c in controls if not c.why.startswith("always")]
+    stems = [stem[c] for c in controls if not c.why.startswith(ALWAYS)]
     alike = [c for c in free if c not in controls and stems.count(stem[c]) > 1]
     for candidate in alike if len(controls) + len(alike) < len(free) else ():  # they go together, unless none is left
         candidate.why = f"one of the {stem[candidate]}, of which the others are controls"
@@ -105,12 +107,12 @@ def _is_set(candidate: Candidate, called: bool) -> bool:
     by_name = called or _TURNED.search(candidate.path.removesuffix("_mV").lower())  # no manipulated variable
     if len(values) == 1:
         candidate.why = (
-            f"always {values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"
+            f"{ALWAYS}{values[0] + 0.0:.6g} here, so its effect is unknown; a move is outside what was fitted"
         )
     elif len(values) <= (few if by_name or not READ.search(candidate.path.lower()) else 2) and not candidate.flickers:
         candidate.why = f"switched between {', '.join(f'{v + 0.0:.6g}' for v in values)}"
     elif _WEATHER.search(candidate.path.lower()):
-        candidate.why = "the weather, by its name, which is no fault of the machine"
+        candidate.why = WEATHER
     elif by_name:
         candidate.why, candidate.judged = f"{_BY_NAME}judged as well", True
     else:
