@@ -1662,6 +1662,10 @@ def test_numbers_that_a_historian_does_not_call_good_are_left_out(tmp_path, good
         "q": [],
     }
     assert not any("without a name" in text for text in bag.warnings)
+    runs = write(tmp_path / "r.csv", "time,Level,Flow,Level_Q,run", *(f"{row},{k // 40}" for k, row in enumerate(rows)))
+    several = group_recordings([runs], layout=TableLayout(runs="run"))
+    assert [sum("not good by 'Level_Q'" in text for text in run.warnings) for run in several] == [1, 0]
+    assert np.isnan(np.concatenate([run.columns_by_field["Level"] for run in several])).sum() == 3
 
 
 @pytest.mark.parametrize("said", ["Good,Bad", "3,7", "192,191", "0,64", "good,good"])

@@ -125,8 +125,7 @@ def _too_large(transients: Sequence[Transient]) -> FitError:
     """The error for values whose squares overflow, naming signal and recording."""
     largest, name, recording = 0.0, "", ""
     for t in transients:
-        names = (*t.state_names, *t.control_names, *t.scheduling_names)
-        for signal, values in zip(names, (*t.x.T, *t.u.T, *t.s.T), strict=True):
+        for signal, values in zip(t.signal_names, (*t.x.T, *t.u.T, *t.s.T), strict=True):
             here = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
             if here > largest:
                 largest, name, recording = here, signal, t.name
@@ -141,8 +140,7 @@ def _without_values(transients: Sequence[Transient]) -> str:
     first, total = transients[0], sum(len(t) for t in transients)
     finite = [np.isfinite(np.concatenate([t.x, t.u, t.s], axis=1)) for t in transients]
     known = sum(f.sum(axis=0) for f in finite)
-    names = (*first.state_names, *first.control_names, *first.scheduling_names)
-    counts = dict(zip(names, np.asarray(known).tolist(), strict=True))
+    counts = dict(zip(first.signal_names, np.asarray(known).tolist(), strict=True))
     never = [name for name, count in counts.items() if not count]
     if never:
         many = len(never) > 1
@@ -153,8 +151,9 @@ def _without_values(transients: Sequence[Transient]) -> str:
     signals = first.signals
     of_one = [i for i, s in enumerate(signals.states) if s.topic == signals.clock] if signals is not None else []
     if len(of_one) > 1 and not any(f[:, of_one].all(axis=1).any() for f in finite):
+        together = ", ".join(first.state_names[i] for i in of_one)
         return (
-            f"no message of {signals.clock if signals else ''} has all of {', '.join(names[i] for i in of_one)}; fit a "
+            f"no message of {signals.clock if signals else ''} has all of {together}; fit a "
             f"model for those that come together, or publish all in one message, as joint_state_publisher with "
             f"source_list does"
         )

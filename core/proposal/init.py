@@ -314,7 +314,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         what = f"rows only, so {_FILL}" if source.type == TABLE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
     if finite.min() == finite.max():
-        return f"always {finite[0] + 0.0:.6g}"
+        return f"{ALWAYS}{finite[0] + 0.0:.6g}"
     if source.type != TABLE and np.ptp(finite) < DUST:
         return f"moves by {np.ptp(finite):.2g} in all, which is rounding"
     counts = np.unique(finite, return_counts=True)[1]

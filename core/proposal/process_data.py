@@ -58,7 +58,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     """
     every = [c for s in sources for c in s.candidates if c.values]
     for candidate in every:
-        if re.match(rf"always|leaves its usual|{TWO_VALUES}", candidate.reason):  # what hardly moves is a signal, too
+        if re.match(rf"{ALWAYS}|leaves its usual|{TWO_VALUES}", candidate.reason):  # what hardly moves is a signal, too
             candidate.reason = ""
     drop_copies([c for c in every if not c.reason and np.ptp(c.finite) > 0], exact=True)
     free = [c for c in every if not c.reason]

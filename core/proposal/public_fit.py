@@ -231,9 +231,8 @@ def _with_knots(
 ) -> tuple[Schedule | Mapping[str, Knots], dict[str, Any], list[str]]:
     """A schedule with the knots of the automatic signals chosen, one after the other; the tables, and sentences."""
     first = transients[0]
-    names = [*first.state_names, *first.control_names, *first.scheduling_names]
     chosen: dict[str, Knots] = dict(asked) if isinstance(asked, Mapping) else {}
-    check_names(chosen, names)
+    check_names(chosen, first.signal_names)
     tables: list[Any] = []
     messages: list[str] = []
     for number, name in enumerate(automatic):
@@ -244,7 +243,7 @@ def _with_knots(
         messages.append(f"schedule: {plural(best.count, 'knot')} on {name}: {table['reason']}")
         chosen = {**chosen, name: knots_of(best.model, name) or 1}
         asked = best.model.schedule or {}  # to the bit as it was judged
-    messages += unused(first.scheduling_names, [*signals_of(asked, names), *automatic])
+    messages += unused(first.scheduling_names, [*signals_of(asked, first.signal_names), *automatic])
     return asked, {"schedule": tables} if tables else {}, messages
 
 
@@ -256,7 +255,7 @@ def _over(
     if not rule.leaves_out:
         return dict.fromkeys(steps, "growing" if rule.widths == "growing" else "constant"), {}, []
     first, point = transients[0], options["operating_point"]
-    on = signals_of(options["schedule"], [*first.state_names, *first.control_names, *first.scheduling_names])
+    on = signals_of(options["schedule"], first.signal_names)
     point = point and point.scheduled_on([name in on for name in first.scheduling_names])
     own = {**options, "operating_point": point}
     lengths, choice = choose_horizons([t.scheduled_on(on) for t in transients], rule, steps, **own)

@@ -159,7 +159,7 @@ def memory_candidates(transients: Sequence[Transient], additive: Additive = "noi
         problem = assemble(transients, point_of(first), None, additive)
     except FitError:
         return []
-    taken = {*first.state_names, *first.control_names, *first.scheduling_names}
+    taken = {*first.signal_names}
     remembered = {r.of for r in first.signals.recalled} if first.signals is not None else set()
     found = autocorrelation(problem)
     follow = [i for i in range(problem.n) if found is not None and found.follows(i) and i not in remembered]
@@ -214,7 +214,7 @@ def promise(transients: Sequence[Transient]) -> dict[str, float]:
     The knots are the ends of the signal and one of a few places between, the best.
     """
     first, steps = transients[0], [t.transitions() for t in transients]
-    names = [*first.state_names, *first.control_names, *first.scheduling_names]
+    names = first.signal_names
     each = ([getattr(step, name) for step in steps] for name in ("x", "u", "s", "x_next", "dt"))
     x, u, s, x_next, dt = map(np.concatenate, each)
     z = np.column_stack([x, u])

@@ -92,16 +92,13 @@ class Table(Recording):
         signals = {name: column for name, column in raw.columns.items() if name not in apart}
         naming, value, of_each = _naming(signals, times)
         called = _NAMES.fullmatch(naming) and rows is None
-        good, doubts = without_bad(signals, value if called else "")
-        of_file += doubts
-        doubted = int(np.isnan(good[value]).sum() - np.isnan(signals[value]).sum()) if value in good else 0
-        signals |= good
-        raw = replace(raw, columns={**raw.columns, **good})
-        wide = _side_by_side(of_each, signals[value], times) if called else None
+        good, doubts = without_bad(signals, value) if called else ({}, [])
+        wide = _side_by_side(of_each, good.get(value, signals[value]), times) if called else None
         if wide is not None:
-            of_file.append(f"column '{naming}' names the signal of each number in '{value}'")
+            of_file += [*doubts, f"column '{naming}' names the signal of each number in '{value}'"]
             known = sum(int(np.isfinite(column).sum()) for column in wide[0].values())
-            if left := len(times) - doubted - known:
+            doubted = np.isnan(good[value]) & ~np.isnan(signals[value]) if good else np.zeros(1)
+            if left := len(times) - int(np.count_nonzero(doubted)) - known:
                 why = "without a name, a time or a number, or of a name and time that another row has"
                 of_file.append(f"{plural(left, 'row')} left out {why}")
             names, times = unique([time, *wide[0]]), wide[1]
@@ -411,7 +408,9 @@ def _every_run(path: Path, layout: TableLayout) -> list[Table]:
 def _read(file: Path) -> RawTable:
     if not file.exists():
         raise missing(file)
-    return read_table(file)
+    raw = read_table(file)
+    good, doubts = without_bad(raw.columns)
+    return replace(raw, columns={**raw.columns, **good}, notes=[*raw.notes, *doubts])
 
 
 def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[np.intp]]:

@@ -349,7 +349,7 @@ def rated(column: Column) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     return good, bad & good.any()
 
 
-def without_bad(columns: Mapping[str, Column], value: str) -> tuple[dict[str, Column], list[str]]:
+def without_bad(columns: Mapping[str, Column], value: str = "") -> tuple[dict[str, Column], list[str]]:
     """Columns without the numbers that the quality beside them does not call good, and how many there are.
 
     `value`: the column that any quality is of; default that of its name (`Level` or `Level_Value` of `Level_Q`).
@@ -359,7 +359,8 @@ def without_bad(columns: Mapping[str, Column], value: str) -> tuple[dict[str, Co
     numbers = {name: c for name, c in columns.items() if c.dtype.kind in "iuf" and c.ndim == 1}
     qualities = {name: named["of"] for name, c in columns.items() if c.ndim == 1 and (named := QUALITY.fullmatch(name))}
     for quality, of in qualities.items():
-        kin = (value,) if value else [n for n in numbers if re.fullmatch(rf"(?i){re.escape(of[:-1])}([\W_]value)?", n)]
+        its_own = re.compile(rf"(?i){re.escape(of[:-1])}([\W_]value)?")
+        kin = [value] if value else [name for name in numbers if of and its_own.fullmatch(name)]
         if columns[quality].dtype.kind in "Oiuf" and kin:
             good, bad = rated(columns[quality])
             if good.sum() > bad.sum() > 0:

@@ -310,6 +310,11 @@ class Transient:
         return self.replace(s=self.s[:, keep], scheduling_names=[self.scheduling_names[j] for j in keep])
 
     @property
+    def signal_names(self) -> tuple[str, ...]:
+        """Names of the states, the controls and the further scheduling signals, in this order."""
+        return *self.state_names, *self.control_names, *self.scheduling_names
+
+    @property
     def t(self) -> Array:
         """Instants in s since the first sample, (N+1,)."""
         return (self.t_ns - self.t_ns[0]) * 1e-9 if len(self.t_ns) else np.empty(0)
@@ -408,7 +413,7 @@ class Transient:
         index = pandas.Index(self.t, name="time [s]")
         if absolute:
             index = pandas.DatetimeIndex(self.t_ns.view("M8[ns]"), tz="UTC", name="time")
-        columns = [*self.state_names, *self.control_names, *self.scheduling_names]
+        columns = list(self.signal_names)
         return pandas.DataFrame(np.hstack([self.x, self.u, self.s]), index=index, columns=columns)
 
     @classmethod

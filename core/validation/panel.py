@@ -23,8 +23,8 @@ p of each of G (three at least) are normal,
 
     exp(mean log p + t (1 + 1/G)^(1/2) s),   s^2 the mean of their variances over the states, t Student's, G - 1;
 
-at most MOST times the former, and MOST times it of one or two recordings. If more than NEARLY_ALL of the
-recordings pass what the others give, an alarm would say little: all thresholds rise until none does, by MOST at most.
+at most MOST times the former, and MOST times it of one or two recordings. If more than NEARLY_ALL of the recordings
+pass what the others give, an alarm would say little: all thresholds rise until none does, MOST times at most.
 
 [Hahn, G. J. and Meeker, W. Q., Statistical Intervals, 1991, section 4.8]
 """
@@ -104,8 +104,7 @@ class Evidence:
     `peaks` (G, S): the largest sizes on each recording, group or block that was left out; `top`, `median` (S,): on all
     healthy data, left out or fitted; `verdicts`: of those; `widths` (2, n): usual and median width where left out,
     recorded units; `judged`: verdicts there; `hours`: those of them within what the others cover; `dt`: typical step,
-    s; `factor`: on the thresholds; `counts`, `near` (units,): alarms left out at the thresholds, and
-    somewhat below.
+    s; `factor`: on the thresholds; `counts`, `near` (units,): alarms left out at the thresholds, and somewhat below.
     """
 
     peaks: Array
@@ -359,11 +358,11 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     rules = rules_for(model, stretch, dt, apart)
     evidence, shown, unlike = _gathered(rules, left, fitted, dt)
     if rate is None:
-        evidence = _raised(evidence, rules, validation.what)
+        evidence = _unasked(evidence, rules, validation.what)
     found = evidence.with_alarms(rules, validation.what, shown)
     beyond = rate is not None and _limit(found, len(rules)) > rate
     if beyond:
-        found = _raised(evidence, rules, validation.what, 0.0).with_alarms(rules, validation.what, shown)
+        found = _raised(evidence, evidence.apart(rules, validation.what)).with_alarms(rules, validation.what, shown)
     while rate is not None and not beyond and found.factor > _LEAST:
         lower = replace(evidence, factor=found.factor / _FINE).with_alarms(rules, validation.what, shown)
         if _limit(lower, len(rules)) > rate:
@@ -373,11 +372,15 @@ def learn(validation: Validation, fitted: Sequence[Part], rate: float | None = N
     return replace(Panel.of(model, found, rules, validation.what, unlike, rate), names=tuple(names.values()))
 
 
-def _raised(evidence: Evidence, rules: Sequence[StatisticRule], what: str, beyond: float = NEARLY_ALL) -> Evidence:
-    """With a factor such that none passes the thresholds of the others, where more than this share of them does."""
-    far = evidence.apart(rules, what)
-    many = (far > 1.0).sum() > beyond * len(far) and (what != "block" or not beyond)
-    return replace(evidence, factor=float(np.clip(far.max(), 1.0, MOST)) if many else 1.0)
+def _unasked(evidence: Evidence, rules: Sequence[StatisticRule], what: str) -> Evidence:
+    """With the factor on thresholds where no rate is asked for."""
+    far = np.zeros(1) if what == "block" else evidence.apart(rules, what)
+    return _raised(evidence, far if (far > 1.0).mean() > NEARLY_ALL else np.ones(1))
+
+
+def _raised(evidence: Evidence, far: Array) -> Evidence:
+    """With thresholds that none of those passes which go so far beyond them, MOST times as large at most."""
+    return replace(evidence, factor=float(np.clip(far.max(), 1.0, MOST)))
 
 
 def _narrowest(
@@ -419,8 +422,8 @@ def extended(
     if sizes != len(evidence.top) or evidence.learnt(rules, what) != model.alarm:
         return None
     new, shown, unlike = _gathered(rules, parts, fitted, evidence.dt)
-    both = evidence + new
-    both = (both if asked is not None else _raised(both, rules, what)).with_alarms(rules, what, shown)
+    both = evidence + new if asked is not None else _unasked(evidence + new, rules, what)
+    both = both.with_alarms(rules, what, shown)
     return Panel.of(model, both, rules, what, [*alarm["unlike"], *unlike], asked)
 
 
