@@ -30,7 +30,6 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, fit, read_transients
 from uncertain_lti.base.errors import BagError, FitError
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.identification.evidence import functions
-from uncertain_lti.proposal import init
 from uncertain_lti.proposal.candidates import (
     Candidate,
     Source,
@@ -44,7 +43,7 @@ from uncertain_lti.proposal.candidates import (
 from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, assign_roles, choose, drop_idle_controls
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.members import all_of_them
-from uncertain_lti.proposal.signals_file import _left_out, name_signals, set_operating_point, signals_file
+from uncertain_lti.proposal.signals_file import _left_out, memory_lines, name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.signals.field_path import KINDS, FieldPath, Memory
@@ -1326,9 +1325,11 @@ def test_every_signals_file_that_is_written_can_be_read(tmp_path, monkeypatch, m
         name_signals(*one)
         set_operating_point(*one)
         remembered = (Remembered(one[recalled][0].name, Memory(kind)),) if kind else ()
-        monkeypatch.setattr(init, "choose_memories", lambda *_, found=remembered: (found, 0.5))
+        monkeypatch.setattr(
+            "uncertain_lti.proposal.signals_file.choose_memories", lambda *_, found=remembered: (found, 0.5)
+        )
         alike = all_of_them(*one, {(c.topic, c.path): c for c in [*states, *controls]})
-        text = signals_file([SimpleNamespace(path=tmp_path, topics={})], sources, *one, "", init._memories(*one), alike)
+        text = signals_file([SimpleNamespace(path=tmp_path, topics={})], sources, *one, "", memory_lines(*one), alike)
         signals = SignalMap.from_dict(yaml.safe_load(text))
         assert len(signals.states) == max(1, len(alike)), text
 

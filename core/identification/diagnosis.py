@@ -564,8 +564,8 @@ def _unstable(model: UncertainLTI) -> list[str]:
         return []
     listed = "; ".join(found[:3]) + (f"; and {len(found) - 3} more" if len(found) > 3 else "")
     return [
-        f"the nominal model is unstable ({listed}): one-step bounds restart from the measured state and stay valid, "
-        f"a free run does not"
+        f"the nominal model is unstable ({listed}): one-step bounds restart from the measured state, so the alarm is "
+        f"as good as ever; simulate nothing with it"
     ]
 
 

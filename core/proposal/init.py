@@ -15,8 +15,7 @@ import math
 import os
 import re
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product, repeat
 
@@ -24,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array
-from uncertain_lti.base.errors import BagError, TransientError, absent
+from uncertain_lti.base.errors import BagError, absent
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.proposal.candidates import (
     FEWEST,
@@ -36,8 +35,6 @@ from uncertain_lti.proposal.candidates import (
     ask_for,
     at_rest,
     bare,
-    clock_of,
-    earlier,
     is_label,
     part_by_role,
     role_by_name,
@@ -51,9 +48,7 @@ from uncertain_lti.proposal.process_data import ALWAYS, WEATHER, is_plant, plant
 from uncertain_lti.proposal.signals_file import (
     ATTITUDE,
     as_unwatched,
-    columns_of,
-    endless,
-    entry,
+    memory_lines,
     name_signals,
     of_attitude,
     of_compass,
@@ -64,15 +59,13 @@ from uncertain_lti.proposal.signals_file import (
     turn_of_count,
     words_of,
 )
-from uncertain_lti.proposal.tune import Remembered, choose_memories
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
 from uncertain_lti.recordings.table import Table, names_signals
 from uncertain_lti.recordings.table_text import QUALITY, rated
 from uncertain_lti.recordings.table_times import called_time, may_be
 from uncertain_lti.sampling.steady_state import codes, shared_codes
-from uncertain_lti.sampling.transient import Transient
-from uncertain_lti.signals.field_path import FieldPath, Memory
+from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.values import TABLE, TableLayout
 
 LONGEST_ARRAY = 35
@@ -490,13 +483,7 @@ def propose(
     BagError
         A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
-    layout = table or TableLayout()
-    bags = group_recordings(list(paths), layout=layout)
-    if not bags:
-        raise BagError("no recording is named; give at least one file or folder")
-    if not layout.runs and (runs := run_column(bags)):
-        layout = replace(layout, runs=runs)
-        bags = group_recordings(list(paths), layout=layout)
+    bags, layout = _recordings(paths, table or TableLayout())
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
@@ -508,15 +495,8 @@ def propose(
         few = "few rows, or no two in a row, have a number of"
         warnings.append(f"{few} {shortlist(rare, 4)}; where it holds until the next one, {_FILL}")
     one_topic = len({s.topic for s in sources}) == 1  # whose rows hold every column
-    if not (states or controls or like) and one_topic and is_plant(sources):  # names are those of the columns
-        chosen, used = plant_signals(sources)
-        if not chosen:
-            raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
-        if all(c.why.startswith((ALWAYS, WEATHER)) for c in used):
-            load = "what loads the machine, such as a power that others draw, is a control: move its line to `controls`"
-            warnings.append(f"nothing in it is set or switched; {load}")
-        text = signals_file(bags, sources, chosen, used, "", layout=layout, plant=True)
-        return Proposal(tuple(chosen), tuple(used), text, tuple(warnings))
+    if not (states or controls or like) and one_topic and is_plant(sources):
+        return _of_plant(bags, sources, warnings, layout)
     if states or controls:
         ask_for(sources, states, controls, str(bags[0].path))
     switches = [] if controls else take_switches(sources)
@@ -525,13 +505,7 @@ def propose(
     sources += [s for s in [*commands, *measured] if s not in sources]  # columns of a table
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
-        why = [f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]]
-        reasons = "; ".join(dict.fromkeys([*why, *warnings[:3]]))
-        nothing = f"{bags[0].path}: nothing in it looks like the state of a machine ({reasons or 'no topics'})"
-        if any(_APART in s.reason for s in sources):
-            raise BagError(f"{nothing}; give recordings of one machine, with the same topics and columns")
-        named = "name the topics of its states in `uncertain-lti init --states`"
-        raise BagError(f"{nothing}; record the machine at work, and longer, or {named}")
+        raise BagError(f"{bags[0].path}: {_nothing(sources, warnings)}")
     chosen, doubt = choose(measured, commands, like, bool(states))
     doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
@@ -552,14 +526,10 @@ def propose(
     if not commands:
         unread = (s for s in sources if s.role == "control" and s.unreadable)
         warnings += [f"{s.topic} is a command by its name, and cannot be read: {s.reason}" for s in unread]
-    for topic in (s.topic for s in sources if s.role == "control"):
-        lacking = [str(bag.path) for bag in bags if not _messages(bag, topic)]
-        if 0 < len(lacking) < len(bags):
-            without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
-            warnings.append(f"{without}, so it is no control; leave those recordings out")
+    warnings += _lacking(bags, [s.topic for s in sources if s.role == "control"])
     members = all_of_them(chosen, used, moving)
     try:
-        memories = _memories(chosen, used)
+        memories = memory_lines(chosen, used)
     except ModuleNotFoundError as error:  # all but this needs no solver
         memories = []
         warnings.append(f"what lies further back was not tried: {absent(error.name) or error}")
@@ -567,33 +537,43 @@ def propose(
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
 
 
-def _memories(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[str]:
-    """Lines of what narrows the envelope of the proposed states on left-out data, and of how fast wheels turned."""
-    group, clock = [*states, *controls], clock_of(states)
-    names, n, transients = [c.name for c in group], len(states), []
-    for number, z in enumerate(columns_of(states, controls)):
-        if len(z) < FEWEST:
-            continue
-        z = np.column_stack([earlier(column, c.delay) for column, c in zip(z.T, group, strict=True)])
-        z = (z - [c.steady for c in group]) / [c.scale or 1.0 for c in group]
-        t, _ = clock.instants(clock, number)
-        with suppress(TransientError):
-            transients.append(Transient(t, z[:, :n], z[:, n:], state_names=names[:n], control_names=names[n:]))
-    if not transients:
-        return []
-    on = endless(states, controls)
-    if chosen := tuple(Remembered(c.name, Memory("rate")) for c in on if of_wheel(c)):
-        gain = "how fast it turned"
-    else:
-        chosen, width = choose_memories(transients, "noise")
-        gain = f"with it, mean width x {width:.2g} on left-out data"
-    lines = ["  # known before the step, so without a row of its own and without a verdict"] if chosen else []
-    for one in chosen:
-        of = group[names.index(one.of)]
-        one = replace(one, memory=Memory("rate")) if of in on else one  # what it was alone says nothing
-        memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
-        steady = of.steady if memory.kind == "lag" else 0.0
-        path, unit = memory.of(of.path), memory.unit(of.unit)
-        recalled = replace(of, name=one.name, path=path, steady=steady, unit=unit, delay=0)
-        lines.append(entry(recalled, comment=gain))
-    return lines
+def _recordings(paths: Sequence[str | os.PathLike[str]], layout: TableLayout) -> tuple[list[Recording], TableLayout]:
+    bags = group_recordings(list(paths), layout=layout)
+    if not bags:
+        raise BagError("no recording is named; give at least one file or folder")
+    if not layout.runs and (runs := run_column(bags)):
+        layout = replace(layout, runs=runs)
+        bags = group_recordings(list(paths), layout=layout)
+    return bags, layout
+
+
+def _of_plant(
+    bags: Sequence[Recording], sources: Sequence[Source], warnings: Sequence[str], layout: TableLayout
+) -> Proposal:
+    chosen, used = plant_signals(sources)  # named as their columns
+    if not chosen:
+        raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
+    text = signals_file(bags, sources, chosen, used, "", layout=layout, plant=True)
+    told = []
+    if all(c.why.startswith((ALWAYS, WEATHER)) for c in used):
+        load = "what loads the machine, such as a power that others draw, is a control: move its line to `controls`"
+        told.append(f"nothing in it is set or switched; {load}")
+    return Proposal(tuple(chosen), tuple(used), text, (*warnings, *told))
+
+
+def _nothing(sources: Sequence[Source], warnings: Sequence[str]) -> str:
+    why = [f"{s.topic}: {s.reason or 'a command by its name'}" for s in sources[:8]]
+    reasons = "; ".join(dict.fromkeys([*why, *warnings[:3]]))
+    nothing = f"nothing in it looks like the state of a machine ({reasons or 'no topics'})"
+    if any(_APART in s.reason for s in sources):
+        return f"{nothing}; give recordings of one machine, with the same topics and columns"
+    named = "name the topics of its states in `uncertain-lti init --states`"
+    return f"{nothing}; record the machine at work, and longer, or {named}"
+
+
+def _lacking(bags: Sequence[Recording], commands: Sequence[str]) -> Iterator[str]:
+    for topic in commands:
+        lacking = [str(bag.path) for bag in bags if not _messages(bag, topic)]
+        if 0 < len(lacking) < len(bags):
+            without = f"{topic} looks like a command and is not in {shortlist(lacking, 3)}"
+            yield f"{without}, so it is no control; leave those recordings out"

@@ -16,6 +16,7 @@ import math
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from itertools import chain, count, zip_longest
 from types import MappingProxyType
@@ -23,13 +24,27 @@ from types import MappingProxyType
 import numpy as np
 
 from uncertain_lti.base.arrays import LARGEST, Array
+from uncertain_lti.base.errors import TransientError
 from uncertain_lti.base.text import printable, shortlist
-from uncertain_lti.proposal.candidates import OF_QUATERNION, SHOWS, Candidate, Source, Steps, clock_of, held, steps_of
+from uncertain_lti.proposal.candidates import (
+    FEWEST,
+    OF_QUATERNION,
+    SHOWS,
+    Candidate,
+    Source,
+    Steps,
+    clock_of,
+    earlier,
+    held,
+    steps_of,
+)
+from uncertain_lti.proposal.tune import Remembered, choose_memories
 from uncertain_lti.recordings.recording import Recording
 from uncertain_lti.sampling.clock import coarse_ns, even_ns, longest_pause
 from uncertain_lti.sampling.reading import of_another_clock
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath
+from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.signals.field_path import FUNCTIONS, FieldPath, Memory
 from uncertain_lti.signals.signal_map import Signal
 from uncertain_lti.signals.values import CHOICES_TEXT, TableLayout, of_table
 
@@ -205,11 +220,51 @@ def longest_hold(source: Source, clock: Source) -> tuple[float | None, str]:
     return next(f * power for f in (1, 2, 5, 10) if f * power >= limit), "s; older ones have ended"
 
 
+def memory_lines(states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[str]:
+    """Lines of what narrows the envelope of the proposed states on left-out data, and of how fast wheels turned."""
+    group, clock = [*states, *controls], clock_of(states)
+    names, n, transients = [c.name for c in group], len(states), []
+    for number, z in enumerate(columns_of(states, controls)):
+        if len(z) < FEWEST:
+            continue
+        z = np.column_stack([earlier(column, c.delay) for column, c in zip(z.T, group, strict=True)])
+        z = (z - [c.steady for c in group]) / [c.scale or 1.0 for c in group]
+        t, _ = clock.instants(clock, number)
+        with suppress(TransientError):
+            transients.append(Transient(t, z[:, :n], z[:, n:], state_names=names[:n], control_names=names[n:]))
+    if not transients:
+        return []
+    on = endless(states, controls)
+    if chosen := tuple(Remembered(c.name, Memory("rate")) for c in on if of_wheel(c)):
+        gain = "how fast it turned"
+    else:
+        chosen, width = choose_memories(transients, "noise")
+        gain = f"with it, mean width x {width:.2g} on left-out data"
+    lines = ["  # known before the step, so without a row of its own and without a verdict"] if chosen else []
+    for one in chosen:
+        of = group[names.index(one.of)]
+        one = replace(one, memory=Memory("rate")) if of in on else one  # what it was alone says nothing
+        memory = one.memory if not of.delay else Memory("lag", of.delay + one.memory.samples)
+        steady = of.steady if memory.kind == "lag" else 0.0
+        path, unit = memory.of(of.path), memory.unit(of.unit)
+        recalled = replace(of, name=one.name, path=path, steady=steady, unit=unit, delay=0)
+        lines.append(entry(recalled, comment=gain))
+    return lines
+
+
 _LONGEST_LINE = 1 << 20  # letters
 _ADDITIVE = f"# The further term that measured data needs: {CHOICES_TEXT}; compare the widths they give."
 
 
 _OPEN = TableLayout()
+_SCALES = (
+    "# steady: median over the longest stretch in which nothing moves; scale: the largest such",
+    "# magnitude, or the range where that is small. Both in recorded units.",
+)
+_SCALES_OF_PLANT = (
+    "# Process data: every measurement is judged. fit takes the medians as steady states, where they",
+    "# see clearly smaller faults. scale: range, in recorded units.",
+)
 
 
 def signals_file(
@@ -218,8 +273,7 @@ def signals_file(
     layout: TableLayout = _OPEN, plant: bool = False,
 ) -> str:  # fmt: skip
     """Write the text of the file."""
-    topics = {c.topic: c.source for c in [*states, *controls]}
-    clock, around = clock_of(states), endless(states, controls)
+    around = endless(states, controls)
     lines = [
         "# Proposed by `uncertain-lti init`; read it, and edit it. From:",
         *_recordings(bags),
@@ -227,13 +281,39 @@ def signals_file(
         "# it is commanded. Then: uncertain-lti fit BAG... --signals THIS_FILE --output machine.model.json",
         "",
         *([] if plant else [_ADDITIVE, f"additive: {'both' if any(map(of_wheel, around)) else 'noise'}", ""]),
+        *_sample_times(bags, states, controls),
+        *_of_table(layout),
+        "",
+        *(_SCALES_OF_PLANT if plant else _SCALES),
+        *([f"# Beware: {doubt}."] if doubt else []),
     ]
+    if any(c.ignore for c in [*states, *controls]):
+        said = "numbers that stand for no value, as they lie far from all others; they count as missing."
+        lines.append(f"# ignore: {said}")
+    ready = [c for s in sources for c in s.candidates if c.ready]
+    lines += ["states:", *(entry(c, comment=c.why) for c in states), *memories]
+    lines += [entry(c, comment=c.reason, out=True) for c in ready if c.ready == "state"]
+    lines += _of_controls(controls, [c for c in ready if c.ready == "control"], None if plant else clock_of(states))
+    proposed = {*states, *controls, *(c for alike in members.values() for c in alike)}
+    if left_out := _left_out(sources, proposed):
+        lines += ["", "# Not proposed, and why:", *left_out]
+    if members:
+        lines = for_members(lines, states[0].element, members)
+    elif around:
+        lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle is or heads for."]
+        lines.append("structure:")
+        lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
+    return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
+
+
+def _sample_times(bags: Sequence[Recording], states: Sequence[Candidate], controls: Sequence[Candidate]) -> list[str]:
+    topics, clock = {c.topic: c.source for c in [*states, *controls]}, clock_of(states)
     offsets = [source.offset or 0.0 for source in topics.values()]  # log time where there is no stamp
     by_arrival = any(source.halting for source in topics.values()) or max(offsets) - min(offsets) > 1.0
     instants = clock.arrival if by_arrival else [clock.instants(clock, k)[0] for k in range(len(clock.arrival))]
     by_them = replace(clock, arrival=instants)
     period = even_ns(clock.stamp) if by_arrival and clock.stamped and not clock.halting else None
-    lines += [
+    lines = [
         f"# Its messages define the sample instants: {by_them.rate:.4g} a second.",
         f"clock: {_quoted(clock.topic)}",
     ]
@@ -245,54 +325,37 @@ def signals_file(
         lines += [
             "",
             "# They arrive by another clock than that of their stamps, as of a simulation, by which they come",
+            "# evenly.",
+            f"step: {period * 1e-9:g}",
         ]
-        lines += ["# evenly.", f"step: {period * 1e-9:g}"]
     elif unit := coarse_ns(instants):
         lines += ["", f"# Its stamps are rounded to {unit * 1e-9:g} s, and its samples come evenly.", "step: constant"]
     if by_arrival:
         lines += ["", "# Not all header stamps move, are in each recording and of one clock: times of arrival"]
-        lines.append("# serve for all.")
-        lines += ["topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
-    if table := layout.to_dict():
-        lines += ["", "# Columns of the time and of the runs, each value of which is a recording; or the"]
-        lines.append("# seconds from row to row.")
-        texts = {key: _number(v, exact=True) if key == "step" else _quoted(v) for key, v in table.items()}
-        lines += ["table:", *(f"  {key}: {text}" for key, text in texts.items())]
-    if plant:
-        lines += ["", "# Process data: every measurement is judged. fit takes the medians as steady states, where they"]
-        lines.append("# see clearly smaller faults. scale: range, in recorded units.")
-    else:
-        lines += ["", "# steady: median over the longest stretch in which nothing moves; scale: the largest such"]
-        lines.append("# magnitude, or the range where that is small. Both in recorded units.")
-    lines += [f"# Beware: {doubt}."] if doubt else []
-    if any(c.ignore for c in [*states, *controls]):
-        said = "numbers that stand for no value, as they lie far from all others; they count as missing."
-        lines.append(f"# ignore: {said}")
-    ready = [c for s in sources for c in s.candidates if c.ready]
-    lines += ["states:", *(entry(c, comment=c.why) for c in states), *memories]
-    lines += [entry(c, comment=c.reason, out=True) for c in ready if c.ready == "state"]
-    if controls:
-        lines += ["", "controls:"]
-        if any(c.source.role == "guess" for c in controls):
-            lines.append("  # by correlation alone: nothing is called a command here")
-        if any(c.delay for c in controls):
-            lines.append("  # delay: number of samples by which the states follow later")
-        for candidate in [*controls, *(c for c in ready if c.ready == "control")]:
-            limit, why = (None, candidate.why) if plant else longest_hold(candidate.source, clock)
-            lines.append(entry(candidate, limit, candidate.reason or why, out=bool(candidate.ready)))
-    else:
-        lines += ["", "# No command can be used. Without controls the envelope must cover what they do."]
-        lines.append("controls: []")
-    proposed = {*states, *controls, *(c for alike in members.values() for c in alike)}
-    if left_out := _left_out(sources, proposed):
-        lines += ["", "# Not proposed, and why:", *left_out]
-    if members:
-        lines = for_members(lines, states[0].element, members)
-    elif around:
-        lines += ["", "# Nothing depends on how many turns there were, or on where a vehicle is or heads for."]
-        lines.append("structure:")
-        lines += [f'  - {{state: "*", from: {_quoted(c.name)}, nominal: 0, half_width: 0}}' for c in around]
-    return "\n".join(printable(line, _LONGEST_LINE) for line in lines) + "\n"  # names may hold line breaks
+        lines += ["# serve for all.", "topics:", *(f"  {_quoted(t)}: {{time: log}}" for t in topics)]
+    return lines
+
+
+def _of_table(layout: TableLayout) -> list[str]:
+    if not (table := layout.to_dict()):
+        return []
+    texts = {key: _number(v, exact=True) if key == "step" else _quoted(v) for key, v in table.items()}
+    said = ["", "# Columns of the time and of the runs, each value of which is a recording; or the"]
+    return [*said, "# seconds from row to row.", "table:", *(f"  {key}: {text}" for key, text in texts.items())]
+
+
+def _of_controls(controls: Sequence[Candidate], further: Sequence[Candidate], clock: Source | None) -> list[str]:
+    if not controls:
+        return ["", "# No command can be used. Without controls the envelope must cover what they do.", "controls: []"]
+    lines = ["", "controls:"]
+    if any(c.source.role == "guess" for c in controls):
+        lines.append("  # by correlation alone: nothing is called a command here")
+    if any(c.delay for c in controls):
+        lines.append("  # delay: number of samples by which the states follow later")
+    for candidate in [*controls, *further]:
+        limit, why = longest_hold(candidate.source, clock) if clock else (None, candidate.why)
+        lines.append(entry(candidate, limit, candidate.reason or why, out=bool(candidate.ready)))
+    return lines
 
 
 def _recordings(bags: Sequence[Recording]) -> list[str]:

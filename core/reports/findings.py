@@ -44,8 +44,6 @@ from uncertain_lti.reports.model_text import blocks_in_words, detectable_data, d
 
 CAUTION_WIDTH, TOO_WIDE = 0.25, 0.5
 """Mean width of the one-step bounds as a share of the state's own range, in the recordings or in the fit."""
-RUNS_AWAY = 1.2
-"""Spectral radius of the nominal recursion from which on it says little of the machine even for a few steps."""
 CAUTION_INSIDE, TOO_FEW_INSIDE = 0.99, 0.9
 """Share of the verdicts on left-out recordings that lie inside all bounds."""
 OUTSIDE_DOMAIN, WITHOUT_VERDICT = 0.05, 0.2
@@ -235,16 +233,11 @@ def _messages(model: UncertainLTI) -> list[str]:
 
 
 def _fit_reasons(model: UncertainLTI) -> Reasons:
-    messages = _messages(model)
-    for message in messages:  # widths and the blocks of a schedule have reasons of their own below
+    for message in _messages(model):  # widths and the blocks of a schedule have reasons of their own below
         if not message.startswith(("the bounds are over", "the block at")) and CONSTANT not in message:
             yield CARE, "fit", message
     if not model.fit_summary:
         yield CARE, "fit", "the model file does not say how it was fitted"
-    radius = model.spectral_radius() if model.sampling.dt_median is not None else 0.0
-    if RUNS_AWAY < radius < math.inf and not any("spectral radius" in message for message in messages):
-        grows = f"a deviation can grow {number(radius)} times in a step (spectral radius)"
-        yield CARE, "stability", f"the nominal model runs away: {grows}"
 
 
 def _regime_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]]) -> Reasons:
