@@ -512,39 +512,17 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     left = f"; no verdict or not used: {', '.join(data['no_verdict'])}" if data["no_verdict"] else ""
     samples = f"{plural(data['samples'], 'sample')}, {plural(data['verdicts'], 'verdict')}"
     blocks.append(f"{data['recording']}: {samples}, {inside}{left}")
-    rows = []
-    for name, s in data["states"].items():
-        counts = [str(s["violations"]), share(s["inside"]), number(s["mean_width"]), share(s["width_to_range"], 2)]
-        worst = beyond(s["worst"]["utilisation"]) if s["violations"] else "-"
-        when = "-" if s["first_violation"] is None else instant_text(s["first_violation"])
-        rows.append([named(name, s["unit"]), *counts, when, worst])
-    header: Sequence[str] = ("state", "violations", "inside", "mean width", "width/range", "first", "worst")
-    blocks.append(Table(header, rows, most=200))
-    if data["horizons"]:
-        rows = []
-        for h in data["horizons"]:
-            gone = [(s["first"]["t"], name) for name, s in h["states"].items() if s["first"] is not None]
-            first, where = (f"{min(gone)[0]:.4f} s", min(gone)[1]) if gone else ("-", "-")
-            rows.append([str(h["steps"]), str(h["windows"]), share(h["inside"]), first, where])
-        blocks.append(Table(("steps", "windows", "inside", "first outside", "state"), rows))
-    visited = [r for r in data["regimes"] if r["verdicts"]]
-    if visited and len(data["regimes"]) > 1:
-        header = ("regime", "verdicts", "inside", "unknown", *(f"{name}: mean width" for name in data["states"]))
-        rows = []
-        for r in visited:
-            widths = [number(state["mean_width"]) for state in r["states"].values()]
-            rows.append([r["regime"], str(r["verdicts"]), share(r["inside"]), str(r["unknown_regime"]), *widths])
-        blocks.append(Table(header, rows))
+    blocks += _tables(data)
     if data["verdicts"]:
-        where = "" if data["beyond"] in data["reason"] else f": {data['beyond']}"
+        where = f": {data['beyond']}" * (data["beyond"] not in data["reason"])
         blocks.append(f"outside the fitted domain: {data['outside_domain_share']:.2%} of the verdicts{where}")
         if data["unknown_regime"]:
-            unknown = data["unknown_regime"] / data["verdicts"]
-            blocks.append(f"unknown regime: {unknown:.2%} of the verdicts, which nothing vouches for")
+            often = f"{data['unknown_regime'] / data['verdicts']:.2%}"
+            blocks.append(f"unknown regime: {often} of the verdicts, which nothing vouches for")
     blocks += [f"  {text}" for text in data["unknown"]]
-    jumps = [j for s in data["states"].values() if (j := s["jump"]) is not None]
-    jumps.sort(key=lambda j: j["largest_in_fit"] / abs(j["change"]))
-    blocks += _first([f"{j['text']} at {instant_text(j)}" for j in jumps], "jump")
+    jumps = filter(None, (s["jump"] for s in data["states"].values()))
+    by_size = sorted(jumps, key=lambda j: j["largest_in_fit"] / abs(j["change"]))
+    blocks += _first([f"{j['text']} at {instant_text(j)}" for j in by_size], "jump")
     frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
     blocks += _first(frozen, "frozen repeat")
     rest = "as of a machine at rest: the model does not move it"
@@ -552,20 +530,47 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     blocks += _first([f"warning: {text}, {moved or rest}" for text, moved in longest], "warning")
     told = [f"the alarm from {instant_text(like)} {like['text']}" for like in data["explained"] if like["text"]]
     blocks += _first(told, "alarm")
+    return [*blocks, *_alarms(data)]
+
+
+def _tables(data: Mapping[str, Any]) -> Iterator[Table]:
+    rows = []
+    for name, s in data["states"].items():
+        counts = [str(s["violations"]), share(s["inside"]), number(s["mean_width"]), share(s["width_to_range"], 2)]
+        worst = beyond(s["worst"]["utilisation"]) if s["violations"] else "-"
+        when = "-" if s["first_violation"] is None else instant_text(s["first_violation"])
+        rows.append([named(name, s["unit"]), *counts, when, worst])
+    yield Table(("state", "violations", "inside", "mean width", "width/range", "first", "worst"), rows, most=200)
+    if data["horizons"]:
+        rows = []
+        for h in data["horizons"]:
+            gone = [(s["first"]["t"], name) for name, s in h["states"].items() if s["first"] is not None]
+            first, where = (f"{min(gone)[0]:.4f} s", min(gone)[1]) if gone else ("-", "-")
+            rows.append([str(h["steps"]), str(h["windows"]), share(h["inside"]), first, where])
+        yield Table(("steps", "windows", "inside", "first outside", "state"), rows)
+    if len(data["regimes"]) > 1 and (visited := [r for r in data["regimes"] if r["verdicts"]]):
+        header = ("regime", "verdicts", "inside", "unknown", *(f"{name}: mean width" for name in data["states"]))
+        rows = []
+        for r in visited:
+            widths = [number(state["mean_width"]) for state in r["states"].values()]
+            rows.append([r["regime"], str(r["verdicts"]), share(r["inside"]), str(r["unknown_regime"]), *widths])
+        yield Table(header, rows)
+
+
+def _alarms(data: Mapping[str, Any]) -> Iterator[str]:
     if alarms := data["alarms"]:
         longest_alarm = max(alarms, key=lambda alarm: alarm["seconds"])
         heads = [(f"ALARM: raised {times(len(alarms))}, first at", alarms[0]), ("  the longest at", longest_alarm)]
         for head, alarm in heads[: 1 + (longest_alarm is not alarms[0])]:
             by = ", ".join(raised_by(alarm)[:MOST_SHOWN])
-            blocks += [f"{head} {_when(alarm)}", *[f"  raised by {by}"] * bool(by)]
+            yield from [f"{head} {_when(alarm)}", *[f"  raised by {by}"] * bool(by)]
         if (far := data["farthest"]) and far["k"] not in {alarm["k"] for _, alarm in heads}:
-            blocks.append(f"  the largest: {far['words']}, at {instant_text(far)}")
-        blocks += [f"  {text}, and fit again" for text in data["jitter"]]
+            yield f"  the largest: {far['words']}, at {instant_text(far)}"
+        yield from (f"  {text}, and fit again" for text in data["jitter"])
     elif data["verdicts"]:
-        near = data["farthest"]
-        blocks += [f"nearest to an alarm: {near['words']}, at {instant_text(near)}"] if near else []
-        blocks.append("no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown"))
-    return blocks
+        if near := data["farthest"]:
+            yield f"nearest to an alarm: {near['words']}, at {instant_text(near)}"
+        yield "no alarm" + ", which says nothing: see the first line" * (data["outcome"] == "unknown")
 
 
 def _when(alarm: Mapping[str, Any]) -> str:
