@@ -380,31 +380,9 @@ def find_column(path: object, wanted: str, columns: Sequence[str], what: str) ->
 
 
 def _shape(path: Path, lines: Sequence[str]) -> _Shape:
-    """Find the delimiter with which most lines have as many values as each other, and the first line of data."""
-    if all(re.fullmatch(r'\s*("[^"]*[,;\t][^"]*"\s*)?', line) for line in lines) and any(map(str.strip, lines)):
-        raise BagError(f"{path}: each line is in quotes as a whole, and so one cell; take them off the lines' two ends")
-    best: tuple[float, int, int, str] | None = None  # how well it fits, cells, - first line, delimiter
-    for delimiter in (*_DELIMITERS, " "):
-        if delimiter == " " and best:
-            break  # within cells
-        split = [_split(line, delimiter) for line in lines]
-        fits: dict[int, float] = {}  # lines of each number of cells, as far as they hold values
-        for cells in split:
-            if len(cells) > 1 and any(map(_is_value, cells)):
-                share = sum(_is_value(c) or c.lower() in _MISSING for c in cells) / len(cells)
-                fits[len(cells)] = fits.get(len(cells), 0.0) + share
-        for wide, fit in fits.items():
-            begin = next(i for i, c in enumerate(split) if len(c) == wide and any(map(_is_value, c)))
-            candidate = (fit, wide, -begin, delimiter)
-            best = max(best, candidate) if best else candidate
-    if best is None:
-        alone = any(_is_value(line.strip()) for line in lines)
-        kind = "one column only" if alone else "no line of numbers"
-        remedy = "put the columns of a recording side by side in one file" if alone else "check the file"
-        raise BagError(f"{path}: there is {kind} in it, and a table has a column of time and others; {remedy}")
-    _, wide, begin, delimiter = best
+    delimiter, wide, first = _delimited(path, lines)
     split = [_split(line, delimiter) for line in lines]
-    first, begin = -begin, _below_names(split, wide, -begin)
+    begin = _below_names(split, wide, first)
     if wide > _MOST_COLUMNS:
         raise BagError(f"{path}: has {wide} columns, more than {_MOST_COLUMNS}; write those that are needed")
     in_spaces = [line.split() for line in lines[begin:] if delimiter == " " and line.strip()]
@@ -440,6 +418,33 @@ def _shape(path: Path, lines: Sequence[str]) -> _Shape:
     many = [i for i in lines_of_names if 2 * kinds[i] > wide] or lines_of_names[:1]
     chosen = next((i for i in many if any(map(_TIME.match, above[i]))), many[0])  # of as many words may be a title
     return _Shape(delimiter, begin, tuple(above[chosen]), tuple(*above[chosen + 1 : chosen + 2]))
+
+
+def _delimited(path: Path, lines: Sequence[str]) -> tuple[str, int, int]:
+    """The delimiter with which most lines have as many values as each other, how many, and the first line of data."""
+    if all(re.fullmatch(r'\s*("[^"]*[,;\t][^"]*"\s*)?', line) for line in lines) and any(map(str.strip, lines)):
+        raise BagError(f"{path}: each line is in quotes as a whole, and so one cell; take them off the lines' two ends")
+    best: tuple[float, int, int, str] | None = None  # how well it fits, cells, - first line, delimiter
+    for delimiter in (*_DELIMITERS, " "):
+        if delimiter == " " and best:
+            break  # within cells
+        split = [_split(line, delimiter) for line in lines]
+        fits: dict[int, float] = {}  # lines of each number of cells, as far as they hold values
+        for cells in split:
+            if len(cells) > 1 and any(map(_is_value, cells)):
+                share = sum(_is_value(c) or c.lower() in _MISSING for c in cells) / len(cells)
+                fits[len(cells)] = fits.get(len(cells), 0.0) + share
+        for wide, fit in fits.items():
+            begin = next(i for i, c in enumerate(split) if len(c) == wide and any(map(_is_value, c)))
+            candidate = (fit, wide, -begin, delimiter)
+            best = max(best, candidate) if best else candidate
+    if best is None:
+        alone = any(_is_value(line.strip()) for line in lines)
+        kind = "one column only" if alone else "no line of numbers"
+        remedy = "put the columns of a recording side by side in one file" if alone else "check the file"
+        raise BagError(f"{path}: there is {kind} in it, and a table has a column of time and others; {remedy}")
+    _, wide, begin, delimiter = best
+    return delimiter, wide, -begin
 
 
 _TIME = re.compile(r"(?i)(t|time|date|zeit|tiempo|temps)\b")
