@@ -21,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import BagError, FitError, SignalError
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep
@@ -175,29 +176,18 @@ def fit_archive(
     scheduled = scheduled_by(schedule, signals)
     regimes = None if scheduled is None else Regimes.of(scheduled, signals)
     fleet: Fleet
+    dt = None
     if client is not None:
         # whether Δt is constant decides what is identifiable, and must be one answer for all partitions
         constant = additive == "both" and all(visit("steps of", _constant_dt, signals))
         columns = Columns.of(additive, constant, regimes)
         tasks = [(load, (recording, signals, columns)) for recording in recordings]
         fleet = on_workers = DaskFleet(client, tasks, counting("reading"))
-        counts, dt, named = fleet.counts, None, [recordings[number] for number in on_workers.kept]
+        counts, named = fleet.counts, [recordings[number] for number in on_workers.kept]
     else:
         assert cache is not None
-        counts, steps, named = [], [], recordings
-
-        def problems() -> Iterator[Problem]:
-            for number, recording in enumerate(recordings, start=1):
-                counting(f"reading {recording[0]}")(number)
-                problem = load(recording, signals, Columns(regimes=regimes))
-                counts.append(problem.N)
-                steps.append(problem.dt)
-                yield problem
-
-        partition = write_cache(cache, problems())
-        dt = np.concatenate(steps)
-        columns = Columns.of(additive, is_constant(dt), regimes)
-        fleet = Fleet([replace(partition, columns=columns)])
+        fleet, counts, dt = _cached(cache, recordings, signals, additive, regimes, counting)
+        named = recordings
     starts = np.concatenate([[0], np.cumsum(counts)])
 
     def where(index: int) -> str:
@@ -224,6 +214,25 @@ def fit_archive(
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
     return with_repeats(model.replace(fit_summary=facts), visit("repeats in", repeats, model))
+
+
+def _cached(
+    cache: str | os.PathLike[str], recordings: Sequence[Recording], signals: SignalMap, additive: Additive,
+    regimes: Regimes | None, counting: Callable[[str], Callable[[int], None]],
+) -> tuple[Fleet, list[int], Array]:  # fmt: skip
+    counts, steps = list[int](), list[Array]()  # transitions of each recording; steps, s
+
+    def problems() -> Iterator[Problem]:
+        for number, recording in enumerate(recordings, start=1):
+            counting(f"reading {recording[0]}")(number)
+            problem = load(recording, signals, Columns(regimes=regimes))
+            counts.append(problem.N)
+            steps.append(problem.dt)
+            yield problem
+
+    partition = write_cache(cache, problems())
+    dt = np.concatenate(steps)
+    return Fleet([replace(partition, columns=Columns.of(additive, is_constant(dt), regimes))]), counts, dt
 
 
 def refuse_auto(signals: SignalMap) -> None:
