@@ -151,6 +151,17 @@ def test_what_looks_like_the_end_is_not_while_chunks_follow(tmp_path, opcode):
     assert bag.topics["/a"].count == 40 and any("damaged" in warning for warning in bag.warnings)
 
 
+@pytest.mark.parametrize("indexed", [True, False])
+def test_a_chunk_inside_a_chunk_is_told(tmp_path, indexed):
+    """Its messages were lost without a word."""
+    outer = chunk_record(DEFINED + said(3) + chunk_record(said(4, begin=3)) + said(2, begin=7), "zstd")
+    index = DEFINED + statistics_record({1: 5}, 1) + chunk_index(len(raw_file()), outer, compression="zstd")
+    bag = Bag(save(tmp_path / "nested.mcap", raw_file(outer, summary=index)), indexed=indexed)
+    assert read_stream(bag, SIGNALS).values[0][:, 0].tolist() == [0.0, 1.0, 2.0, 7.0, 8.0]
+    (warning,) = bag.warnings
+    assert warning.startswith(f"{bag.path}: 1 chunk inside other chunks left out with all messages in it")
+
+
 def test_chunks_that_lie_in_each_other_are_walked(tmp_path):
     """An index that has one chunk inside another: going by it and walking the file read different messages."""
     other = Topic("/b")

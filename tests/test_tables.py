@@ -9,10 +9,12 @@
 
 """Tables as recordings: the bits that the same data gives in MCAP, headers and times of every kind, and bad files."""
 
+import io
 import math
 import random
 import re
 import warnings
+import zipfile
 from datetime import datetime, timedelta
 from decimal import Decimal
 from pathlib import Path
@@ -543,6 +545,15 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
 # --- bad and hostile files --------------------------------------------------------------------------------------
 
 
+def states_rows(number):
+    """A .npz file whose only array states so many rows and has none."""
+    buffer, header = io.BytesIO(), io.BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "<f8", "fortran_order": False, "shape": (number,)})
+    with zipfile.ZipFile(buffer, "w") as archive:
+        archive.writestr("t.npy", header.getvalue())
+    return buffer.getvalue()
+
+
 @pytest.mark.parametrize(
     ("name", "data", "words"),
     [
@@ -571,6 +582,7 @@ def test_a_column_that_is_not_there_names_file_and_columns(tables, tmp_path):
         ("a.mf4", b"MDF     4.10    ", r"a measurement of CAN and the like \(MDF\); write its signals"),
         ("1.BIN", b"\xa3\x95\x80\x80", "a log of ArduPilot; write its messages as .csv"),
         ("a.npz", b"PK\x03\x04nothing", "is damaged or no .npz file"),
+        ("a.npz", states_rows(10**15), "needs more memory than there is .*; copy it again"),
         ("a.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "is damaged or no .mat file|holds no column"),
         ("a.mat", b"MATLAB 7.3 MAT-file" + bytes(200), r"save\('a.mat', '-v7'\)"),
     ],

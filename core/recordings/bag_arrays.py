@@ -236,7 +236,7 @@ def _messages(data: bytearray, ends: Sequence[int], wanted: NDArray[np.bool_], c
         records = walk_records(data, begin, end, left if contents.indexed else end - begin)
         if contents.indexed:
             left -= records.number
-            if records.stop != end or records.short or records.late:
+            if records.stop != end or records.short or records.late or records.nested:
                 raise IndexMismatchError
             for definition in records.definitions:
                 _hold_against(contents, data, *definition)

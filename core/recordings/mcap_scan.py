@@ -109,7 +109,7 @@ class _Scanner:
         self.warned = Counter[str]()  # warnings of each kind
         self.chunk_warnings: list[str] = []
         self.damaged = False
-        self.odd_records = self.late = 0
+        self.odd_records = self.late = self.nested = 0
         self.records_left = most_records(size)  # in chunks
         self.bytes_left = most_inflated(size)
         self.definitions_left = _LARGEST_DEFINITIONS
@@ -136,6 +136,9 @@ class _Scanner:
         if self.odd_records:
             odd = count(self.odd_records, "record")
             self._warn(f"{odd} that cannot be read left out; the recorder or the disk damaged the file")
+        if self.nested:
+            within = "inside other chunks left out with all messages in it, as MCAP allows none there"
+            self._warn(f"{count(self.nested, 'chunk')} {within}; mend what wrote the file")
         if self.late:
             self._warn(f"{count(self.late, 'message')} past the year 2262 left out; the recorder's clock was wrong")
         if lost:
@@ -237,6 +240,7 @@ class _Scanner:
             self._definition(opcode, records[start:stop])
         self.odd_records += found.short
         self.late += found.late
+        self.nested += found.nested
 
     def _chunk(self, position: int, begin: int, content: bytes, cut: bool = False) -> None:
         """Take a chunk, or leave it out; what little a cut leaves of a chunk's beginning is reported with the cut."""

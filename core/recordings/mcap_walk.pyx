@@ -24,6 +24,7 @@ cdef enum:
     OPCODE_OF_SCHEMA = 3
     OPCODE_OF_CHANNEL = 4
     OPCODE_OF_MESSAGE = 5
+    OPCODE_OF_CHUNK = 6
 
 
 class Records(NamedTuple):
@@ -34,6 +35,7 @@ class Records(NamedTuple):
     definitions: list
     short: int
     late: int
+    nested: int
     number: int
     stop: int
 
@@ -41,7 +43,7 @@ class Records(NamedTuple):
 def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most, bint bare=False):
     """Whole records of block[begin:end], at most so many, until one that is cut or of opcode 0; if bare, until another."""
     cdef const uint8_t[::1] data = block
-    cdef Py_ssize_t at = begin, found = 0, number = 0, short = 0, late = 0
+    cdef Py_ssize_t at = begin, found = 0, number = 0, short = 0, late = 0, nested = 0
     cdef Py_ssize_t room = min(most, (end - begin) // (HEAD + MESSAGE_HEAD))
     places, times, channels = np.empty((2, room), np.int64), np.empty(room, np.uint64), np.empty(room, np.uint16)
     cdef long[:, ::1] place = places
@@ -65,6 +67,7 @@ def walk_records(block, Py_ssize_t begin, Py_ssize_t end, Py_ssize_t most, bint 
             place[0, found] = at + HEAD + MESSAGE_HEAD
             place[1, found] = at + HEAD + <Py_ssize_t>length
             found += 1 - (time[found] >> 63)
+        nested += data[at] == OPCODE_OF_CHUNK
         at += HEAD + <Py_ssize_t>length
     begins, ends = places[0, :found], places[1, :found]
-    return Records(channels[:found], times[:found], begins, ends, definitions, short, late, number, at)
+    return Records(channels[:found], times[:found], begins, ends, definitions, short, late, nested, number, at)

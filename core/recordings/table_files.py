@@ -35,6 +35,9 @@ def read_table(path: Path) -> RawTable:
         read: RawTable = _READERS[path.suffix.lower()](path)
     except OSError as error:
         raise os_error(path, error) from None
+    except MemoryError as error:  # that a damaged file asks for, or a long one needs
+        why = f" ({one_line(error)})" if str(error) else ""
+        raise BagError(f"{path}: needs more memory than there is{why}; copy it again, or give a shorter one") from None
     return read
 
 
