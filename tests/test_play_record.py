@@ -268,6 +268,20 @@ def test_log_times_are_those_of_a_simulated_clock_until_it_goes_back(world: Worl
     assert recorded == [5 * 10**9] * 2 + [6 * 10**9] * 4
 
 
+def test_a_simulated_clock_that_goes_back_by_little_is_told(world: World, tmp_path: Path) -> None:
+    clock, publisher = world.publisher(Clock, "/clock"), world.publisher(Float64, "/state")
+    process = recorder(world, ["/state"], tmp_path / "out.mcap", "--use-sim-time")
+    world.subscribed(clock, publisher)
+    for ns in (0, 5 * 10**8, 25 * 10**7, 75 * 10**7):
+        clock.publish(Clock(clock=Time(sec=5, nanosec=ns)))
+        publisher.publish(Float64())
+        time.sleep(0.1)
+    process.signal(signal.SIGINT)
+    assert "/clock went back by up to 0.25 s: log times stand still there" in process.succeed()
+    recorded = [m.log_time_ns - 5 * 10**9 for m in Bag(tmp_path / "out.mcap").raw_messages()]
+    assert recorded == [0, 5 * 10**8, 5 * 10**8, 75 * 10**7]
+
+
 def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     numbers = world.publisher(Float64, "/numbers")

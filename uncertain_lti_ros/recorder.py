@@ -79,6 +79,9 @@ def run(args: argparse.Namespace) -> Result:
             _record(life, subscriptions, file, taken, args.duration, step, args.progress.note)
         if taken.back:
             args.progress.note(taken.back)
+        if simulated and taken.fell_ns:
+            by = f"{CLOCK} went back by up to {taken.fell_ns * 1e-9:.2g} s"
+            args.progress.note(f"{by}: log times stand still there, and `check` may judge otherwise than a node")
         if not file.count:
             came = f"no message came on {', '.join(topics)}{f' after a time on {CLOCK}' * simulated}"
             raise BagError(f"{output}: not written, {came}; check who publishes")
@@ -174,12 +177,13 @@ class _InOrder:
     another; the live node puts that in order too.
 
     `clock`: gives log times, ns; None for the time of the system; `late`: how many came after others that were sent
-    over `LATE` later, and stayed so; `latest`: s at most; `back`: why nothing is taken any more, in words.
+    over `LATE` later, and stayed so; `latest`: s at most; `back`: why nothing is taken any more, in words; `fell_ns`:
+    by how much /clock went back at most where messages are taken all the same.
     """
 
     def __init__(self, file: _File, topics: Iterable[str], clock: Callable[[], int] | None) -> None:
         self._file, self._began_ns = file, time.time_ns()
-        self.clock, self._logged_ns, self.back = clock, 0, ""
+        self.clock, self._logged_ns, self.back, self.fell_ns = clock, 0, "", 0
         self._came, self._least = -math.inf, dict[str, float]()
         self._heard = dict.fromkeys(topics, -math.inf)
         self._waiting: CatchUp | None = None
@@ -196,7 +200,8 @@ class _InOrder:
             self.back = f"{CLOCK} went back {to}, so the recording ends there; record what follows to another file"
         if self.back or log_ns <= 0:  # no time has come on /clock
             return
-        self._logged_ns = log_ns
+        self.fell_ns = max(self.fell_ns, self._logged_ns - log_ns)
+        self._logged_ns = log_ns if self.clock is None else max(self._logged_ns, log_ns)
         self._file.began = self._file.began or now
         way = (taken_ns - sent_ns) * 1e-9 if sent_ns else 0.0
         if now - self._came > STALL and self._waiting is None:
