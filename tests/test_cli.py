@@ -251,7 +251,22 @@ def test_a_recording_of_one_robot_of_several_is_checked_below_its_prefix(folder,
 
     for prefix in ("/robot1", "robot1/"):
         assert judged(robot, "--topic-prefix", prefix) == judged(folder / "bad.mcap")
-    assert "is /robot1/engine/state meant?" in refused(cli, "check", folder / "m.model.json", robot)
+    said = refused(cli, "check", folder / "m.model.json", robot)
+    assert "is /robot1/engine/state meant?" in said and "with --remap /engine/state:=NAME" in said
+
+
+def test_a_recording_of_remapped_topics_is_checked_by_their_names_there(folder, tmp_path, cli):
+    """As the node hears it with `-r`, which acts below `topic_prefix`; a check could not be told so."""
+    plain, robot, name = Bag(folder / "bad.mcap"), tmp_path / "robot.mcap", {STATE_TOPIC: "/drives/all"}
+    topics = [Topic(name.get(topic, f"/r{topic}"), info.type) for topic, info in plain.topics.items()]
+    messages = [Message(name.get(m.topic, f"/r{m.topic}"), m.log_time_ns, bytes(m.data)) for m in plain.raw_messages()]
+    write(topics, messages).save(robot)
+    words, model = ["--enable", f"{STATE_TOPIC} position[fan_speed] > -100"], folder / "m.model.json"
+    moved = [*words, "--topic-prefix", "r", "--remap", f"/r{STATE_TOPIC}:=drives/all"]
+    (one,) = cli.json("check", model, robot, *moved, status=1)["recordings"]
+    (other,) = cli.json("check", model, folder / "bad.mcap", *words, status=1)["recordings"]
+    assert one["verdict_per_sample"] == other["verdict_per_sample"] and one["alarms"] == other["alarms"]
+    assert "--remap /x: it is not read; what is read is" in refused(cli, "check", model, robot, "--remap", "x:=y")
 
 
 def test_help_and_usage(capsys):

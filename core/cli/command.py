@@ -97,6 +97,13 @@ def _time(text: str) -> float:
     return seconds
 
 
+def _remap(text: str) -> tuple[str, str]:
+    topic, assigned, name = text.partition(":=")
+    if not (assigned and topic.strip("/") and name.strip("/")):
+        raise argparse.ArgumentTypeError(f"{text!r} does not read TOPIC:=NAME")
+    return f"/{topic.lstrip('/')}", f"/{name.lstrip('/')}"
+
+
 def _file(text: str) -> str:
     """A path that no command which it is handed on to takes for an option; an empty one would be this folder."""
     if not text:
@@ -200,6 +207,13 @@ OPTIONS: dict[str, dict[str, Any]] = {
         "PREFIX",
         default="",
     ),
+    "--remap": _takes(
+        "a topic of the model, below its prefix, has another name in the recording, as by -r of the node",
+        "TOPIC:=NAME",
+        type=_remap,
+        action="append",
+        default=[],
+    ),
     "--masked": _takes("states, separated by commas, that never raise the alarm", "STATES", default=""),
     "--enable": _takes(
         "no alarm unless this holds: TOPIC FIELD OPERATOR NUMBER, such as '/engine/mode data == 3'",
@@ -257,7 +271,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
 
 RULES = ("--rules", "--violations", "--window", "--margin")
 """Another rule of containment, or other rules, than the model's."""
-DEPLOYED = (*RULES, "--topic-prefix", "--masked", "--enable", "--grace", "--latch", "--from", "--to")
+DEPLOYED = (*RULES, "--topic-prefix", "--remap", "--masked", "--enable", "--grace", "--latch", "--from", "--to")
 """The rules of the alarm and when they are armed, as the node has them as parameters."""
 
 

@@ -62,12 +62,18 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
             model = model.replace(alarm=rules)
         except ModelError as error:
             raise ModelError(f"{options.rules}: does not fit the model: {error}") from None
-    if prefix := options.topic_prefix.strip("/"):
-        prefix = f"/{prefix}"
-        model = model.replace(signals=model.signals.below(prefix))
-    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin, listed_states(options.masked))
     condition = Condition.parse(options.enable)
-    condition = condition and replace(condition, topic=below(prefix, condition.topic))
+    if options.topic_prefix.strip("/") or options.remap:
+        prefix = f"/{options.topic_prefix.strip('/')}"
+        read = [*model.signals.topics, *([condition.topic] if condition else [])]
+        there = {topic: below(prefix, topic) for topic in read}
+        remapped = dict(options.remap)
+        for topic in remapped.keys() - there.values():
+            raise ModelError(f"--remap {topic}: it is not read; what is read is {', '.join(there.values())}")
+        there = {topic: remapped.get(name, name) for topic, name in there.items()}
+        model = model.replace(signals=model.signals.moved(there.__getitem__))
+        condition = condition and replace(condition, topic=there[condition.topic])
+    monitor = EnvelopeMonitor(model, options.violations, options.window, options.margin, listed_states(options.masked))
     return DeployedMonitor(monitor, condition, options.grace, options.latch, options.start, options.stop)
 
 

@@ -338,7 +338,7 @@ def read_as_fitted_with_decisions(
         remedy = "check it with EnvelopeMonitor(model).check(transient)"
         raise SignalError(f"the model was fitted to arrays and names no topics; {remedy}")
     bag = recording if isinstance(recording, Recording) else open_recording(recording, (), True, signals.table)
-    for topic, found in types_of([bag], signals).items():
+    for topic, found in types_of([bag], signals, remap=True).items():
         expected = next(s.type for s in signals.signals if s.topic == topic)
         if expected and found != expected:
             remedy = "check a recording of the same topics"
@@ -393,20 +393,22 @@ def load_signals(path: str | os.PathLike[str], recordings: Sequence[str | os.Pat
         raise
 
 
-def require(bag: Recording, topic: str) -> None:
-    """Refuse a topic that a recording lacks, with the nearest names and all of them."""
+def require(bag: Recording, topic: str, remap: bool = False) -> None:
+    """Refuse a topic that a recording lacks, with the nearest names and all of them; remap: with the option for it."""
     if topic not in bag.topics:
         there = shortlist(sorted(bag.topics), 50) or "none"
         none = f"there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
+        if remap and bag.topics:
+            none += f"; one of another name is checked with --remap {topic}:=NAME"
         raise BagError(f"{bag.path}: {none}") from None
 
 
-def types_of(bags: Sequence[Recording], signals: SignalMap) -> Mapping[str, str]:
+def types_of(bags: Sequence[Recording], signals: SignalMap, remap: bool = False) -> Mapping[str, str]:
     """Message type of each topic, which must be the same in all recordings."""
     types: dict[str, str] = {}
     for bag in bags:
         for topic in signals.topics:
-            require(bag, topic)
+            require(bag, topic, remap)
             found = bag.topics[topic].type
             if types.setdefault(topic, found) != found:
                 other = f"{types[topic]} in {bags[0].path}"

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NoReturn
 
@@ -404,26 +404,24 @@ class SignalMap:
         """
         return self.replace_signals([replace(s, type=types.get(s.topic, s.type)) for s in self.signals])
 
-    def below(self, prefix: str) -> SignalMap:
-        """The same signals on topics below a prefix.
+    def moved(self, there: Callable[[str], str]) -> SignalMap:
+        """The same signals on other topics.
 
         Parameters
         ----------
-        prefix : str
-            Such as `/robot1`; empty for none.
+        there : callable
+            Gives the topic in place of each.
 
         Returns
         -------
         SignalMap
             A new map.
         """
-        if not prefix:
-            return self
         lists: dict[str, Any] = {
-            kind: tuple(replace(s, topic=below(prefix, s.topic)) for s in getattr(self, kind)) for kind in LISTS
+            kind: tuple(replace(s, topic=there(s.topic)) for s in getattr(self, kind)) for kind in LISTS
         }
-        time = {below(prefix, topic): source for topic, source in self.time.items()}
-        return replace(self, **lists, clock=self.clock and below(prefix, self.clock), time=time)
+        time = {there(topic): source for topic, source in self.time.items()}
+        return replace(self, **lists, clock=self.clock and there(self.clock), time=time)
 
     def _repr_html_(self) -> str:
         """Where each signal is read, and its operating point; below, how samples are cut."""
