@@ -20,6 +20,7 @@ class Records(NamedTuple):
     definitions: list[tuple[int, int, int]]
     short: int
     late: int
+    nested: int
     number: int
     stop: int
 
