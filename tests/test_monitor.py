@@ -12,6 +12,7 @@
 import math
 import pickle
 from collections import deque
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -25,7 +26,7 @@ from test_model import random_model
 from test_transient import runs
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
-from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.errors import ModelError, TransientError
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
 from uncertain_lti.sampling.clock import Status
@@ -235,7 +236,31 @@ def test_a_transient_of_other_size_is_refused() -> None:
     monitor = EnvelopeMonitor(a_model(2, 1, 7))
     transient = transient.replace(state_names=["x1", "x0"])  # by their places one would be judged as the other
     refuses(ModelError, "run has x1, x0, the model x0, x1; give them in the order", monitor.check, transient)
-    refuses(ModelError, r"have shapes \[\(1,\), .*; the model takes \[\(2,\)", monitor.predict, [1.0], [1.0], 0.1)
+    refuses(ModelError, r"x has shape \(1,\); give real numbers of shape \(2,\)", monitor.predict, [1.0], [1.0], 0.1)
+
+
+@pytest.mark.parametrize(
+    "bad", [None, "abc", ["a", 1], [[1, 2], [3]], {}, object(), 1j, np.ones((2, 2, 7)), b"x", [[]]]
+)
+def test_arguments_that_are_no_numbers_of_their_shape_are_named(bad: Any) -> None:
+    """They ended in an error of numpy that names none of them."""
+    model = a_model(2, 1, 7)
+    monitor, point = EnvelopeMonitor(model), model.operating_point
+    x, u, z, dt = [0.1, 0.2], [0.3], [0.1, 0.2, 0.3], 0.1
+    calls: list[tuple[str, Callable[[], Any]]] = [
+        ("x", lambda: model.bounds(bad, u, dt)), ("u", lambda: model.bounds(x, bad, dt)),
+        ("x", lambda: monitor.predict(bad, u, dt)), ("u", lambda: monitor.predict(x, bad, dt)),
+        ("x0", lambda: model.simulate(bad, [u], dt)), ("u", lambda: model.simulate(x, bad, dt)),
+        ("z", lambda: monitor.expect(0, bad, dt)), ("z", lambda: monitor.foresee(0, bad, dt)),
+        ("dt", lambda: monitor.predict(x, u, bad)), ("dt", lambda: monitor.foresee(0, z, bad)),
+        ("dt", lambda: model.simulate(x, [u], bad)), ("margin", lambda: model.bounds(x, u, dt, bad)),
+        ("x", lambda: point.normalise_x(bad)), ("u", lambda: point.normalise_u(bad)),
+    ]  # fmt: skip
+    for name, call in calls:
+        refuses(
+            (ModelError, TransientError), rf"^{name} (is not numeric|has shape .*); give (real|a real|as many)", call
+        )
+    refuses(ModelError, "step is .*; give a Step of a Sampler", monitor.judge, bad)
 
 
 def test_a_transient_without_samples_has_no_verdict() -> None:

@@ -41,6 +41,24 @@ def real(values: Any) -> Array:
     return np.array(values, dtype=np.float64)
 
 
+def numbers(values: Any, what: str, wanted: tuple[Any, ...], error: type[Exception]) -> Array:
+    """An argument as real numbers of a shape, in which ... is any number of axes in front and None any length."""
+    plain = type(values) is np.ndarray and values.dtype == np.float64
+    last = wanted[1:] if wanted[:1] == (...,) else wanted
+    sizes = str(wanted).replace("Ellipsis", "...").replace("None", "N")
+    instead = f"give real numbers of shape {sizes}" if wanted else "give a real number"
+    try:
+        if values is None or np.asarray(values).dtype.kind in "US":
+            raise TypeError
+        array: Array = values if plain else real(values)
+    except (TypeError, ValueError, OverflowError):
+        raise error(f"{what} is not numeric; {instead}") from None
+    own = array.shape[array.ndim - len(last) :] if wanted[:1] == (...,) and array.ndim >= len(last) else array.shape
+    if len(own) != len(last) or any(size not in (None, has) for has, size in zip(own, last, strict=True)):
+        raise error(f"{what} has shape {array.shape}; {instead}")
+    return array
+
+
 LONGEST_S = 9e9
 """s; 2^63 ns are 9.2e9 s."""
 LARGEST = 1e50

@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import LARGEST, Array, real
+from uncertain_lti.base.arrays import LARGEST, Array, numbers, real
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import moment, plural
 from uncertain_lti.identification.problem import Columns, Problem, Regimes
@@ -174,7 +174,7 @@ def _factors(
         raise FitError(f"count is {count!r}; it must be sample or transient")
     factors = np.ones(transients)
     if transient_weights is not None:
-        factors = np.asarray(transient_weights, dtype=np.float64)
+        factors = numbers(transient_weights, "transient_weights", (...,), FitError)
         if factors.shape != (transients,) or not (np.isfinite(factors).all() and (factors > 0).all()):
             raise FitError(f"transient_weights must be {transients} positive numbers, one per transient")
     if count == "transient":

@@ -30,7 +30,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, runs
+from uncertain_lti.base.arrays import Array, numbers, runs
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended
@@ -326,12 +326,18 @@ def simulate(model: Any, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLik
     -------
     array (N+1, n)
         Normalised states; infinite or NaN where an unstable model runs away.
+
+    Raises
+    ------
+    ModelError
+        An argument is not numeric, or has another shape.
     """
-    u = np.asarray(u, dtype=np.float64)
-    dt = np.broadcast_to(np.asarray(dt, dtype=np.float64), (len(u),))
-    s = np.zeros((len(u), 0)) if s is None else np.asarray(s, dtype=np.float64)
+    u = numbers(u, "u", (None, model.m), ModelError)
+    dt = numbers(dt, "dt", (...,), ModelError)
+    dt = np.broadcast_to(numbers(dt, "dt", (len(u),) if dt.ndim else (), ModelError), (len(u),))
+    s = numbers(np.zeros((len(u), 0)) if s is None else s, "s", (len(u), model.q), ModelError)
     x = np.empty((len(u) + 1, model.n))
-    x[0] = x0
+    x[0] = numbers(x0, "x0", (model.n,), ModelError)
     A, B, c = model.A, model.B, model.c
     n, m = model.n, model.m
     z = np.hstack((x[:-1], u, s))
@@ -427,7 +433,7 @@ def discrepancy(model: Any, transient: Transient, W: ArrayLike | None = None) ->
     """
     error = (run_over(model, transient) - model.operating_point.normalise_x(transient.x))[1:]
     usable = transient.usable
-    weights = np.ones(model.n) if W is None else np.asarray(W, dtype=np.float64)
+    weights = np.ones(model.n) if W is None else numbers(W, "W", (...,), ModelError)
     if weights.shape not in ((model.n,), (len(usable), model.n), (len(usable), model.n, model.n)):
         raise ModelError(
             f"W has shape {weights.shape}; it must be ({model.n},), ({len(usable)}, {model.n}) "

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, numbers
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.base.files import written
 from uncertain_lti.base.text import MOST, Table, html_table, list_of, named, number, numbers_of, plural
@@ -65,6 +65,7 @@ def to_control(model: Any, dt: float | None = None, recorded: bool = False, knot
     ModelError
         dt is not a positive number, a control is called `disturbance` and there is one, or there is no such block.
     """
+    dt = None if dt is None else float(numbers(dt, "dt", (), ModelError))
     if dt is not None and not (math.isfinite(dt) and dt > 0):
         raise ModelError(f"dt is {dt}; it must be a positive number of seconds, or left out")
     offset = bool(np.any(model.c))

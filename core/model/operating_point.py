@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, on_cores, real
+from uncertain_lti.base.arrays import Array, numbers, on_cores, real
 from uncertain_lti.base.errors import TransientError
 from uncertain_lti.kernel.arithmetic import normalised_columns
 from uncertain_lti.signals.signal_map import Signal
@@ -169,7 +169,7 @@ class OperatingPoint:
         array (..., n)
             Dimensionless.
         """
-        return np.asarray(normalised(np.asarray(x, dtype=np.float64), self.x_s, self.X))
+        return np.asarray(normalised(numbers(x, "x", (..., len(self.x_s)), TransientError), self.x_s, self.X))
 
     def normalise_u(self, u: ArrayLike) -> Array:
         """Controls as deviations.
@@ -184,7 +184,7 @@ class OperatingPoint:
         array (..., m)
             Dimensionless.
         """
-        return np.asarray(normalised(np.asarray(u, dtype=np.float64), self.u_s, self.U))
+        return np.asarray(normalised(numbers(u, "u", (..., len(self.u_s)), TransientError), self.u_s, self.U))
 
     def scheduled_on(self, stays: Sequence[bool]) -> OperatingPoint:
         """The same point without some of the further scheduling signals.
@@ -216,7 +216,7 @@ class OperatingPoint:
         array (..., q)
             Dimensionless.
         """
-        return np.asarray(normalised(np.asarray(s, dtype=np.float64), self.s_s, self.S))
+        return np.asarray(normalised(numbers(s, "s", (..., len(self.s_s)), TransientError), self.s_s, self.S))
 
     def recorded_x(self, x: ArrayLike) -> Array:
         """State deviations in recorded units.
@@ -231,4 +231,4 @@ class OperatingPoint:
         array (..., n)
             Recorded units.
         """
-        return np.asarray(recorded(np.asarray(x, dtype=np.float64), self.x_s, self.X))
+        return np.asarray(recorded(numbers(x, "x", (..., len(self.x_s)), TransientError), self.x_s, self.X))

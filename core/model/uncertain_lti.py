@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, numbers
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.kernel.arithmetic import blended, edges
@@ -328,9 +328,10 @@ class UncertainLTI(Envelope):
         ModelError
             Shapes do not fit.
         """
-        x, u, dt, s = (np.asarray(a, dtype=np.float64) for a in (x, u, dt, np.zeros(0) if s is None else s))
-        if x.shape[-1:] != (self.n,) or u.shape[-1:] != (self.m,):
-            raise ModelError(f"x has shape {x.shape} and u {u.shape}; they must end in {self.n} and {self.m}")
+        x, u = numbers(x, "x", (..., self.n), ModelError), numbers(u, "u", (..., self.m), ModelError)
+        dt, s = (
+            numbers(a, name, (...,), ModelError) for a, name in ((dt, "dt"), (np.zeros(0) if s is None else s, "s"))
+        )
         if s.shape[-1:] != (self.q,):
             names = ", ".join(signal.name for signal in self.signals.scheduling)
             raise ModelError(f"s has shape {s.shape}; it must end in {self.q}" + f", with {names}" * bool(names))
@@ -372,7 +373,7 @@ class UncertainLTI(Envelope):
         ModelError
             Shapes do not fit.
         """
-        return edges(*self.centre_and_half(x, u, dt, s), margin)
+        return edges(*self.centre_and_half(x, u, dt, s), float(numbers(margin, "margin", (), ModelError)))
 
     # --- the nominal model on its own ---
 
@@ -414,7 +415,8 @@ class UncertainLTI(Envelope):
         dt = self.sampling.dt_median if dt is None else dt
         if dt is None:
             raise ModelError("spectral radius: the model has no dt_median; give dt")
-        return float(np.abs(np.linalg.eigvals(nominal.recursion(self, dt))).max())
+        step = float(numbers(dt, "dt", (), ModelError))
+        return float(np.abs(np.linalg.eigvals(nominal.recursion(self, step))).max())
 
     def replace(self, **changes: Any) -> UncertainLTI:
         """The same model with some constructor arguments replaced.

@@ -16,13 +16,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, SupportsFloat
 
 import cython
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, on_cores
+from uncertain_lti.base.arrays import Array, numbers, on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.kernel import arithmetic as kernel
 from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, all_carried
@@ -183,7 +183,7 @@ class EnvelopeMonitor:
         outside = judgement.unknown_regime or bool(self.model.domain.beyond(z)[0])
         return judgement.numbers(LOWER).tolist(), judgement.numbers(UPPER).tolist(), own, outside
 
-    def predict(self, x: ArrayLike, u: ArrayLike, dt: float, s: ArrayLike = ()) -> tuple[Array, Array]:
+    def predict(self, x: ArrayLike, u: ArrayLike, dt: SupportsFloat, s: ArrayLike = ()) -> tuple[Array, Array]:
         """Bounds one step ahead, recorded units.
 
         Parameters
@@ -209,14 +209,12 @@ class EnvelopeMonitor:
         ModelError
             x, u or s has another length.
         """
-        given = [np.asarray(a, dtype=np.float64) for a in (x, u, s)]
-        shapes, own = [a.shape for a in given], [(count,) for count in (self.model.n, self.model.m, self.model.q)]
-        if shapes != own:
-            raise ModelError(f"x, u and s have shapes {shapes}; the model takes {own}")
-        verdict = self.expect(0, np.concatenate(given).tolist(), dt)
+        given = (x, "x", self.model.n), (u, "u", self.model.m), (s, "s", self.model.q)
+        z = np.concatenate([numbers(values, name, (count,), ModelError) for values, name, count in given])
+        verdict = self.expect(0, z, dt)
         return verdict.lower, verdict.upper
 
-    def expect(self, t_ns: int, z: Sequence[float], dt: float) -> Verdict:
+    def expect(self, t_ns: int, z: ArrayLike, dt: SupportsFloat) -> Verdict:
         """`predict` as a verdict, not counted for the alarm.
 
         Parameters
@@ -233,10 +231,11 @@ class EnvelopeMonitor:
         Verdict
             Its `lower` and `upper` are the bounds.
         """
-        step = Step(Status.OK, t_ns, 0, dt, z, z[: len(self._counted)])
+        before, step_s = self._ahead(z, dt)
+        step = Step(Status.OK, t_ns, 0, step_s, before, before[: len(self._counted)])
         return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
-    def foresee(self, t_ns: int, z: Sequence[float], dt: float) -> Foreseen | None:
+    def foresee(self, t_ns: int, z: ArrayLike, dt: SupportsFloat) -> Foreseen | None:
         """Bounds at the end of the longest horizon, if controls and further scheduling signals stay as they are.
 
         Parameters
@@ -253,10 +252,16 @@ class EnvelopeMonitor:
         Foreseen or None
             By the margin of the one-step rule; None without horizons, and where the nominal run leaves all numbers.
         """
-        bounds = None if self._runs is None else self._runs.foresee(z, dt)
+        before, step_s = self._ahead(z, dt)
+        bounds = None if self._runs is None else self._runs.foresee(before, step_s)
         if bounds is None or not all_finite(bounds):
             return None
-        return Foreseen(t_ns + max(self.model.steps) * round(dt * 1e9), bounds)
+        return Foreseen(t_ns + max(self.model.steps) * round(step_s * 1e9), bounds)
+
+    def _ahead(self, z: ArrayLike, dt: SupportsFloat) -> tuple[list[float], float]:
+        """z and Δt as numbers."""
+        total = self.model.n + self.model.m + self.model.q
+        return numbers(z, "z", (total,), ModelError).tolist(), float(numbers(dt, "dt", (), ModelError))
 
     def steps_back(self, step: Step) -> bool:
         """Whether time steps back with a sample that `judge` has not taken yet.
@@ -303,6 +308,7 @@ class EnvelopeMonitor:
         Verdict
             With the alarm after it.
         """
+        refuse_other(step, Step, "step", "give a Step of a Sampler", ModelError)
         alarms, watch = self.alarms, self.frozen_watch
         if self.starts_over(step) or not armed:
             alarms.reset()
@@ -382,6 +388,7 @@ class EnvelopeMonitor:
         steps = transient.transitions()
         count, n = len(transient), model.n
         armed = Arming(None, 0).over(transient.t_ns) if armed is None else armed
+        refuse_other(armed, Armed, "armed", "give what Arming.over returns, or leave it out", ModelError)
         if not armed.asked.all():
             steps = steps.take(armed.asked[steps.k] & armed.asked[steps.k + 1])
         fitted = (self._shortest <= steps.dt) & (steps.dt <= self._longest)

@@ -119,7 +119,10 @@ def nanoseconds(t: ArrayLike, name: str, recorded: bool) -> NDArray[np.int64]:
     if np.ma.is_masked(t):
         where = int(np.argmax(np.ma.getmask(t)))
         raise TransientError(f"{name}: t[{where}] is masked; leave out samples without a time")
-    raw = np.array(t)
+    try:
+        raw = np.array(t)
+    except ValueError:  # lists of several lengths
+        raise TransientError(f"{name}: t is not numeric; give a vector (N+1,)") from None
     if raw.ndim != 1:
         raise TransientError(f"{name}: t has shape {raw.shape}; it must be a vector (N+1,)")
     if raw.dtype.kind in "mM":
