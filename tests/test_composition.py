@@ -13,6 +13,7 @@ import re
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from conftest import ROOT
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
 from geometry_msgs.msg import Vector3Stamped
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
 from ros_processes import PATIENCE, Diagnostics, World, until
@@ -59,6 +61,19 @@ class Robots:
                 publisher.publish(message)
             self.sent[prefix] += 1
             time.sleep(0.005)
+
+
+def test_an_executor_that_takes_topics_out_of_turn_is_told(world: World, tmp_path: Path, capfd: Any) -> None:
+    executor = MultiThreadedExecutor(2, context=world.node.context)
+    node = EnvelopeMonitorNode(
+        parameter_overrides=[Parameter("model", value=str(saved(by_hand(), tmp_path)))],
+        context=world.node.context, use_global_arguments=False,
+    )  # fmt: skip
+    executor.add_node(node)
+    node.start()
+    executor.shutdown()
+    node.destroy_node()
+    assert "a MultiThreadedExecutor takes topics out of turn" in "".join(capfd.readouterr())
 
 
 def test_two_monitors_in_one_process(world: World, tmp_path: Path) -> None:

@@ -130,7 +130,8 @@ def test_samples_controls_and_steps_are_broadcast() -> None:
 @pytest.mark.parametrize(("x", "u"), [((2,), (1,)), ((3,), (2,)), ((5, 3), (5,)), ((), (1,))])
 def test_wrong_shapes_are_said(x: tuple[int, ...], u: tuple[int, ...]) -> None:
     model = random_model(np.random.default_rng(0), 3, 1)
-    refuses(ModelError, r"[xu] has shape .*; give real numbers of shape \(\.\.\., [31]\)", model.bounds, np.ones(x), np.ones(u), 0.1)
+    words = r"[xu] has shape .*; give real numbers of shape \(\.\.\., [31]\)"
+    refuses(ModelError, words, model.bounds, np.ones(x), np.ones(u), 0.1)
     refuses(ModelError, "give as many of each, or one for all", model.bounds, np.ones((5, 3)), np.ones((2, 1)), 0.1)
 
 

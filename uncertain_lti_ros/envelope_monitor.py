@@ -27,6 +27,7 @@ from rcl_interfaces.msg import SetParametersResult
 from rclpy.clock import Clock, ROSClock
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
+from rclpy.executors import MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
@@ -228,6 +229,9 @@ class EnvelopeMonitorNode(LifecycleNode):
     def start(self) -> None:
         """Configure and activate; if that fails the reason is logged and published on /diagnostics."""
         self._starts_itself = True
+        if isinstance(self.executor, MultiThreadedExecutor):
+            out_of_turn = "a MultiThreadedExecutor takes topics out of turn, so samples get other controls"
+            self.get_logger().warning(f"{out_of_turn}; add the node to an EventsExecutor")
         if self.trigger_configure() == TransitionCallbackReturn.SUCCESS:
             self._starts_itself = self.trigger_activate() != TransitionCallbackReturn.SUCCESS
 

@@ -176,9 +176,8 @@ class _InOrder:
     A process that stood still, or joins publishers that kept messages for it, gets the rest later, one topic after
     another; the live node puts that in order too.
 
-    `clock`: gives log times, ns; None for the time of the system; `late`: how many came after others that were sent
-    over `LATE` later, and stayed so; `latest`: s at most; `back`: why nothing is taken any more, in words; `fell_ns`:
-    by how much /clock went back at most where messages are taken all the same.
+    `clock`: gives log times, ns; None for the time of the system; `fell_ns`: by how much it fell at most; `late`: how
+    many came after others that were sent over `LATE` later, and stayed so; `latest`: s at most; `back`: why it ends.
     """
 
     def __init__(self, file: _File, topics: Iterable[str], clock: Callable[[], int] | None) -> None:

@@ -59,8 +59,7 @@ def numbers(values: Any, what: str, wanted: tuple[Any, ...], error: type[Excepti
     return array
 
 
-LONGEST_S = 9e9
-"""s; 2^63 ns are 9.2e9 s."""
+LONGEST_S = 9e9  # s; 2^63 ns are 9.2e9 s
 LARGEST = 1e50
 """Magnitude of a number in recorded units or in 1/s, and of a scale or its inverse: squares of ratios stay finite."""
 

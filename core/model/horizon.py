@@ -326,11 +326,6 @@ def simulate(model: Any, x0: ArrayLike, u: ArrayLike, dt: ArrayLike, s: ArrayLik
     -------
     array (N+1, n)
         Normalised states; infinite or NaN where an unstable model runs away.
-
-    Raises
-    ------
-    ModelError
-        An argument is not numeric, or has another shape.
     """
     u = numbers(u, "u", (None, model.m), ModelError)
     dt = numbers(dt, "dt", (...,), ModelError)

@@ -466,7 +466,6 @@ def _block(chunk: ChunkIndex) -> Block:
 
 
 def _can_be(chunk: ChunkIndex, data_end: int) -> bool:
-    """Whether there may be such a chunk, in front of the end of the data."""
     block, begin = _block(chunk), chunk.chunk_start_offset
     return (
         chunk.chunk_length == block.unchecked + block.size

@@ -10,7 +10,7 @@ class Records(NamedTuple):
 
     `channel`, `log_time` (ns), `begin`, `end` (messages,): of each message, whose data is block[begin:end];
     `definitions`: opcode, begin and end of the content of every schema and channel; `short`: messages too short to be
-    one; `late`: messages past 2**63 ns, which are left out; `nested`: chunks; `number`: records; `stop`: where it ended.
+    one; `late`: messages past 2**63 ns, which are left out; `nested`: chunks; `number`: records; `stop`: their end.
     """
 
     channel: NDArray[np.uint16]
