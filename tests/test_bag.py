@@ -561,7 +561,7 @@ def test_a_file_that_is_missing_names_those_beside_it(tmp_path: Path) -> None:
         assert "a shell replaces ~ and * only where they are not in quotes" in error_of(quoted)
     assert "neither a file nor a folder" in error_of(Path("/dev/zero"))
     os.symlink(tmp_path / "nowhere", tmp_path / "link.mcap")
-    assert "there is no such file" in error_of(tmp_path / "link.mcap")
+    assert "there is no such file or folder; it is a link to" in error_of(tmp_path / "link.mcap")
     assert "File name too long" in error_of(tmp_path / ("x" * 300))
 
 

@@ -105,7 +105,7 @@ def read_csv(path: Path) -> RawTable:
             encoding = "cp1252"  # of Windows
     start = head.decode(encoding, errors="replace").rstrip("\0")  # which a power cut leaves behind the last line
     if "\0" in start:
-        raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; check the path and its suffix")
+        raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; unpack it if it is compressed")
     whole, decimals = start.rpartition("\n")[0], [match[2] for match in _CUT_TIME.finditer(start)]
     cut_times = any(three.startswith("0") for three in decimals)  # which numbers do not
     cut_times = cut_times and len(_CUT_TIME.findall(whole)) == len(re.findall(r"\d:\d\d:\d\d", whole))

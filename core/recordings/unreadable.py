@@ -79,6 +79,8 @@ def missing(path: Path) -> BagError:
     hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
     if str(path).startswith("~") or "*" in path.name:
         hint = "; a shell replaces ~ and * only where they are not in quotes"
+    if path.is_symlink():
+        hint = f"; it is a link to {os.readlink(path)}, which is not there"
     if (unfinished := Path(f"{path}.part")).exists():
         hint = f"; its recording goes on, or was killed: read {unfinished}"
     return BagError(f"{path}: there is no such file or folder{hint}")
