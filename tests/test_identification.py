@@ -375,7 +375,7 @@ def test_what_is_too_small_for_the_arithmetic_is_named(size, criterion):
 def test_infinite_and_complex_numbers_are_refused():
     for wrong in ({"fixed": {"A": np.full((2, 2), np.inf)}}, {"upper": {"A": np.full((2, 2), -np.inf)}}):
         refuses(FitError, "A is to be infinite; give finite numbers, NaN for a free element", Structure, 2, 1, **wrong)
-    refuses(FitError, "A is not an array of real numbers", Structure, 2, 1, fixed={"A": np.full((2, 2), 1j)})
+    refuses(FitError, "A is not numeric; give real", Structure, 2, 1, fixed={"A": np.full((2, 2), 1j)})
     with pytest.raises(TransientError, match="x is not numeric; give real numbers"):
         Transient(np.arange(3.0), np.full((3, 2), 1j), np.zeros((3, 1)))
     with pytest.raises(ModelError, match="field 'A' is not an array of numbers"):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, real
+from uncertain_lti.base.arrays import Array, numbers
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.schedule import Schedule
@@ -145,13 +145,7 @@ class Structure:
 
     def _read(self, name: str, values: ArrayLike) -> Array:
         self._known(name)
-        try:
-            array = real(values)
-        except (TypeError, ValueError):
-            raise FitError(f"structure: {name} is not an array of real numbers; write NaN for a free element") from None
-        if array.shape != self._shapes[name]:
-            raise FitError(f"structure: {name} has shape {array.shape}; it must be {self._shapes[name]}")
-        return array
+        return numbers(values, f"structure: {name}", self._shapes[name], FitError)
 
     @classmethod
     def from_rules(
