@@ -1176,6 +1176,24 @@ def test_a_function_of_a_state_in_another_topic_is_no_second_state(tmp_path, cop
     assert f"{left} data: says what {proposal.states[0].topic} data says already" in proposal.text
 
 
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+def test_what_is_computed_from_several_signals_of_another_topic_is_no_state(tmp_path, noise):
+    """Odometry of the wheels made the fit rank deficient, and its alarm named yaw at 4e9 times its threshold."""
+    rng, messages, x, u = np.random.default_rng(0), [], np.zeros(2), np.zeros(2)
+    for k in range(2000):
+        t = at(k)
+        u = rng.normal(size=2) if k % 37 == 0 else u
+        read = x + 1e-3 * rng.normal(size=2)
+        messages.append(Message("/joint_states", t, joint_state(t, read)))
+        messages.append(f64("/speed", t, 0.04 * read.sum() + 0.04 * noise * rng.normal()))
+        messages += [f64(f"/{side}_cmd", t, value) for side, value in zip(("left", "right"), u, strict=True)]
+        x = x + 0.02 * (3.0 * u - 2.0 * x)
+    proposal = proposed(tmp_path, messages, {"/joint_states": JOINT})[1]
+    assert ({c.topic for c in proposal.states} == {"/joint_states"}) == (noise == 0.0), proposal.text
+    told = "/speed data: says what /joint_states says already, several of its signals together"
+    assert (told in proposal.text) == (noise == 0.0)
+
+
 def test_two_sensors_in_topics_of_their_own_are_both_states(tmp_path):
     rng = np.random.default_rng(1)
     pressure = beside("/aaa/sensor", lambda x, u: 101325.0 + 9810.0 * x + 10.0 * rng.normal())

@@ -51,6 +51,7 @@ WHITE, OWN = 0.3, 0.5
 two sensors has of its own."""
 ROUNDED = 1e-6
 """Standard deviation of the difference of two signals, as a share, up to which it is rounding."""
+_EXACT = 0.01  # what a fit on others leaves of a signal's steps, as a share, up to which it is computed from them
 _ENOUGH, _STRETCH = 5_000_000, 128  # elements of the regressors from which on stretches of samples do
 _STRETCHES = 10  # of the samples, dealt out to the halves in turn
 _CLIP = 5.0
@@ -141,6 +142,19 @@ def functions(X: Array, Y: Array | None = None) -> NDArray[np.bool_]:
             still = np.diff(b[:, k]).std() < 0.7 * b[:, k].std()
             white = rest[:, k].std() == 0 or np.corrcoef(rest[1:, k], rest[:-1, k])[0, 1] < WHITE
             found[i, moving[k]] |= share[k] < 0.02 or (still and white)  # white around what it follows
+    return found
+
+
+def computed(dX: Array, topics: Sequence[str], function: NDArray[np.bool_]) -> dict[int, str]:
+    """Signals whose steps (N, n) are a sum of those of another topic, of no one alone (n, n), and that topic."""
+    found: dict[int, str] = {}
+    for topic in dict.fromkeys(topics):
+        whole = [i for i, t in enumerate(topics) if t == topic and i not in found]
+        others = [i for i, t in enumerate(topics) if t != topic and i not in found and not function[whole, i].any()]
+        if len(whole) > 1 and others and len(dX) > 2 * len(whole):
+            (rest,) = left(dX[:, whole], dX[:, others])
+            exact = rest.std(axis=0) < _EXACT * dX[:, others].std(axis=0)
+            found |= {i: topic for i, so in zip(others, exact.tolist(), strict=True) if so}
     return found
 
 

@@ -22,6 +22,7 @@ from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.evidence import (
     LONGEST_DELAY,
     NOISE,
+    computed,
     from_both_ends,
     functions,
     lags,
@@ -50,10 +51,10 @@ from uncertain_lti.signals.values import TABLE, of_table
 def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     """Drop candidates that are functions of another one, whatever their topics: copies, other units, squares.
 
-    Such a function leaves next to nothing of a candidate, or nothing but noise. Of two that are functions of each
-    other, the one in which the controls show clearly more stays, else the first. Two sensors of one quantity both
-    stay, where each has noise of its own: a fault of one, or what comes between them, such as a slipping wheel, shows
-    in their difference alone.
+    Such a function leaves next to nothing of a candidate, or nothing but noise, and so may a sum: odometry, of wheels.
+    Of two that are functions of each other, the one in which the controls show clearly more stays, else the first. Two
+    sensors of one quantity both stay, where each has noise of its own: a fault of one, or what comes between them, such
+    as a slipping wheel, shows in their difference alone.
     """
     if len(steps.X) < FEWEST:
         return pool
@@ -63,13 +64,17 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
     for i, j in np.argwhere(function).tolist():
         if _alike(pool[i], pool[j]) or two_sensors(*steps.X[:, [i, j]].T):
             function[i, j] = pool[i].topic == pool[j].topic and _moves_with(pool[j], pool[i], exact=True)
+    sums = computed(steps.dX, [c.topic for c in pool], function)
+    for i, topic in sums.items():
+        pool[i].reason = f"says what {topic} says already, several of its signals together"
 
     def drop(i: int, source: int) -> None:
         of = pool[source]
         place = of.path if of.topic == pool[i].topic else f"{of.topic} {of.path}"
         pool[i].reason = f"says what {place} says already"
 
-    for i in np.argsort(-np.log(np.maximum(steps.effects()[0], 1.0)).round(1), kind="stable").tolist():
+    ranked = np.argsort(-np.log(np.maximum(steps.effects()[0], 1.0)).round(1), kind="stable").tolist()
+    for i in (i for i in ranked if i not in sums):
         source = next((j for j in kept if function[j, i]), None)
         if source is not None:
             drop(i, source)
@@ -150,10 +155,7 @@ def prefer_rates(source: Source) -> None:
                 candidate.reason, candidate.ready = reason, "state" * (reason == _EFFORT)
 
 
-_ROWS = 1 << 14
-"""Rows of which correlations are taken at once."""
-_NEARLY = 0.999
-"""Correlation from which on it is looked at closer."""
+_ROWS, _NEARLY = 1 << 14, 0.999  # of which correlations are taken at once; correlation from which on to look closer
 
 
 def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidate]:
@@ -235,8 +237,7 @@ def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
 
 ALIKE = 0.8
 """Rate of a topic, relative to that of the fastest, from which on both may give states of one model."""
-SLOWER = 10.0
-"""Times the rate of a topic that of the fastest is at most, where both give states of one model."""
+SLOWER = 10.0  # times the rate of a topic that of the fastest is at most, where both give states of one model
 BLURRED = 2.0
 """Times the variance that one sample leaves unknown of the next at their own rate that is left at a slower one, from
 which on the numbers of a topic move in between."""
@@ -247,8 +248,7 @@ LOST = 0.01
 topic alone."""
 STEERS = 100.0
 """F statistic of one control alone from which on it counts as turning an axis of a body."""
-PER_UNKNOWN = 20
-"""Transitions per signal below which further signals are only listed."""
+PER_UNKNOWN = 20  # transitions per signal below which further signals are only listed
 MOST, EACH = 12, 1000  # states, and controls; or as many as there are so many transitions for each
 
 
