@@ -478,6 +478,9 @@ def test_one_recording_does_not_vouch_for_another_day(runs, learnt):
     for what in ("block", "recording"):  # also where some of its blocks are unlike the others
         kind, words = worth(full, replace(panel, unlike=("part",), what=what))
         assert kind == "some" and "not repeat" in words and (told in words) == (what == "block")
+        blind = np.where(np.arange(full.n) == 0, math.inf, panel.biases)  # also where a state is hardly judged
+        kind, words = worth(full, replace(panel, biases=blind, what=what))
+        assert kind == "some" and words.startswith("sees only") and (told in words) == (what == "block")
 
 
 def test_a_combination_that_the_others_lack_is_far_though_each_signal_is_in_its_range():

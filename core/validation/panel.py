@@ -523,10 +523,13 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             f"unproven: {unlike}, so nothing shows how it does on what comes next, and an alarm may be operation that "
             f"was not recorded; record the same work again"
         )
+    alone = panel.what == "block" or panel.units == 1
+    further = f"fit {TELLING} or more, or expect alarms in healthy ones"
     if still or blind:
         seen = [name for name in names if name not in (*still, *blind)]
         why = [f"{shortlist(still, _NAMED)} never moved"] if still else []
         why += [f"of {shortlist(blind, _NAMED)} not even a jump of the whole recorded range"] if blind else []
+        why += [f"one recording says nothing of another day: {further}"] * alone
         return "some", f"sees only {shortlist(seen, _NAMED)}: {'; '.join(why)}"
     low, high = (np.format_float_positional(float(f"{100 * s:.2g}"), trim="-") for s in (share.min(), share.max()))
     ranges = f"{low} % of the recorded range" if low == high else f"{low} to {high} % of the recorded ranges"
@@ -534,8 +537,6 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
     if len(coarse) == model.n:
         missing = "what moves the states may be missing among the controls"
         return "some", f"worth little: it sees jumps of {ranges} only, which a plot shows as well; {missing}"
-    alone = panel.what == "block" or panel.units == 1
-    further = f"fit {TELLING} or more, or expect alarms in healthy ones"
     if count:
         return "some", (
             f"worth having within what was recorded: {unlike}, so nothing vouches for operation that none of them shows"
