@@ -43,20 +43,20 @@ def real(values: Any) -> Array:
 
 def numbers(values: Any, what: str, wanted: tuple[Any, ...], error: type[Exception]) -> Array:
     """An argument as real numbers of a shape, in which ... is any number of axes in front and None any length."""
-    plain = type(values) is np.ndarray and values.dtype == np.float64
     last = wanted[1:] if wanted[:1] == (...,) else wanted
-    sizes = str(wanted).replace("Ellipsis", "...").replace("None", "N")
-    instead = f"give real numbers of shape {sizes}" if wanted else "give a real number"
     try:
-        if values is None or np.asarray(values).dtype.kind in "US":
+        given = values if isinstance(values, np.ndarray) else np.asarray(values)
+        if values is None or given.dtype.kind in "US":
             raise TypeError
-        array: Array = values if plain else real(values)
+        array = given if type(given) is np.ndarray and given.dtype == np.float64 else real(given)
+        own = array.shape[max(array.ndim - len(last), 0) :] if last is not wanted else array.shape
+        if len(own) == len(last) and all(size in (None, has) for has, size in zip(own, last, strict=True)):
+            return array
+        found = f"has shape {array.shape}"
     except (TypeError, ValueError, OverflowError):
-        raise error(f"{what} is not numeric; {instead}") from None
-    own = array.shape[array.ndim - len(last) :] if wanted[:1] == (...,) and array.ndim >= len(last) else array.shape
-    if len(own) != len(last) or any(size not in (None, has) for has, size in zip(own, last, strict=True)):
-        raise error(f"{what} has shape {array.shape}; {instead}")
-    return array
+        found = "is not numeric"
+    sizes = str(wanted).replace("Ellipsis", "...").replace("None", "N")
+    raise error(f"{what} {found}; {f'give real numbers of shape {sizes}' if wanted else 'give a real number'}")
 
 
 LONGEST_S = 9e9  # s; 2^63 ns are 9.2e9 s

@@ -231,7 +231,7 @@ class EnvelopeMonitor:
         Verdict
             Its `lower` and `upper` are the bounds.
         """
-        before, step_s = self._ahead(z, dt)
+        before, step_s = self._given(z, dt)
         step = Step(Status.OK, t_ns, 0, step_s, before, before[: len(self._counted)])
         return Verdict(step, self.alarm, self._judge.judge(step.before, step.after, step.dt))
 
@@ -252,15 +252,16 @@ class EnvelopeMonitor:
         Foreseen or None
             By the margin of the one-step rule; None without horizons, and where the nominal run leaves all numbers.
         """
-        before, step_s = self._ahead(z, dt)
+        before, step_s = self._given(z, dt)
         bounds = None if self._runs is None else self._runs.foresee(before, step_s)
         if bounds is None or not all_finite(bounds):
             return None
         return Foreseen(t_ns + max(self.model.steps) * round(step_s * 1e9), bounds)
 
-    def _ahead(self, z: ArrayLike, dt: SupportsFloat) -> tuple[list[float], float]:
-        """z and Δt as numbers."""
+    def _given(self, z: ArrayLike, dt: SupportsFloat) -> tuple[list[float], float]:
         total = self.model.n + self.model.m + self.model.q
+        if isinstance(z, list) and len(z) == total and isinstance(dt, float) and set(map(type, z)) == {float}:
+            return z, dt  # of a sampler, for every sample
         return numbers(z, "z", (total,), ModelError).tolist(), float(numbers(dt, "dt", (), ModelError))
 
     def steps_back(self, step: Step) -> bool:
