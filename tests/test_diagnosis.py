@@ -277,6 +277,13 @@ def test_few_samples_that_carry_a_width_are_named_and_discarding_them_does_what_
     assert not any(WORDS["few"] in m for m in narrow.fit_summary["messages"])
 
 
+def test_of_many_states_with_such_samples_the_widest_are_named_and_the_rest_counted():
+    parts = [run(seed=seed, change=spiked((400,))) for seed in range(5)]
+    x, u = np.hstack([p.x[:, :1] for p in parts]), np.hstack([p.u for p in parts])
+    (message,) = [m for m in messages(Transient(parts[0].t_ns, x, u, name="run")) if WORDS["few"] in m]
+    assert " and of 1 other state as wide as" in message
+
+
 def test_for_a_criterion_that_would_discard_others_the_stretch_is_named():
     (message,) = [m for m in messages(run(change=spiked((400,))), criterion="lp") if WORDS["few"] in m]
     assert "leave that stretch out" in message and "--discard" not in message

@@ -495,7 +495,7 @@ def _carried(
     indices = sorted(few.transitions)
     wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
     listed = ", ".join(f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4])
-    listed += f" and of {len(wide) - 4} other states" if len(wide) > 4 else ""
+    listed += f" and of {plural(len(wide) - 4, 'other state')}" if len(wide) > 4 else ""
     cure = "leave that stretch out of the recording"
     if discarded is not None:
         cure = f"--discard {discarded + len(indices)} leaves them out and lists them"
