@@ -49,12 +49,11 @@ from uncertain_lti.signals.values import TABLE, of_table
 
 
 def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
-    """Drop candidates that are functions of another one, whatever their topics: copies, other units, squares.
+    """Drop candidates that are functions of another one, or sums of several of another topic: odometry, of wheels.
 
-    Such a function leaves next to nothing of a candidate, or nothing but noise, and so may a sum: odometry, of wheels.
-    Of two that are functions of each other, the one in which the controls show clearly more stays, else the first. Two
-    sensors of one quantity both stay, where each has noise of its own: a fault of one, or what comes between them, such
-    as a slipping wheel, shows in their difference alone.
+    A function, be it a copy or a square, leaves next to nothing of a candidate, or nothing but noise. Of two that are
+    functions of each other, the one in which the controls show clearly more stays, else the first. Two sensors of one
+    quantity both stay, where each has noise of its own: a fault of one, or a slipping wheel, parts them.
     """
     if len(steps.X) < FEWEST:
         return pool
