@@ -1194,6 +1194,20 @@ def test_what_is_computed_from_several_signals_of_another_topic_is_no_state(tmp_
     assert (told in proposal.text) == (noise == 0.0)
 
 
+def test_what_no_name_or_type_tells_is_offered_where_the_controls_show_in_it(tmp_path):
+    """A torque cell of a message type of its own was in the list of reasons alone."""
+    rng = np.random.default_rng(0)
+
+    def cell(k, x, u):
+        return [Message("/cell", at(k), array([2.0 * x + 1e-2 * rng.normal(), rng.normal()]), at(k))]
+
+    messages = driven(("/joint_states/arm", "/plant/cmd"), count=2000, extra=cell)
+    proposal = proposed(tmp_path, messages, {"/cell": ARRAY})[1]
+    offered = [line for line in proposal.text.splitlines() if line.startswith("  # - ") and "/cell" in line]
+    assert len(offered) == 2 and all("but the controls show in it" in line for line in offered), proposal.text
+    assert {c.topic for c in proposal.states} == {"/joint_states/arm"}
+
+
 def test_two_sensors_in_topics_of_their_own_are_both_states(tmp_path):
     rng = np.random.default_rng(1)
     pressure = beside("/aaa/sensor", lambda x, u: 101325.0 + 9810.0 * x + 10.0 * rng.normal())

@@ -107,9 +107,8 @@ def drop_noise(pool: list[Candidate], used: Sequence[Candidate]) -> tuple[list[C
     families = {c.family for c, known in zip(pool, share, strict=True) if known >= NOISE}
     for candidate, known, seen in zip(pool, share, shown, strict=True):
         if known < NOISE and not (seen and candidate.family in families):
-            told = f"{max(0.0, known):.0%}"
+            candidate.ready, told = "state", f"{max(0.0, known):.0%}"
             candidate.reason = f"noise: one sample predicts {told} of the variance at the next, controls included"
-            candidate.ready = "state"
     return [c for c in pool if not c.reason], ""
 
 
@@ -368,6 +367,8 @@ def assign_roles(
         controls = [held for source in states if (held := _held_columns(source)) is not None]
     for source in unknown:
         source.reason = "neither state nor control by its name or type"
+        for candidate in source.free if controls and explained(source, controls) > SHOWS else ():
+            candidate.reason, candidate.ready = f"{source.reason}, but the controls show in it", "state"
     return controls, states
 
 
