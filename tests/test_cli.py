@@ -269,6 +269,12 @@ def test_a_recording_of_remapped_topics_is_checked_by_their_names_there(folder, 
     assert "--remap /x: it is not read; what is read is" in refused(cli, "check", model, robot, "--remap", "x:=y")
 
 
+def test_a_recording_without_topics_is_told_as_such(tmp_path, cli):
+    """A table of no rows was all that was printed."""
+    path = write([], []).save(tmp_path / "none.mcap")
+    assert cli("topics", path).out == f"{path}: there is no topic in it\n"
+
+
 def test_help_and_usage(capsys):
     """Every command has --help; wrong usage is status 2."""
     for words, status in (

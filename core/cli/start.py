@@ -60,7 +60,7 @@ def topics(options: argparse.Namespace) -> Result:
         rate = f"{number(f.rate)} in bursts" if f.bursts else number(f.rate)
         rows.append([name, kind, str(f.info.count), rate, number(f.largest_gap), stamps])
     header = ("topic", "type", "messages", "rate [1/s]", "largest gap [s]", "header stamps")
-    lines = [str(Table(header, rows, most=len(rows)))]
+    lines = [str(Table(header, rows, most=len(rows)))] if rows else [f"{bag.path}: there is no topic in it"]
     for f in facts:
         name = printable(f.info.topic, _LONGEST_NAME)
         if not f.info.readable or f.info.reason:
