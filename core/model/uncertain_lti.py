@@ -329,9 +329,7 @@ class UncertainLTI(Envelope):
             Shapes do not fit.
         """
         x, u = numbers(x, "x", (..., self.n), ModelError), numbers(u, "u", (..., self.m), ModelError)
-        dt, s = (
-            numbers(a, name, (...,), ModelError) for a, name in ((dt, "dt"), (np.zeros(0) if s is None else s, "s"))
-        )
+        dt, s = numbers(dt, "dt", (...,), ModelError), numbers([] if s is None else s, "s", (...,), ModelError)
         if s.shape[-1:] != (self.q,):
             names = ", ".join(signal.name for signal in self.signals.scheduling)
             raise ModelError(f"s has shape {s.shape}; it must end in {self.q}" + f", with {names}" * bool(names))

@@ -211,7 +211,7 @@ class EnvelopeMonitor:
         """
         given = (x, "x", self.model.n), (u, "u", self.model.m), (s, "s", self.model.q)
         z = np.concatenate([numbers(values, name, (count,), ModelError) for values, name, count in given])
-        verdict = self.expect(0, z, dt)
+        verdict = self.expect(0, z.tolist(), dt)
         return verdict.lower, verdict.upper
 
     def expect(self, t_ns: int, z: ArrayLike, dt: SupportsFloat) -> Verdict:

@@ -483,7 +483,7 @@ def propose(
     BagError
         A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
-    bags, layout = _recordings(paths, table or TableLayout())
+    bags, layout = _opened(paths, table or TableLayout())
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     warnings += set_aside_labels(sources, bags) if not states else []
@@ -537,7 +537,7 @@ def propose(
     return Proposal(tuple(chosen), tuple(used), text, tuple(warnings), tuple(members))
 
 
-def _recordings(paths: Sequence[str | os.PathLike[str]], layout: TableLayout) -> tuple[list[Recording], TableLayout]:
+def _opened(paths: Sequence[str | os.PathLike[str]], layout: TableLayout) -> tuple[list[Recording], TableLayout]:
     bags = group_recordings(list(paths), layout=layout)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")

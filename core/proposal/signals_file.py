@@ -282,7 +282,7 @@ def signals_file(
         "",
         *([] if plant else [_ADDITIVE, f"additive: {'both' if any(map(of_wheel, around)) else 'noise'}", ""]),
         *_sample_times(bags, states, controls),
-        *_of_table(layout),
+        *_layout_lines(layout),
         "",
         *(_SCALES_OF_PLANT if plant else _SCALES),
         *([f"# Beware: {doubt}."] if doubt else []),
@@ -336,7 +336,7 @@ def _sample_times(bags: Sequence[Recording], states: Sequence[Candidate], contro
     return lines
 
 
-def _of_table(layout: TableLayout) -> list[str]:
+def _layout_lines(layout: TableLayout) -> list[str]:
     if not (table := layout.to_dict()):
         return []
     texts = {key: _number(v, exact=True) if key == "step" else _quoted(v) for key, v in table.items()}
