@@ -165,6 +165,7 @@ def test_names_keep_the_letters_of_any_alphabet(tmp_path):
         x += 0.02 * (-2.0 * x + 3.0 * u) + 0.002 * math.sin(7 * k)
     proposal = propose([csv(tmp_path / "a.csv", ["Zeit", "Größe [mm]", "油门"], rows)])
     assert [c.name for c in (*proposal.states, *proposal.controls)] == ["größe_mm", "c_油门"]
+    assert [c.unit for c in (*proposal.states, *proposal.controls)] == ["mm", ""]
 
 
 def test_a_topic_that_one_recording_lacks_is_left_out(tmp_path):
@@ -1448,6 +1449,34 @@ def test_a_thousand_transitions_of_each_carry_more_signals_than_twelve(tmp_path,
     columns = {f"q{j}": joints[:, j] for j in range(13)} | {f"cmd_{j}": commands[:, j] for j in range(13)}
     found = propose([table_of(tmp_path / "a.csv", columns, fmt="%.6g")])
     assert len(found.controls) == proposed and len(found.states) == proposed
+
+
+@pytest.mark.parametrize("below", ["", "s,%,rpm,\u00b0C,,open,V\n"])
+def test_units_are_those_of_the_header_or_of_the_line_below_it(tmp_path, below):
+    rng = np.random.default_rng(6)
+    commands = np.repeat(rng.normal(size=(200, 1)), 20, axis=0)
+    gains = rng.normal(size=(1, 5))
+    heads = ["Time [s]", "Valve cmd (%)", "Shaft Speed [rpm]", "Oil {\u00b0C}", "Level [A]", "Level [B]", "Drop (1st)"]
+    if below:
+        heads = ["time", "valve_cmd", "shaft_speed", "oil", "level_1", "level_2", "drop"]
+    rows = np.column_stack(
+        [
+            0.1 * np.arange(4000),
+            commands,
+            np.column_stack(
+                [answers(rng, commands * g, pole=p) for g, p in zip(gains[0], (0.9, 0.8, 0.7, 0.95, 0.85), strict=True)]
+            ),
+        ]
+    )
+    path = tmp_path / "a.csv"
+    path.write_text(f"{','.join(heads)}\n{below}" + "".join(",".join(f"{v:.6g}" for v in row) + "\n" for row in rows))
+    found = propose([path])
+    units = {c.name: c.unit for c in [*found.states, *found.controls]}
+    named = [next(units.pop(name) for name in list(units) if name.startswith(of)) for of in ("shaft", "oil", "valve")]
+    assert named == ["rpm", "\u00b0C", "%"]
+    assert sum(map(bool, units.values())) == bool(below) and len(units) == 3  # brackets that tell two apart are no unit
+    (tmp_path / "s.yaml").write_text(found.text)
+    assert [s.unit for s in SignalMap.load(tmp_path / "s.yaml").controls] == ["%"]
 
 
 def test_of_a_long_recording_stretches_from_everywhere_are_looked_at():

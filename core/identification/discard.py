@@ -39,8 +39,7 @@ LARGEST, MOST_ELEMENTS, LONGEST_ROW = 200_000, 300, 32
 class Carriers:
     """Few transitions that carry the width of the envelope.
 
-    `transitions`: positions in the problem; `factor` (n,): mean width of each state with them, over its mean width
-    without.
+    `transitions`: positions in the problem; `factor` (n,): mean width of each state with them, over that without.
     """
 
     transitions: tuple[int, ...]

@@ -339,8 +339,7 @@ def solve_as_written(
 ) -> tuple[Array, Array, Array]:
     """Solve (10), or (11) row by row, over all samples at once, as written (docs/theory.md): an independent answer.
 
-    Returns (r, n): nominal elements, one column per row of the model, 1/s; Returns (q, n): half-widths of the same
-    shape.
+    Returns (r, n): nominal elements, one column per row of the model, 1/s; Returns (q, n): half-widths likewise.
     """
     import cvxpy as cp
 

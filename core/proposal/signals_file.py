@@ -86,7 +86,7 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
             numbered = (f"{name}_{number}" for number in count(2))
             candidate.name = next(n for n in chain([name], numbered) if n not in taken)
             taken.add(candidate.name)
-            candidate.unit = next((unit for pattern, unit in _UNITS if pattern.search(candidate.path)), "")
+            candidate.unit = candidate.unit or next((u for pattern, u in _UNITS if pattern.search(candidate.path)), "")
 
 
 def _words(candidate: Candidate, several_kinds: bool) -> list[str]:
@@ -460,7 +460,7 @@ def _place(name: str, member: str) -> str:
 def _quoted(text: str) -> str:
     """As YAML takes it: plain where it may stand so, and is not read as a number or a truth value."""
     special = re.fullmatch(r"(?i)(y|n|yes|no|on|off|true|false|null|nan|\\.inf)", text)
-    if re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_./-]*", text) and not special:
+    if re.fullmatch(r"[A-Za-z_/][A-Za-z0-9_./^-]*", text) and not special:
         return text
     return json.dumps(text, ensure_ascii=not text.isprintable())
 
@@ -470,7 +470,7 @@ def entry(candidate: Candidate, max_hold: float | None = None, comment: str = ""
     parts = [f"name: {_quoted(candidate.name)}", f"topic: {_quoted(candidate.topic)}"]
     parts.append(f'field: "{_in_yaml(candidate.path)}"')
     parts += [f"steady: {_number(candidate.steady)}", f"scale: {_number(candidate.scale)}"]
-    parts += [f"unit: {candidate.unit}"] * bool(candidate.unit)
+    parts += [f"unit: {_quoted(candidate.unit)}"] * bool(candidate.unit)
     parts += [] if max_hold is None else [f"max_hold: {_number(max_hold)}"]
     parts += ["judged: true"] * candidate.judged
     parts += [f"delay: {candidate.delay}"] * bool(candidate.delay)

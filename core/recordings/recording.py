@@ -102,7 +102,8 @@ class Recording(ABC):
     in their place: a format without topics gives its data one, with fields that `FieldPath` reads.
 
     `path`: file or folder, as errors and reports call the recording; `parts`: its files, in order; `size`: bytes of
-    these; `topics`: by name; `indexed`: whether anything known of it comes from an index that reading may prove wrong.
+    these; `topics`: by name; `indexed`: whether reading may prove an index wrong from which some of it is known;
+    `units`: of fields by path, where the file says them.
     """
 
     path: Path
@@ -110,6 +111,7 @@ class Recording(ABC):
     size: int
     topics: Mapping[str, TopicInfo]
     indexed = False
+    units: Mapping[str, str] = MappingProxyType({})
     _warnings: list[str]  # what is missing or left out
     _undecoded: Mapping[str, str] = MappingProxyType({})  # likewise, of messages left out by topic
 

@@ -41,6 +41,7 @@ from uncertain_lti.recordings.table_text import (
     field_name,
     find_column,
     unique,
+    units_of,
     without_bad,
 )
 from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
@@ -112,8 +113,10 @@ class Table(Recording):
         self._warnings += [f"{file}: {note}" for note in _no_numbers({name: raw.columns[name] for name in names})]
         self._warnings += [f"{path}: {note}" for note in notes]
         here = slice(None) if np.array_equal(kept, np.arange(len(times))) else kept
-        fields = zip(once(map(field_name, names), "_"), names, strict=True)
-        self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields}
+        fields = dict(zip(once(map(field_name, names), "_"), names, strict=True))
+        units = units_of(names, raw.units)
+        self.units = {field: units[name] for field, name in fields.items() if name in units}
+        self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields.items()}
         self._quaternions = _quaternions(self.columns_by_field)
         reason = ""
         if not names:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import codecs
 import csv
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -50,6 +51,13 @@ _WIDE = {  # by which of a text's first four bytes are not 0
 _CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
 _ARROW = re.compile(r"(\d\d:\d\d:\d\d\.\d{3}) -> (.*)", re.DOTALL)  # as the serial monitor of Arduino writes a line
 QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?P<unit>[^\W\d_]\S{0,7}|[%°]\S{0,7})")
+_BASE = (
+    "[munpµμkcdhMG]?(?:m|g|s|A|K|V|W|N|J|Pa|Hz|T|bar|rad|Ω|Ohm|ohm|Ah|Wh|VA|var|l|L|mol|Nm|eV)|°[CFKA]*|deg[CFKA]*|[CFHt%‰]"
+    "|%RH|rpm|rev|ppm|ppb|psi|ft|lbf?|mph|mi|knots|kt|gal|Torr|atm|U|min|h|d|1"
+)
+_FACTOR = rf"(?:{_BASE})[²³]?(?:(?:\^|\*\*)?-?\d)?"
+_UNIT = re.compile(rf"(?!(?:min|U|d|1)$){_FACTOR}(?:[*·⋅./ ]{_FACTOR})*")
+_IN_BRACKETS = re.compile(r"(?P<of>.*[^\s_])[\s_]*(?:\[(?P<a>[^\[\]]+)\]|\((?P<b>[^()]+)\)|\{(?P<c>[^{}]+)\})\s*")
 _MOST_COLUMNS = 20_000
 _ODD_CELL = re.compile(r"could not convert string .* at row (\d+), column (\d+)")  # of numpy.loadtxt
 _MOST_PASSED = 10**6  # rows that may be passed over again for such cells
@@ -66,8 +74,8 @@ class RawTable:
     """What a file holds.
 
     `columns`: by the names in the file, in their order; `notes`: what was left out or changed, each a part of a
-    sentence; `exact`: takes the name of a column of numbers, and returns the text of its cells; None where there is no
-    text; `units`: what a line below the names says of some columns.
+    sentence; `exact`: gives the text of the cells of a column of numbers by its name, where there is text; `units`:
+    what a line below the names says of some columns.
     """
 
     columns: Mapping[str, Column]
@@ -330,6 +338,16 @@ def field_name(column: str) -> str:
     """Name of a column as a field path takes it: `Speed [rpm]` is `Speed_rpm`."""
     name = re.sub(r"\W+", "_", column).strip("_") or "column"
     return name if re.match(r"[A-Za-z_]", name) else f"c_{name}"
+
+
+def units_of(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
+    """Units of columns by name, of `Speed [rpm]` or below it; none where brackets tell columns of one name apart."""
+    parts = {name: found for name in names if (found := _IN_BRACKETS.fullmatch(name))}
+    alike = Counter(match["of"] for match in parts.values())
+    alike.update(names)
+    units = {n: m["a"] or m["b"] or m["c"] for n, m in parts.items() if alike[m["of"]] == 1}
+    units |= {name: unit.strip("[](){} ") for name, unit in stated.items() if name in names}
+    return {name: unit.strip() for name, unit in units.items() if _UNIT.fullmatch(unit.strip())}
 
 
 QUALITY = re.compile(r"(?i)(?P<of>(.*[\W_])?)(q|qc|qual|quality)\d*")
