@@ -230,12 +230,15 @@ def test_a_state_that_stops_is_frozen_beyond_what_was_recorded(repeats, dt, rate
 
 @pytest.mark.parametrize(
     ("longest", "rate", "steps"),
-    [(0.0, 5.0, 3), (1.0, 5.0, 3), (2.0, 0.2, 4), (3.0, 0.2, None)],
+    [(0.0, 5.0, 3), (1.0, 5.0, 3), (2.0, 0.2, 5), (3.0, 0.2, None), (4.0, 5.0, 9), (60.0, 500.0, 11)],
 )
 def test_at_a_sample_a_second_two_equal_ones_are_no_repeat_and_three_a_rest(
     longest: float, rate: float, steps: int | None
 ) -> None:
-    """However far the model moves the state meanwhile; a rest of the fit may be longer the next time."""
+    """However far the model moves the state meanwhile; a rest of the fit may be longer the next time.
+
+    Of a coarse sensor some equal samples are chance at any rate: up to twice the most of the fit, and ten.
+    """
     repeats, sampling = Repeats([longest], [0.75], [LARGEST], [LARGEST]), Sampling(1.0, 1.0, 1.0)
     model = UncertainLTI([[0.0]], [[rate]], [[0.0]], [[0.0]], v=[0.5], repeats=repeats, sampling=sampling)
     x = np.concatenate([np.linspace(5.0, 4.0, 20), np.full(10, 4.0)])[:, None]

@@ -298,9 +298,9 @@ def _activity(model: Any, transient: Any, steps: Any) -> tuple[Array, Array]:
 FARTHER = 2.0
 """How many times what the recordings reached a measure must be, and a short repeat the longest of them."""
 
-USUAL_S = 0.25
-"""Seconds up to which a repeat is usual, s, if the fit has repeats half as long: those of a coarse sensor in motion.
-So long must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
+USUAL_S, USUAL = 0.25, 10
+"""Seconds and usual steps up to which a repeat is usual if the fit has repeats half as long: of a coarse sensor in motion.
+The seconds must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
 
 LEAST = 3
 """Steps that a repeat must have, but of a slow sensor that noise changes: two equal samples may be chance."""
@@ -350,7 +350,8 @@ class FrozenWatch:
         longest, reached = repeats.longest_repeat_s, np.array([repeats.largest_run, repeats.largest_sum])
         known = np.isfinite(reached)  # of a model that was changed after its fit they are not
         beyond = np.vstack([np.maximum(1.0, FARTHER * np.where(known, reached, 0.0)), repeats.active_beyond])
-        usual = np.where(known[0], np.maximum(np.minimum(FARTHER * longest, USUAL_S), (LEAST - 0.5) * dt), longest)
+        coarse = np.minimum(FARTHER * longest, max(USUAL_S, USUAL * dt))
+        usual = np.where(known[0], np.maximum(coarse, (LEAST - 0.5) * dt), longest)
         noisy = np.where(longest == 0.0, repeats.noisy_steps, 0.0)
         by_noise = np.where(noisy >= NOISY, USUAL_S, np.inf), np.where(noisy >= SLOW_NOISY, SLOW_S, np.inf)
         thresholds = np.vstack([usual, longest, np.where(beyond < LARGEST, beyond, np.inf), *by_noise]).T
