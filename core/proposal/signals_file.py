@@ -414,10 +414,12 @@ def _is_pulled(state: Candidate, controls: Sequence[Candidate]) -> bool:
 
 
 def _goes_round(candidate: Candidate) -> bool:
-    """Whether an angle went round by half a turn or more."""
-    spans = (np.ptp(of[np.isfinite(of)]) for of in candidate.values if np.isfinite(of).any())
+    """Whether an angle went round by half a turn or more, in one recording or in all: each may begin elsewhere."""
     turn = FieldPath(candidate.path).unwrap
-    return turn > 0 and max(spans, default=0.0) >= turn / 2
+    if not turn:
+        return False
+    around = np.unique(candidate.finite % turn)
+    return bool(np.diff(around, append=around[0] + turn).max() <= turn / 2)
 
 
 def for_members(lines: Sequence[str], one: str, members: Mapping[str, Sequence[Candidate]]) -> list[str]:
