@@ -119,6 +119,13 @@ def test_controls_that_nearly_move_together_are_named_with_the_cure():
     assert "record 'a' moving while 'b' and 'c' rest;" in f"{message};", message
 
 
+def test_signals_of_which_the_level_is_most_are_not_said_to_move_together():
+    """With the recorded values as they are, temperatures and a set point that is always 40 were."""
+    one = run(noise=0.0)
+    found = [messages(one.replace(x=one.x + level, u=one.u + 30)) for level in (0, 20)]
+    assert all(WORDS["collinear"] not in text for text in found[1]), found
+
+
 def test_columns_that_move_together_in_two_ways_are_named_once():
     one = run(noise=0.0)
     twice = [m for m in messages(Transient(one.t_ns, one.x[:, [0, 0, 1, 1]], one.u, name="run")) if "rank def" in m]

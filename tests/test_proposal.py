@@ -2031,7 +2031,7 @@ def test_nothing_depends_on_where_a_vehicle_is(tmp_path, turn):
 
 @pytest.mark.parametrize(("apart", "depends"), [(2.1, False), (0.2, True)])
 def test_nothing_depends_on_a_heading_that_each_recording_has_elsewhere(tmp_path, apart, depends):
-    """A quadruped that turned by less than half a turn in each was UNKNOWN in 3 of 8 healthy runs, for where it headed."""
+    """A quadruped that turned less than half a turn in each was UNKNOWN in 3 of 8 runs, as it headed elsewhere."""
     rng, bags = np.random.default_rng(3), []
     for k in range(3):
         place, messages = np.zeros(2), []

@@ -146,8 +146,7 @@ def describe(
         lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
         messages += lacking.values()
         messages += _weak(problem, sums, signals, past, lacking)
-        later = [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)]
-        messages += _fed_back(part, names, past, later)
+        messages += _fed_back(part, names, past, [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)])
         messages += _noisy({i: share for i, share in noisy.items() if i not in lacking}, names, part.dt)
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
@@ -214,7 +213,8 @@ def _collinear(
     problem: Fleet | Problem, sums: Moments, names: Sequence[str], past: Collection[int], rows: Rows
 ) -> list[str]:
     """Signals that nearly move together, and the recording that would separate them."""
-    free = np.flatnonzero((sums.phi_scale[: problem.p] > 0) & ~np.isin(range(problem.p), list(past)))
+    away = np.maximum(sums.low, -sums.high) > sums.high - sums.low  # a level, which says nothing on how it moves
+    free = np.flatnonzero((sums.phi_scale[: problem.p] > 0) & ~away & ~np.isin(range(problem.p), list(past)))
     found: dict[str, str] = {}  # several combinations may be of the same signals
     for columns, value, vector in sorted(_directions(sums, free, rows), key=itemgetter(1)):
         part = [columns[j] for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]

@@ -299,7 +299,7 @@ FARTHER = 2.0
 """How many times what the recordings reached a measure must be, and a short repeat the longest of them."""
 
 USUAL_S, USUAL = 0.25, 10
-"""Seconds and usual steps up to which a repeat is usual if the fit has repeats half as long: of a coarse sensor in motion.
+"""Seconds, and usual steps, up to which a repeat is usual if the fit has some half as long: a coarse sensor in motion.
 The seconds must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
 
 LEAST = 3
