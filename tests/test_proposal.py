@@ -1849,6 +1849,18 @@ def test_a_mode_or_a_counter_tells_no_runs_apart(tmp_path, ids):
     assert "table:" not in propose([path]).text
 
 
+def test_what_switches_a_steady_power_is_a_control_and_no_copy_of_it(tmp_path):
+    """A power known to 1 % was a state, with bounds as wide as itself, for want of the switch that left."""
+    rng = np.random.default_rng(0)
+    on = np.repeat(rng.integers(0, 2, 60), 20)
+    power, level = np.round(on * (12.8 + 0.02 * rng.normal(size=1200)), 2), np.cumsum(0.1 * rng.normal(size=1200))
+    rows = zip(60 * np.arange(1200), power, on, on * 24, np.round(level, 3), strict=True)
+    path = csv(tmp_path / "plant.csv", ["time", "P1_POWER", "P1_RUN", "P1_VOLTS", "LEVEL"], rows)
+    proposal = propose([path])
+    assert {c.path for c in proposal.controls} == {"P1_POWER", "P1_RUN"}, proposal.text
+    assert "P1_VOLTS: moves with P1_RUN" in proposal.text and [c.path for c in proposal.states] == ["LEVEL"]
+
+
 def test_a_plant_has_every_measurement_judged_and_what_is_set_as_controls(tmp_path):
     """A pump that is switched and its flow, one that never ran, an analyser, a label, a valve of a controller."""
     rng = np.random.default_rng(0)

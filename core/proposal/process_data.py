@@ -60,7 +60,10 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for candidate in every:
         if re.match(rf"{ALWAYS}|leaves its usual|{TWO_VALUES}", candidate.reason):  # what hardly moves is a signal, too
             candidate.reason = ""
-    drop_copies([c for c in every if not c.reason and np.ptp(c.finite) > 0], exact=True)
+    moving = [c for c in every if not c.reason and np.ptp(c.finite) > 0]
+    two_valued = [c for c in moving if len(np.unique(c.finite)) == 2]
+    for alike in (two_valued, [c for c in moving if c not in two_valued]):  # a power is no copy of what switches it
+        drop_copies(alike, exact=True)
     free = [c for c in every if not c.reason]
     called = {c for s in sources if s.role in ("control", "reference") for c in s.candidates}
     controls = [c for c in free if _is_set(c, c in called)]
