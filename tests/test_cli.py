@@ -300,6 +300,11 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, cli):
     assert "outside the fitted domain, where nothing vouches for the bounds" in first and "says nothing" in last
     assert re.search(r"that reach as far: \w+ at [\d.-]+ to [\d.-]+ \(fitted: [\d.-]+ to [\d.-]+\)$", first)
     assert cli.json("report", path, folder / "run.mcap", status=3)["recordings"][0]["outcome"] == "unknown"
+    again = folder / "again.mcap"
+    again.write_bytes((folder / "run.mcap").read_bytes())
+    both = cli("check", path, folder / "run.mcap", again, status=3).out
+    assert "\n\nUNKNOWN: " in both  # and not below the text of the first
+    again.unlink()
     printed = cli.json("check", path, folder / "run.mcap", status=3)
     assert (printed["outcome"], printed["exit_status"], printed["alarm"]) == ("unknown", 3, False)
     (recording,) = printed["recordings"]

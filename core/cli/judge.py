@@ -172,7 +172,8 @@ def check(options: argparse.Namespace) -> Result:
         if data["alarm"] and not data["reason"]:
             files = bag.parts if len(bag.parts) > 1 and not bag.path.is_dir() else [bag.path]
             loud += map(shlex.quote, map(str, files))
-        options.say(check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
+        apart = "\n" * (len(results) > 1)  # some begin with a headline, before the name
+        options.say(apart + check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
         if (copy := copies.get(bag)) is not None:
             writing = options.progress.iterate("writing")
             made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, deployed.monitor.rule, writing)
