@@ -327,6 +327,7 @@ def test_no_sentence_on_a_repeat_contradicts_itself() -> None:
     assert repeat_words(89.34, 89.26) == "repeats exactly for 89.3 s"
     assert repeat_words(3.0, 2.0) == "repeats exactly for 3 s (at most 2 s in the fit)"
     assert repeat_words(3.0, 0.0) == "repeats exactly for 3 s (never in the fit)"
+    assert repeat_words(36000.0, 510.0) == "repeats exactly for 10 h (at most 8.5 min in the fit)"
 
 
 def test_a_training_recording_with_bounds_of_no_width_is_not_frozen() -> None:

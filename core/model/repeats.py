@@ -46,6 +46,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LARGEST, Array
 from uncertain_lti.base.errors import ModelError
+from uncertain_lti.base.text import lasting
 from uncertain_lti.kernel import arithmetic as kernel
 from uncertain_lti.model.terms import checked, object_of
 
@@ -458,7 +459,8 @@ class Partly:
 
 def repeat_words(seconds: float, longest: float) -> str:
     """What is said of a repeat: what is longer than any of the fit, and how long those were."""
-    said = f"repeats exactly for {seconds:.3g} s"
-    if f"{seconds:.3g}" == f"{longest:.3g}" or seconds <= longest:
+    now, most = (lasting(time / 3600.0) for time in (seconds, longest))
+    said = f"repeats exactly for {now}"
+    if now == most or seconds <= longest:
         return said
-    return f"{said} ({f'at most {longest:.3g} s' if longest > 0.0 else 'never'} in the fit)"
+    return f"{said} ({f'at most {most}' if longest > 0.0 else 'never'} in the fit)"

@@ -523,7 +523,7 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     jumps = filter(None, (s["jump"] for s in data["states"].values()))
     by_size = sorted(jumps, key=lambda j: j["largest_in_fit"] / abs(j["change"]))
     blocks += _first([f"{j['text']} at {instant_text(j)}" for j in by_size], "jump")
-    frozen = ["FROZEN: {text}, told after {told_after:.3g} s, {why}".format_map(repeat) for repeat in data["frozen"]]
+    frozen = [f"FROZEN: {r['text']}, told after {lasting(r['told_after'] / 3600)}, {r['why']}" for r in data["frozen"]]
     blocks += _first(frozen, "frozen repeat")
     rest = "as of a machine at rest: the model does not move it"
     longest = [(r["text"], f"while {shortlist(r['moving'], 3)} moved" * bool(r["moving"])) for r in long_repeats(data)]
