@@ -23,7 +23,7 @@ ARGUMENTS = {
     "name": ("envelope_monitor", "Name of the node."),
     "namespace": ("", "Namespace of the node and its outputs."),
     "topic_prefix": ("", "Prefix of the topics of the model; 'namespace' for the namespace of the node."),
-    "use_sim_time": ("false", "Follow /clock."),
+    "use_sim_time": ("", "Follow /clock, true or false; empty: as the parameter file or SetParameter says."),
     "autostart": ("", "Configure and activate without being asked, true or false; empty: as the parameter file says."),
     "required": ("false", "The launch ends when the node does, and the node ends if its model is wrong."),
     "respawn": ("false", "Start the node again when it ends."),
@@ -46,16 +46,16 @@ def start(context):
         delay = float(given["respawn_delay"])
     except ValueError:
         raise ValueError(f"respawn_delay:={given['respawn_delay']} is no number; give seconds") from None
-    values = {"use_sim_time": truth("use_sim_time", given["use_sim_time"])}
+    values = {name: truth(name, given[name]) for name in ("use_sim_time", "autostart") if given[name]}
     if given["model"]:
         values["model"] = given["model"]
-    if given["autostart"]:
-        values["autostart"] = truth("autostart", given["autostart"])
     if required:
         values["required"] = True
     if given["topic_prefix"]:
-        of_node = "/" + given["namespace"].strip("/")
-        values["topic_prefix"] = of_node if given["topic_prefix"] == "namespace" else given["topic_prefix"]
+        prefix, below = given["topic_prefix"], given["namespace"]
+        if not below.startswith("/"):  # then it is below what PushRosNamespace of launch files around this one gives
+            below = f"{context.launch_configurations.get('ros_namespace', '')}/{below}"
+        values["topic_prefix"] = "/" + below.strip("/") if prefix == "namespace" else prefix
     node = LifecycleNode(
         package="uncertain_lti_ros",
         executable="envelope_monitor",

@@ -276,3 +276,21 @@ def test_a_launch_argument_that_is_no_number_is_named(monkeypatch):
     launched["start"].__globals__["LaunchConfiguration"] = lambda name: MagicMock(perform=lambda _: given[name])
     with pytest.raises(ValueError, match="^respawn_delay:=abc is no number; give seconds$"):
         launched["start"](None)
+
+
+@pytest.mark.parametrize(
+    ("pushed", "namespace", "inputs"),
+    [("", "robot1", "/robot1"), ("/robot7", "", "/robot7"), ("fleet", "r8/", "/fleet/r8"), ("fleet", "/r8", "/r8")],
+)
+def test_a_launched_monitor_follows_the_launch_files_around_its_own(monkeypatch, pushed, namespace, inputs):
+    """Its inputs its namespace, also what PushRosNamespace puts before it, and /clock SetParameter or the file."""
+    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    launched = runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))
+    given = {name: default for name, (default, _) in launched["ARGUMENTS"].items()}
+    given |= {"namespace": namespace, "topic_prefix": "namespace"}
+    launched["start"].__globals__["LaunchConfiguration"] = lambda name: MagicMock(perform=lambda _: given[name])
+    launched["start"](SimpleNamespace(launch_configurations={"ros_namespace": pushed} if pushed else {}))
+    file, values = sys.modules["launch_ros.actions"].LifecycleNode.call_args.kwargs["parameters"]
+    assert values == {"topic_prefix": inputs}, "and use_sim_time is left to others"
+    assert file == given["params_file"]
