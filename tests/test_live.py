@@ -662,7 +662,7 @@ def test_what_cannot_be_configured_says_why_and_can_be_mended(world: World, tmp_
     diagnostics.reaches(STALE, saying="no verdict yet")
 
 
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_ends_the_node_with_status_0(world: World, tmp_path: Path, end: int) -> None:
     diagnostics = world.diagnostics()
     process = world.monitor(saved(by_hand(), tmp_path))

@@ -199,7 +199,7 @@ def test_what_a_shared_file_says_to_other_nodes_is_no_reason_to_refuse(tmp_path:
             starts(world, file, nothing)
 
 
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_while_a_program_is_imported_ends_it_with_status_0(tmp_path: Path, end: int) -> None:
     first = (
         "import builtins, os, sys; from uncertain_lti_ros.nodes import envelope_monitor; real = builtins.__import__\n"

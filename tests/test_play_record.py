@@ -209,6 +209,31 @@ def test_recording_takes_the_quality_of_service_it_finds_and_writes_it_down(worl
     assert player.succeed()
 
 
+def test_a_terminal_that_is_closed_ends_recording_in_order_unless_that_is_ignored(world: World, tmp_path: Path) -> None:
+    ignoring = f"import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN); {COMMANDS}"
+    publisher = world.publisher(Float64, "/power")
+    outputs = [tmp_path / name for name in ("closed.mcap", "goes-on.mcap")]
+    closed = recorder(world, ["/power"], outputs[0])
+    goes_on = world.start("nohup", "-c", ignoring, "record", "/power", "--output", str(outputs[1]))
+    goes_on.says("recording")
+    until(lambda: publisher.get_subscription_count() == 2, "both recorders")
+    parts = [output.with_name(f"{output.name}.part") for output in outputs]
+    empty = [part.stat().st_size for part in parts]
+
+    def written() -> bool:
+        publisher.publish(Float64(data=1.0))
+        return all(part.stat().st_size > size for part, size in zip(parts, empty, strict=True))
+
+    until(written, "messages on the disk")
+    for process in (closed, goes_on):
+        process.signal(signal.SIGHUP)
+    closed.succeed()
+    assert goes_on.running
+    goes_on.signal(signal.SIGINT)
+    goes_on.succeed()
+    assert all([*Bag(output).raw_messages()] for output in outputs)
+
+
 def test_what_comes_after_the_recorder_stood_still_is_put_in_the_order_of_sending(world: World, tmp_path: Path) -> None:
     """More than Fast DDS holds for it, so that the rest is sent again, one topic after the other."""
     pair = [world.publisher(Float64, name) for name in ("/command", "/state")]

@@ -10,10 +10,17 @@
 """ROS 2 nodes around ``uncertain_lti``: parameters, QoS, clocks and messages; no numerics of their own."""
 
 import os
+import signal
 import sys
 from pathlib import Path
 
 from uncertain_lti.base.errors import UncertainLTIError
+
+
+def endings() -> list[int]:
+    """Signals that end a process in order; SIGHUP, of a terminal that was closed, unless it is ignored (`nohup`)."""
+    closed = [] if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else [signal.SIGHUP]
+    return [signal.SIGINT, signal.SIGTERM, *closed]
 
 
 def hold_middleware() -> None:

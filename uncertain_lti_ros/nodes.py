@@ -18,7 +18,7 @@ import traceback
 from importlib import import_module
 
 from uncertain_lti.base.errors import UncertainLTIError
-from uncertain_lti_ros import hold_middleware
+from uncertain_lti_ros import endings, hold_middleware
 
 _BAD_USAGE, _FAULT = 2, 70
 
@@ -40,7 +40,7 @@ def turbofan() -> int:
 
 def _run(module: str, function: str) -> int:
     name = module if function == "main" else function
-    for number in (signal.SIGINT, signal.SIGTERM):  # until `living` takes them over, a second later
+    for number in endings():  # until `living` takes them over, a second later
         signal.signal(number, lambda *_: os._exit(0))
     try:
         hold_middleware()

@@ -37,6 +37,7 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Future
 
 from uncertain_lti.base.errors import UncertainLTIError
+from uncertain_lti_ros import endings
 
 BAD_USAGE = 2
 _LAST_DOMAIN = 232
@@ -270,7 +271,7 @@ _LAST = 20  # s that taking the middleware down may take after a signal
 
 
 class Life:
-    """One node on one executor; `alive` turns false on SIGINT and SIGTERM.
+    """One node on one executor; `alive` turns false on a signal of `endings`.
 
     The events executor keeps messages in order of arrival; without a time limit its calls keep a core busy and
     deliver nothing in some releases, so it is driven by timed calls. If it is absent the default executor
@@ -373,7 +374,7 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
         if life is not None:
             life.end()
 
-    before = {name: signal.signal(name, end) for name in (signal.SIGINT, signal.SIGTERM)}
+    before = {name: signal.signal(name, end) for name in endings()}
     try:
         try:
             rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
