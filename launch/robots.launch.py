@@ -9,6 +9,7 @@
 
 """Start one envelope_monitor per robot: each in the namespace of its robot, with its inputs from there."""
 
+import re
 from pathlib import Path
 
 from launch import LaunchDescription
@@ -22,8 +23,11 @@ ONE = Path(__file__).resolve().parent / "envelope_monitor.launch.py"
 def start(context):
     """Include the launch file of one monitor for each robot."""
     robots = [name.strip("/ ") for name in LaunchConfiguration("robots").perform(context).split(",")]
-    if not all(robots):
-        raise ValueError("robots:=NAME,NAME,... names the robots, for example robots:=robot1,robot2")
+    # A name that launch_ros refuses would end the launch, but none of the monitors that it has begun to start.
+    if not all(re.fullmatch(r"\w+(/\w+)*", name, re.ASCII) for name in robots) or len({*robots}) < len(robots):
+        raise ValueError(
+            f"robots:={','.join(robots)} must name each robot once, in letters, digits, _ and /, as in robot1,robot2"
+        )
     shared = {name: LaunchConfiguration(name).perform(context) for name in ("model", "required")}
     return [
         IncludeLaunchDescription(

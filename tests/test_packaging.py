@@ -294,3 +294,16 @@ def test_a_launched_monitor_follows_the_launch_files_around_its_own(monkeypatch,
     file, values = sys.modules["launch_ros.actions"].LifecycleNode.call_args.kwargs["parameters"]
     assert values == {"topic_prefix": inputs}, "and use_sim_time is left to others"
     assert file == given["params_file"]
+
+
+@pytest.mark.parametrize("robots", ["robot1,", "robot1,robot 2", "robot1,robot-2", "robot1,/robot1/"])
+def test_robots_that_cannot_be_launched_are_refused_before_any_is(monkeypatch, robots):
+    """The monitor of the first was left running."""
+    names = "actions", "launch_description_sources", "substitutions"
+    for name in ("launch", *(f"launch.{name}" for name in names)):
+        monkeypatch.setitem(sys.modules, name, MagicMock())
+    start = runpy.run_path(str(ROOT / "launch/robots.launch.py"))["start"]
+    start.__globals__["LaunchConfiguration"] = lambda _: MagicMock(perform=lambda _: robots)
+    with pytest.raises(ValueError, match="must name each robot once, in letters"):
+        start(None)
+    assert not sys.modules["launch.actions"].IncludeLaunchDescription.called
