@@ -19,8 +19,10 @@ import pytest
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 pytest.importorskip("cyclonedds", reason="the cyclonedds wheel, which subscribes here, is not installed")
 
-from ros_processes import World
+from perturbed import STATE
+from ros_processes import STALE, World
 from ros_processes import world as world
+from sensor_msgs.msg import JointState
 from test_live import by_hand, everything_armed, header_bag, offline, saved
 
 from uncertain_lti.sampling.clock import Status
@@ -83,6 +85,41 @@ time.sleep(0.3)
 beats += [m.data for m in violation.take(1000)]
 print(json.dumps([got, beats]), flush=True)
 """
+
+
+_PUBLISHER = """
+import sys, time
+from dataclasses import dataclass
+from cyclonedds.core import Policy, Qos
+from cyclonedds.domain import DomainParticipant
+from cyclonedds.idl import IdlStruct
+from cyclonedds.pub import DataWriter
+from cyclonedds.topic import Topic
+
+@dataclass
+class JointState(IdlStruct, typename="sensor_msgs::msg::dds_::JointState_"):
+    frame_id: str
+
+participant = DomainParticipant(int(sys.argv[1]))
+named = Qos(Policy.Userdata(b"typehash=RIHS01_" + b"0a" * 32 + b";"))  # as nodes name the fields of their types
+writer = DataWriter(participant, Topic(participant, "rt/plant/state", JointState), qos=named)
+print("there", flush=True)
+time.sleep(600)
+"""
+
+
+def test_a_publisher_of_another_version_of_the_type_is_told(world: World, tmp_path: Path) -> None:
+    world.monitor(saved(by_hand(), tmp_path))
+    world.env["CYCLONEDDS_URI"] = _CONFIGURATION
+    diagnostics = world.diagnostics()
+    ours = world.publisher(JointState, STATE)
+    World.subscribed(ours)
+    since = diagnostics.count
+    world.start("publisher", "-c", _PUBLISHER, world.env["ROS_DOMAIN_ID"]).says("there")
+    told = f"{STATE}: a publisher sends another version of sensor_msgs/msg/JointState, which may be misread"
+    diagnostics.reaches(STALE, saying=told, since=since)
+    before = [array.status[0].message for array in diagnostics.topic.messages[:since]]
+    assert not any("another version" in said for said in before), "nor of the same"
 
 
 def test_another_vendor_hears_every_flag(world: World, tmp_path: Path) -> None:

@@ -127,10 +127,7 @@ def whole_to_real(given: Parameter, default: object) -> Parameter:
 def run_node(
     name: str, summary: str, parameters: Sequence[Declared], run: Callable[[list[str]], int], args: Sequence[str] | None
 ) -> int:
-    """Run a node on some arguments.
-
-    `--help` prints what the node is and its parameters.
-    """
+    """Run a node on some arguments; `--help` prints what the node is and its parameters."""
     given = list(sys.argv[1:] if args is None else args)
     if "--help" in given or "-h" in given:
         print(_help(name, summary, parameters))

@@ -36,6 +36,8 @@ from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+from rclpy.type_hash import TypeHash
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 
@@ -302,9 +304,19 @@ class MatchedSubscription:
                 self.destroy()
                 self._subscribe(qos)
         why = {f"cannot be heard, {problem}" for offer in offers for problem in incompatible(self.qos, offer)}
+        if self._has_another_version(infos):
+            why.add(f"sends another version of {self.type_name}, which may be misread; build both from the same one")
         others = {info.topic_type for info in infos} - {self.type_name}
         why |= {f"sends {other}, and {self.type_name} is wanted" for other in others}
         self.problems = [f"{self.topic}: a publisher {what}" for what in sorted(why)]
+
+    def _has_another_version(self, publishers: Iterable[TopicEndpointInfo]) -> bool:
+        """Whether one of them has a type of this name with other fields, which the middleware takes for the same."""
+        readers = self._node.get_subscriptions_info_by_topic(self._asked_topic)
+        me = self._node.get_name(), self._node.get_namespace()
+        ours = {str(i.topic_type_hash) for i in readers if (i.node_name, i.node_namespace) == me}
+        theirs = {str(i.topic_type_hash) for i in publishers if i.topic_type == self.type_name}
+        return bool(ours and theirs - ours - {str(TypeHash())})  # that of no ROS node
 
     def takes_turns(self) -> bool:
         """Whether messages of several publishers come by turns, at the usual pace of these turns."""
