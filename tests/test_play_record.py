@@ -360,6 +360,8 @@ def test_a_disk_that_is_full_ends_recording_in_a_sentence(world: World, tmp_path
         (["/a", "/b", "-o", "x.mcap", "--wait", "0.2"], "/a, /b: not there after 0.2 s"),
         (["/a b", "-o", "x.mcap", "--wait", "0.2"], "'/a b' is no topic name"),
         (["", "-o", "x.mcap", "--wait", "0.2"], "'' is no topic name"),
+        (["/a", "-o", ""], "--output '' names no file; give one, as in run.mcap"),
+        (["/a", "-o", "/"], "--output '/' names no file"),
     ],
 )
 def test_what_cannot_be_recorded_is_said_in_a_sentence(command, tmp_path, monkeypatch, arguments, sentence):
@@ -368,6 +370,28 @@ def test_what_cannot_be_recorded_is_said_in_a_sentence(command, tmp_path, monkey
     status, said = command("record", *arguments)
     assert status == 2 and sentence in said and "Traceback" not in said
     assert (tmp_path / "there.mcap").read_bytes() == b"old" and not list(tmp_path.glob("x.mcap*"))
+
+
+def test_a_file_that_is_moved_away_or_comes_while_recording_is_told_and_kept(world: World, tmp_path: Path) -> None:
+    """Hours were recorded to a file that nothing led to any more; a file that had come was overwritten."""
+    publisher = world.publisher(Float64, "/power")
+    removed, replaced = (recorder(world, ["/power"], tmp_path / name) for name in ("removed.mcap", "replaced.mcap"))
+    until(lambda: publisher.get_subscription_count() == 2, "both recorders")
+    (tmp_path / "removed.mcap.part").rename(tmp_path / "elsewhere")
+    (tmp_path / "replaced.mcap").write_text("precious")
+    part = tmp_path / "replaced.mcap.part"
+    empty = part.stat().st_size
+
+    def written() -> bool:
+        publisher.publish(Float64(data=1.0))
+        return part.stat().st_size > empty and not removed.running
+
+    until(written, "messages on the disk, and the end of the other")
+    assert removed.wait() == 2
+    assert "removed.mcap.part: was moved or removed while recording; look for it" in removed.output
+    replaced.signal(signal.SIGINT)
+    assert replaced.wait() == 2 and f"came while recording; what was recorded is in {part}" in replaced.output
+    assert (tmp_path / "replaced.mcap").read_text() == "precious" and [*Bag(part).raw_messages()]
 
 
 def test_a_recording_of_silence_is_said_and_leaves_no_file(world: World, tmp_path: Path) -> None:

@@ -65,6 +65,8 @@ def run(args: argparse.Namespace) -> Result:
     While recording it is called BAG.part, with all but the last seconds readable.
     """
     output = Path(args.output)
+    if output.name in ("", ".."):
+        raise ArgumentError(f"--output {args.output!r} names no file; give one, as in run.mcap")
     if output.suffix != ".mcap":
         output = output.with_name(f"{output.name}.mcap")
     simulated: bool = args.use_sim_time
@@ -265,6 +267,8 @@ class _File:
                 self._stream.flush()
                 os.fsync(self._stream.fileno())
             self._stream.close()
+            if self.count and self.path.exists():
+                raise BagError(f"{self.path}: came while recording; what was recorded is in {self._part}")
             if self.count:
                 os.replace(self._part, self.path)
             else:
@@ -272,7 +276,12 @@ class _File:
         except OSError as error:
             with suppress(OSError):  # or the interpreter tries again, and says so
                 self._stream.close()
-            raise BagError(f"{self._part}: cannot be finished: {error.strerror}; what is in it can be read") from None
+            raise self._failed(error, "cannot be finished", "what is in it can be read") from None
+
+    def _failed(self, error: OSError, what: str, remedy: str) -> BagError:
+        if isinstance(error, FileNotFoundError):
+            return BagError(f"{self._part}: was moved or removed while recording; look for it, or record again")
+        return BagError(f"{self._part}: {what}: {error.strerror}; {remedy}")
 
     @property
     def span(self) -> float:
@@ -296,14 +305,15 @@ class _File:
     def flush(self) -> None:
         self._to_disk(self._writer.end_chunk)
         self._to_disk(self._stream.flush)
+        self._to_disk(os.stat, self._part)
 
-    def _to_disk(self, write: Callable[..., None], *arguments: Any) -> None:
+    def _to_disk(self, write: Callable[..., object], *arguments: Any) -> None:
         """Write, unless an error was met: rclpy prints what is raised in a callback, so `hold` raises it elsewhere."""
         try:
             if self._full is None:
                 write(*arguments)
         except OSError as error:
-            self._full = BagError(f"{self._part}: cannot be written: {error.strerror}; make room")
+            self._full = self._failed(error, "cannot be written", "make room")
 
     def hold(self) -> None:
         """Raise BagError where something could not be written."""
