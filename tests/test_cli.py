@@ -495,6 +495,15 @@ def test_a_near_miss_names_one_option(words, said, capsys):
     assert said in error and " or --" not in error.rpartition("error: ")[2]
 
 
+@pytest.mark.parametrize("words", ["check m -a.mcap", "check m b.mcap -a.mcap", "topics -a.mcap"])
+def test_a_file_whose_name_begins_with_a_dash_is_told_how_to_be_given(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("-a.mcap").touch()
+    with pytest.raises(SystemExit):
+        main(words.split())
+    assert "; the file -a.mcap is given as ./-a.mcap" in capsys.readouterr().err
+
+
 def test_what_is_proposed_and_written_as_json(folder, tmp_path, cli):
     data = cli.json("init", folder / "run.mcap")
     assert {"name", "topic", "field"} <= set(data["states"][0]) and data["text"].startswith("# Proposed by")

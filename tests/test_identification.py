@@ -336,6 +336,8 @@ def test_wrong_options_are_refused():
     transient = drawn(small_plant(1), 50, 1)
     cases = [
         (dict(criterion="lq"), "criterion is 'lq'"),
+        (dict(criterion=["qp"]), r"criterion is \['qp'\]; it must be qp or lp"),
+        (dict(additive=["none"]), r"additive is \['none'\]; it must be"),
         (dict(additive="white"), "additive is 'white'"),
         (dict(method="magic"), "method is 'magic'"),
         (dict(weights=np.ones(3)), r"weights have shape \(3,\)"),

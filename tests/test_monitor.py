@@ -98,6 +98,8 @@ def test_masks_and_rules_are_held_against_the_model() -> None:
     assert EnvelopeMonitor(model, masked=["x1"]).masked == ("x1",)
     with pytest.raises(ModelError, match="masked state 'x2' is not in the model; its states are x0, x1"):
         EnvelopeMonitor(model, masked=["x2"])
+    with pytest.raises(ModelError, match="masked is of type int; give the names of states"):
+        EnvelopeMonitor(model, masked=1)
     for one in ("x1", iter(["x1"]), {"x1"}):  # an iterator was used up before it masked anything
         assert EnvelopeMonitor(model, masked=one).masked == ("x1",)
     assert EnvelopeMonitor(model, *np.array([2, 3])).rule == AlarmRule(2, 3)

@@ -16,6 +16,7 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from bag_writer import float64
@@ -67,6 +68,12 @@ def test_the_same_transients_and_remarks(tmp_path: Path) -> None:
         for name in ("t_ns", "x", "u", "segment"):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
     assert any("cannot be decoded" in note for note in beside[-1].notes)
+
+
+@pytest.mark.parametrize("processes", ["two", [2], 1.5, 0, -1])
+def test_a_number_of_processes_is_a_whole_one(tmp_path: Path, processes: Any) -> None:
+    with pytest.raises(BagError, match="processes is .*; give a whole number from 1 on, or None"):
+        read_transients(runs(tmp_path), XU, processes=processes)
 
 
 @pytest.mark.slow

@@ -225,6 +225,11 @@ def test_an_empty_run_and_a_single_sample_have_no_transition() -> None:
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": ["a", "a"]}, "two columns of x have the same name"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": ["a", ""]}, "a column of x is called ''; give"),
         (([0.0, 1.0], np.zeros((2, 2)), []), {"state_names": [1, 2]}, "a column of x is called 1; give"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"state_names": 5}, "names of x is of type int; give a list of names"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"sources": 5}, "sources is of type int; give a list of paths"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"sources": [5]}, "sources: one of them is of type int; give a list of paths"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"notes": "abc"}, "notes is of type str; give a list of texts"),
+        (([0.0, 1.0], [1.0, 2.0], []), {"counters": [1]}, "counters is of type list; give counts by name"),
         ((np.ma.masked_greater([0.0, 9.0], 5.0), [1.0, 2.0], []), {}, r"t\[1\] is masked; leave out samples without"),
     ],
 )

@@ -12,7 +12,9 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from uncertain_lti.base.text import printable
 
@@ -56,6 +58,16 @@ def refuse_other(value: object, kind: type | tuple[type, ...], what: str, instea
     if not isinstance(value, kind):
         of = "None" if value is None else f"of type {type(value).__name__}"
         raise error(f"{what} is {of}; {instead}")
+
+
+def each_of(values: Any, kind: type | tuple[type, ...], what: str, instead: str, error: type[Exception]) -> list[Any]:
+    """What a list of values of a type holds; a text is none."""
+    if isinstance(values, str) or not isinstance(values, Iterable):
+        raise error(f"{what} is of type {type(values).__name__}; {instead}")
+    found = list(values)
+    for value in found:
+        refuse_other(value, kind, f"{what}: one of them", instead, error)
+    return found
 
 
 _EXTRAS = {

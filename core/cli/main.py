@@ -253,6 +253,8 @@ class _Parser(argparse.ArgumentParser):
             message += f" (an option of {', '.join(takes)})" if takes else meant(word, chosen._option_string_actions, 1)
             if not word.startswith("-"):
                 message += f"; that is one more than it takes: {chosen.prog} --help"
+        if files := [word for word in self._given if word.startswith("-") and os.path.exists(word)]:
+            message += f"; the file {files[0]} is given as ./{files[0]}"
         super().error(message)
 
 

@@ -157,7 +157,7 @@ class Columns:
         additive term: it carries the steady state from knot to knot. Without such a term c is 0, as at rest its
         rounding would have no half-width to lie in.
         """
-        if additive not in CHOICES:
+        if not isinstance(additive, str) or additive not in CHOICES:
             raise FitError(f"additive is {additive!r}; it must be {CHOICES_TEXT}")
         names = set(CHOICES[additive].split())
         if constant_dt and "v" in names:
@@ -326,7 +326,7 @@ class DiskPartition:
 
 def check_criterion(criterion: str) -> None:
     """Refuse a criterion that there is not."""
-    if criterion not in CRITERIA:
+    if not isinstance(criterion, str) or criterion not in CRITERIA:
         raise FitError(f"criterion is {criterion!r}; it must be {' or '.join(CRITERIA)}")
 
 

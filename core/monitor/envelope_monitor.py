@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from functools import cache, partial
 from itertools import pairwise
@@ -126,6 +126,7 @@ class EnvelopeMonitor:
         self.rule = replace(model.alarm_rule, **given)
         every = with_containment(model.alarm, self.rule) if given else model.alarm
         names = model.state_names
+        refuse_other(masked, Iterable, "masked", "give the names of states", ModelError)
         masked = [masked] if isinstance(masked, str) else list(masked)
         for name in masked:
             if name not in names:

@@ -268,6 +268,8 @@ def read_transients(
     bags = group_recordings(of, indexed=True, layout=signals.table)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
+    if processes is not None and not (isinstance(processes, int) and processes > 0):
+        raise BagError(f"processes is {processes!r}; give a whole number from 1 on, or None")
     signals = signals.with_types(types_of(bags, signals))
     streams = read_streams(bags, signals, progress, processes)
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)

@@ -15,14 +15,14 @@ import csv
 import math
 import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, real
-from uncertain_lti.base.errors import TransientError
+from uncertain_lti.base.errors import TransientError, refuse_other
 from uncertain_lti.base.text import plural
 from uncertain_lti.sampling.clock import Status
 
@@ -184,6 +184,7 @@ def names_of(
 ) -> tuple[str, ...]:
     """Names of the columns of an argument: those given, of the signals, or its letter and a number."""
     count = values.shape[1]
+    refuse_other(given, (Iterable, type(None)), f"{name}: names of {letter}", "give a list of names", TransientError)
     names = tuple(given) if given is not None else tuple(s.name for s in signals) if signals is not None else None
     if names is None:
         return tuple(f"{letter}{i + 1}" for i in range(count))

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import LONGEST_S, Array
-from uncertain_lti.base.errors import TransientError, refuse_other
+from uncertain_lti.base.errors import TransientError, each_of, refuse_other
 from uncertain_lti.base.text import html_table, meant, named, number, plural
 from uncertain_lti.sampling.clock import Counters, Status, longest_step, passed, to_ns
 from uncertain_lti.sampling.samples import (
@@ -186,9 +186,11 @@ class Transient:
         self.ends: tuple[At, ...] = ("departure",) * self.u.shape[1]
         if signals:
             self.ends = tuple(c.at for c in signals.controls)
+        refuse_other(counters, (Mapping, type(None)), f"{name}: counters", "give counts by name", TransientError)
         self.counters = Counters(counters or {})
-        self.sources = tuple(os.fspath(s) for s in sources)
-        self.notes = tuple(notes)
+        paths = each_of(sources, (str, os.PathLike), f"{name}: sources", "give a list of paths", TransientError)
+        self.sources = tuple(os.fspath(path) for path in paths)
+        self.notes = tuple(each_of(notes, str, f"{name}: notes", "give a list of texts", TransientError))
         for what, value in (("max_gap", 1.0 if max_gap is None else max_gap), ("min_step", min_step)):
             refuse_other(value, Real, f"{name}: {what}", "give a number of seconds", TransientError)
         if max_gap is not None and not (0 < max_gap <= LONGEST_S or max_gap == math.inf):
