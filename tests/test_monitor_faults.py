@@ -520,6 +520,19 @@ def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(bench
     until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without")
 
 
+def test_a_model_that_is_swapped_costs_no_snapshot_of_an_alarm(bench: StartBench, tmp_path: Path) -> None:
+    """It was written later, without the messages around the alarm."""
+    folder = tmp_path / "snapshots"
+    on = bench(**snapping(folder) | {"snapshot.after": 3600.0})
+    on.plant.send(20)
+    on.plant.send(3, off=2.0)
+    on.flags.count(23)
+    assert on.world.set(model=str(on.path)) == (True, "")
+    (found,) = until(lambda: list(folder.glob("*.mcap")), "the file")
+    verdicts = offline(on.path, found)
+    assert len(verdicts) == 23 and any(v.violated for v in verdicts)
+
+
 def test_a_folder_of_snapshots_that_was_cleared_away_is_made_again(bench: StartBench, tmp_path: Path) -> None:
     folder = tmp_path / "of" / "snapshots"
     on = bench(**{"snapshot.folder": str(folder)})

@@ -204,9 +204,9 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active:
             self.intake.waiting(all_of_them=True)
             session.go_on_from(self.session)
+        self.snapshots.clear(self.session)
         self.intake.session = session
         self.outputs.prepare(session)
-        self.snapshots.clear()
         if self.active:
             self._find_enable_type()
             self.subscribe()

@@ -57,8 +57,9 @@ class Snapshots:
             self._album.close()
         self._album = self.recent = self._due = None
 
-    def clear(self) -> None:
-        """Forget all messages: another model reads the next ones."""
+    def clear(self, session: Session | None) -> None:
+        """Write what is due, and forget all messages: another model reads the next ones."""
+        self.write_due(session, math.inf)
         if self.recent is not None:
             self.recent.clear()
 
