@@ -336,7 +336,7 @@ def test_a_publisher_of_another_type_that_joins_is_told_and_its_messages_are_lef
     world.start("other", "-c", f"{joins}; p = node.create_publisher(Float32, '/numbers', 1); time.sleep(300)")
     process.says("note: /numbers: a publisher sends std_msgs/msg/Float32, and std_msgs/msg/Float64 is wanted\n")
     process.signal(signal.SIGINT)
-    assert "1 messages of 1 topics" in process.succeed() and process.output.count("a publisher sends") == 1
+    assert "1 message of 1 topic" in process.succeed() and process.output.count("a publisher sends") == 1
 
 
 def test_a_disk_that_is_full_ends_recording_in_a_sentence(world: World, tmp_path: Path) -> None:
@@ -543,7 +543,7 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
     assert "/foreign is not played: frost_interfaces/msg/UCommand: the Python package frost_interfaces" in said
     assert "/other is not played: std_msgs/msg/Float64 was recorded in another version" in said
     assert "/json is not played: its messages are in json" in said
-    assert "there is no subscriber to /good after 0.2 s" in said and "played 1 messages of 1 topics" in said
+    assert "there is no subscriber to /good after 0.2 s" in said and "played 1 message of 1 topic" in said
     for arguments, sentence in (
         ([bag, "--topics", "/foreign"], "no topic of it can be played"),
         ([bag, "--topics", "/a"], "there is no topic /a; topics there: /foreign, /good"),
@@ -560,7 +560,7 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
 def test_a_signal_ends_playing(world: World, tmp_path: Path) -> None:
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 60 * 10**9, 10**8))).save(tmp_path / "in.mcap")
     heard = world.listen(Float64, "/x")
-    ended = r"uncertain-lti play: \S+in.mcap: played \d+ messages of 1 topics in \S+ s, then interrupted\n"
+    ended = r"uncertain-lti play: \S+in.mcap: played \d+ messages of 1 topic in \S+ s, then interrupted\n"
     for words in ([], ["--quiet"]):
         player = world.command("play", bag, *words)
         heard.count(3)
@@ -634,7 +634,7 @@ def test_lockstep_asks_again_where_an_answer_is_lost(world: World, tmp_path: Pat
     world.node.create_subscription(Float64, "/x", count, 100)
     bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 2 * 10**8))).save(tmp_path / "in.mcap")
     player = world.command("play", bag, "--lockstep", "listener")
-    assert "played 5 messages of 1 topics" in player.succeed()
+    assert "played 5 messages of 1 topic" in player.succeed()
     assert received[0] == 5 and answers[0] > 5 and not held
 
 

@@ -33,7 +33,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
-from uncertain_lti.base.text import meant
+from uncertain_lti.base.text import meant, plural
 from uncertain_lti.cli.command import DONE, Result, complain
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
@@ -130,7 +130,7 @@ def run(args: argparse.Namespace) -> Result:
         if missed := _unconfirmed(life, played):
             note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     sent = sum(p.sent for p in played.values())
-    ended = f"{bag.path}: played {sent} messages of {len(played)} topics in {took:.1f} s"
+    ended = f"{bag.path}: played {plural(sent, 'message')} of {plural(len(played), 'topic')} in {took:.1f} s"
     if life.signal is None:
         args.say(ended)
     else:

@@ -29,7 +29,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.base.text import shortlist
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, arrival_of
 from uncertain_lti.monitor.snapshot import BACK_NS
@@ -93,7 +93,8 @@ def run(args: argparse.Namespace) -> Result:
         each = shortlist([f"{count} of {topic}" for topic, count in taken.late.most_common()], 5)
         after = f"came up to {taken.latest:.2g} s after others that were sent later, and fits and checks take them so"
         on_the_way += f"; {each} {after}: record again on a less busy machine, or fewer topics"
-    args.say(f"{output}: {file.count} messages of {len(subscriptions)} topics over {file.span:.1f} s{on_the_way}")
+    counted = f"{plural(file.count, 'message')} of {plural(len(subscriptions), 'topic')}"
+    args.say(f"{output}: {counted} over {file.span:.1f} s{on_the_way}")
     counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost, "late": taken.late}
     return Result(data={"bag": str(output), **counts})
 

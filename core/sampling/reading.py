@@ -21,6 +21,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
+from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -268,8 +269,10 @@ def read_transients(
     bags = group_recordings(of, indexed=True, layout=signals.table)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
-    if processes is not None and not (isinstance(processes, int) and processes > 0):
-        raise BagError(f"processes is {processes!r}; give a whole number from 1 on, or None")
+    whole = "give a whole number from 1 on, or None"
+    refuse_other(processes, (Integral, type(None)), "processes", whole, BagError)
+    if processes is not None and processes < 1:
+        raise BagError(f"processes is {processes}; {whole}")
     signals = signals.with_types(types_of(bags, signals))
     streams = read_streams(bags, signals, progress, processes)
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
