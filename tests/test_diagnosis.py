@@ -194,6 +194,17 @@ def test_a_machine_at_rest_is_not_frozen():
     assert "frozen" not in said(messages(run(u=u, change=settle, noise=0.0)))
 
 
+def test_a_block_of_a_long_recording_that_ends_as_a_rest_begins_is_not_frozen():
+    """Of 28500 transitions 0 to 999 and 1447 to 2446 are looked at: the first end in a repeat, and the others at 0."""
+    count = 28_500
+
+    def change(x, u):
+        x = put(1000, 1, x[999, 1])(x, u)[0]
+        return put(slice(1447, 1500), 1, lambda x: x[:, 1].min())(x, u)
+
+    assert "frozen" not in said(messages(run(u=steps(np.random.default_rng(7), count + 1), count=count, change=change)))
+
+
 @pytest.mark.parametrize("period", [2, 5])
 def test_state_of_a_slower_topic_is_named_with_its_period(period):
     slower = put(slice(None), 1, lambda x: x[np.arange(len(x)) // period * period, 1])

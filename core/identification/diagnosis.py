@@ -425,7 +425,7 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
         still = problem.x_next[i] == problem.z[i]
         if still.mean() > 0.5:  # held, quantised, or at rest most of the time
             continue
-        still[1:] &= problem.source[1:] == problem.source[:-1]
+        still[1:] &= (problem.source[1:] == problem.source[:-1]) & (problem.z[i, 1:] == problem.x_next[i, :-1])
         for start, stop in (run for run in runs(still) if run[1] - run[0] >= FROZEN):
             others = (spread > 0) & (np.arange(problem.p) != i)
             moving = others & (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread)
