@@ -2261,6 +2261,19 @@ def test_four_numbers_of_an_attitude_that_name_no_axis_are_no_states(tmp_path, n
     proposal = propose([table_of(tmp_path / "a.csv", columns, 2.0 * np.arange(len(u)))])
     assert [c.path for c in proposal.states] == ["rate"], proposal.text
     assert "of an attitude, as the squares of the four add up to 1" in proposal.text
+    reset = dict(zip((name.format(i) for i in numbers), (np.full(len(u), i == 0) * 1.0 for i in range(4)), strict=True))
+    proposal = propose([table_of(tmp_path / "b.csv", columns | reset, 2.0 * np.arange(len(u)))])
+    assert "always 1" in proposal.text and "of an attitude" not in proposal.text, proposal.text  # it never turned
+
+
+def test_entries_of_one_array_are_all_named_by_their_topic_where_another_array_has_its_name():
+    """Of `control` of motors and servos one entry of each had its topic in its name, and `control_1` was of either."""
+    motors, servos = (
+        Source(f"/out/{name}", "px4_msgs/msg/Of", "control", False, None) for name in ("motors", "servos")
+    )
+    entries = [Candidate(motors, "control[0]", [])] + [Candidate(servos, f"control[{i}]", []) for i in (0, 2)]
+    name_signals([], entries)
+    assert [c.name for c in entries] == ["motors_control_0", "servos_control_0", "servos_control_2"]
 
 
 def test_the_phase_of_a_flight_is_no_state_where_there_is_no_command(tmp_path):

@@ -274,7 +274,8 @@ def _sift(source: Source) -> None:
         ]
     numbered = [c for c in source.candidates if c.values and re.search(r"\d\]?$", c.path)]
     for of in {c.path.rstrip("]")[:-1] for c in numbered}:
-        if of_attitude(parts := [c for c in numbered if c.path.rstrip("]")[:-1] == of]):
+        parts = [c for c in numbered if c.path.rstrip("]")[:-1] == of]
+        if of_attitude(parts) and any(np.ptp(c.finite) > 0 for c in parts):
             for candidate in parts:
                 candidate.reason, candidate.ready = ATTITUDE, "state"
     for candidate in source.free if source.type == TABLE else ():  # before its usual value is taken for none

@@ -77,8 +77,9 @@ def name_signals(states: Sequence[Candidate], controls: Sequence[Candidate]) -> 
     for group, suffix in ((states, "state"), (controls, "command")):
         kinds = {c.kind for c in group}
         plain = {c: "_".join(_words(c, len(kinds) > 1)) for c in group}
-        for candidate, name in plain.items():
-            others = (c for c in group if plain[c] == name and (candidate.ready or not c.ready))  # or in a comment
+        array = {c: re.sub(r"\d+$", "", name) if c.path.endswith("]") else name for c, name in plain.items()}
+        for candidate, name in plain.items():  # entries of one array have names of one form
+            others = (c for c in group if array[c] == array[candidate] and (candidate.ready or not c.ready))
             alike = [other.topic for other in others]
             name = "_".join([*_apart(candidate.topic, alike), name])
             if name in taken or (suffix == "command" and candidate.element in elements):
