@@ -1619,11 +1619,29 @@ def test_columns_that_lack_numbers_now_and_then_or_one_after_the_other_are_of_on
     rng = np.random.default_rng(1)
     lost = [",".join([f"{0.1 * k:.1f}", *np.where(rng.random(3) < 0.3, "", "1.5")]) for k in range(300)]
     halves = [f"{0.1 * k:.1f},{'2.5,,1' if k < 150 else ',3.5,1'}" for k in range(300)]
-    slow = [f"{0.1 * k:.1f},{k % 5},{k % 3},{k if k % 10 == 0 else ''}" for k in range(300)]
     changed = [f"{0.1 * k:.1f}," + ",".join(str(k) if j == k * k % 3 else "" for j in range(3)) for k in range(300)]
-    for number, rows in enumerate((lost, halves, slow, changed)):
+    for number, rows in enumerate((lost, halves, changed)):
         path = write(tmp_path / f"{number}.csv", "time,a,b,c", *rows)
         assert list(open_recording(path).topics) == ["/table"]
+
+
+def test_signals_of_several_rates_in_one_table_are_topics_of_their_own(tmp_path):
+    """A CAN log with a row for each frame of the fastest signal had only those of its signals proposed."""
+    rng = np.random.default_rng(1)
+
+    def row(k):
+        lost = rng.random() < 0.02
+        slow = f"{k % 7},{math.sin(0.01 * k):.4f}" if k % 5 == 3 and not lost else ","
+        return f"{0.01 * k:.2f},{'' if lost else k % 5},{k % 3},{slow},{20 + k // 100 if k % 100 == 7 else ''}"
+
+    for rows in (350, 3000):
+        path = write(tmp_path / f"{rows}.csv", "time,Whl [km/h],Yaw,Eng [rpm],Ped,Cool", *map(row, range(rows)))
+        table = open_recording(path)
+        assert list(table.topics) == ["/table", "/table/Eng_rpm", "/table/Cool"]
+        assert [fact.fields for fact in table.facts()] == [("Whl_km_h", "Yaw"), ("Eng_rpm", "Ped"), ("Cool",)]
+        assert [fact.rate for fact in table.facts()] == pytest.approx([100, 20, 1])
+    columns = table.columns(["/table/Cool"], [[FieldPath("Cool")]])
+    assert columns.values[0][:, 0].tolist() == [20 + k for k in range(30)]
 
 
 def _by_turns(rows, more=lambda k: ""):
@@ -1646,7 +1664,7 @@ def test_an_index_or_a_label_of_each_row_does_not_make_messages_by_turns_one(tmp
     assert [fact.fields for fact in table.facts()] == [("CMD_u", "more"), ("ATT_r", "ATT_p")]
     temperature = _by_turns(400, lambda k: f",{20 + math.sin(0.01 * k):.4f}")
     one = write(tmp_path / "b.csv", "time,CMD.u,ATT.r,ATT.p,T", *temperature)
-    assert list(open_recording(one).topics) == ["/table"]
+    assert list(open_recording(one).topics) == ["/table", "/table/CMD_u", "/table/ATT_r"]  # at half its rate
     named = _by_turns(400, lambda k: f",{('ATT', 'CMD')[k % 2]}")
     assert not open_recording(write(tmp_path / "c.csv", "time,CMD.u,ATT.r,ATT.p,type", *named)).warnings  # no units
 

@@ -9,7 +9,7 @@
 
 """Table: a file of columns as a recording, whose messages are its rows, each at its time.
 
-It has one topic, but for a log of several messages in one table, whose lines hold the numbers of one of them each.
+It has one topic, but for a log of several messages or rates in one table.
 """
 
 from __future__ import annotations
@@ -19,8 +19,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, pairwise, product
-from os.path import commonprefix
+from itertools import pairwise, product
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -36,6 +35,7 @@ from uncertain_lti.recordings.table_files import read_table
 from uncertain_lti.recordings.table_text import (
     ODD_SHARE,
     QUANTITY,
+    ROWS_EACH,
     Column,
     RawTable,
     field_name,
@@ -45,9 +45,10 @@ from uncertain_lti.recordings.table_text import (
     without_bad,
 )
 from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
+from uncertain_lti.recordings.table_topics import by_message
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
-from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout
+from uncertain_lti.signals.values import TABLE, TableLayout
 
 _PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
@@ -56,15 +57,12 @@ _HOUR = 3_600 * 10**9  # ns
 _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
-_ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has, of a short log fewer
-_MOST_KINDS = 100  # of messages
 _OF_SIGNALS = (
     r"(tag|var(iable)?|signal|field|point|channel|sensor|item|parameter|series|metric|topic|entity)([\W_]*(name|id))?"
 )
 _NAMES = re.compile(rf"(?i)(.*[\W_])?(name|{_OF_SIGNALS})")
 _VALUES = re.compile(r"(?i)_?((var|tag)?[\W_]*value|val|payload|reading|wert)")
 _TOGETHER = 0.9  # of the times, that have a number of each signal
-_SHARED = 0.5  # of the rows of the rarer column, from which on two columns are of one message
 
 
 def is_table(path: Path) -> bool:
@@ -78,7 +76,7 @@ class Table(Recording):
     Rows are taken in the order of the file: where the time steps back, another run may begin, and the rules of sampling
     decide. Rows without a time are left out. A column is a field of the topic `/table`, by its name with everything but
     letters, digits and underscores replaced; a matrix is an array, and four of a quaternion are one field besides.
-    Where columns have their numbers in rows of their own by turns, each group of them is a topic below.
+    Where columns have their numbers in rows of their own, each group of them is a topic below.
 
     `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run.
     """
@@ -129,7 +127,7 @@ class Table(Recording):
 
     def _tell_topics(self, reason: str, kind: str) -> None:
         """Rows and columns of each topic, of a table of such a kind, and the reason why it cannot be read, if any."""
-        every = _by_message(self.columns_by_field, len(self.times))
+        every = by_message(self.columns_by_field, len(self.times))
         one = len(every) == 1 and not reason
         texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
         some = len(texts) < len(self.columns_by_field)
@@ -360,7 +358,7 @@ def _flows(columns: Iterable[Column], rows: int) -> bool:
 def _take_turns(cells: Sequence[object]) -> int:
     """How many names take turns from row to row, nearly as often as if each row were of any of them; 0 if none do."""
     rows = np.array(list(Counter(cells).values()))
-    if len(rows) < 2 or rows.min() < _ROWS_EACH or not all(cells):
+    if len(rows) < 2 or rows.min() < ROWS_EACH or not all(cells):
         return 0
     changes = 1.0 - float(((rows / len(cells)) ** 2).sum())
     return len(rows) if sum(a != b for a, b in pairwise(cells)) >= 0.8 * changes * len(cells) else 0
@@ -451,47 +449,6 @@ def _rows_of_each(keys: Column) -> dict[str, NDArray[np.intp]]:
     return {str(names[i]): rows[i] for i in np.argsort(first, kind="stable").tolist()}
 
 
-def _by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
-    """Fields and rows of each topic: of a log whose lines are of several messages by turns, those of each message.
-
-    Where no message has two numbers, signals were written as they changed, and hold until then: they are one table.
-    """
-    one = {TABLE_TOPIC: (list(columns), np.arange(number))}
-    names: dict[bytes, list[str]] = {}  # by where they have a number
-    for name, column in columns.items():
-        if column.dtype.kind not in "OM":
-            there = np.isfinite(column) if column.ndim == 1 else np.ones(number, np.bool_)
-            if there.all() and column.ndim == 1 and _goes_on(column):
-                there = ~there  # an index or a label is of no message
-            if there.all() or len(names) > _MOST_KINDS:
-                return one
-            names.setdefault(there.tobytes(), []).append(name)
-    any_row = names.pop(bytes(number), [])
-    known = {kind: np.frombuffer(kind, np.bool_) for kind in names}
-    rows = {kind: np.count_nonzero(there) for kind, there in known.items()}
-    groups: list[list[bytes]] = []
-    for kind in known:
-        shared = {other: np.count_nonzero(known[kind] & known[other]) for group in groups for other in group}
-        of = {other for other, both in shared.items() if both >= _SHARED * min(rows[kind], rows[other])}
-        tied = [group for group in groups if not of.isdisjoint(group)]
-        groups = [group for group in groups if group not in tied] + [[*chain(*tied), kind]]
-    rows_of = [np.flatnonzero(np.any([known[kind] for kind in group], axis=0)) for group in groups]
-    fields = [[name for kind in group for name in names[kind]] for group in groups]
-    turns = [1 + np.count_nonzero(np.diff(of) > 1) >= min(_ROWS_EACH, max(3, len(of) / 5)) for of in rows_of]
-    if sum(turns) < 2 or max(map(len, fields)) < 2:
-        return one
-    begun = [(commonprefix(group), group[0]) for group in fields]
-    fields[int(np.argmax([len(of) for of in rows_of]))] += any_row
-    topics = once((begin.rpartition("_")[0] or begin or first for begin, first in begun), "_")
-    return {f"{TABLE_TOPIC}/{topic}": of for topic, of in zip(topics, zip(fields, rows_of, strict=True), strict=True)}
-
-
-def _goes_on(column: Column) -> bool:
-    """Whether a column is an index, a label or constant: its step from row to row is nearly always that before."""
-    same = np.diff(column.astype(np.float64), 2) == 0
-    return int(np.count_nonzero(same)) >= 0.9 * len(same)
-
-
 def names_signals(column: str) -> bool:
     """Whether a column says by its name that it names the signal of a row's number."""
     return re.fullmatch(rf"(?i)(.*[\W_])?{_OF_SIGNALS}", column) is not None
@@ -510,14 +467,14 @@ def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[st
         named = np.flatnonzero(columns[naming] != "")
         cells, when = columns[naming][named], times[named]
         few = len(set(cells.tolist()))
-        if not 2 <= few <= len(named) // _ROWS_EACH or len(named) < (1 - ODD_SHARE) * len(times):
+        if not 2 <= few <= len(named) // ROWS_EACH or len(named) < (1 - ODD_SHARE) * len(times):
             continue
         beside = [n for n in [*texts, *every] if n != naming and n not in numbers]
         rows = _rows_of_each(_of_units(cells.astype(str), [columns[n][named] for n in beside], when))
         order = np.concatenate([*rows.values()])
         first = np.cumsum([0, *map(len, rows.values())])[:-1]
         least, most = (of_each.reduceat(when[order], first) for of_each in (np.minimum, np.maximum))
-        usual = np.diff(first, append=len(order)) >= _ROWS_EACH  # a name of few rows says nothing
+        usual = np.diff(first, append=len(order)) >= ROWS_EACH  # a name of few rows says nothing
         anew = sum(usual) > 1 and most[usual].min() > least[usual].max() and _NAMES.fullmatch(naming)
         if 2 * np.count_nonzero(cells[1:] != cells[:-1]) > len(cells) or anew:
             of_rows = {name: columns[name][named][order] for name in numbers}

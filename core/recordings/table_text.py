@@ -63,6 +63,7 @@ _ODD_CELL = re.compile(r"could not convert string .* at row (\d+), column (\d+)"
 _MOST_PASSED = 10**6  # rows that may be passed over again for such cells
 _ANNOTATIONS = "#group", "#datatype", "#default"  # of InfluxDB, above each table in a file
 YEARS = (1678, 2261)  # that ns since 1970 can say
+ROWS_EACH = 20  # that a unit has at least, and stretches of rows that a message has, of a short log fewer
 ODD_SHARE = 0.1  # of lines with another number of cells, or cells that are no time, above which a file is no table
 
 Column = NDArray[Any]
