@@ -24,7 +24,7 @@ from uncertain_lti.base.arrays import LARGEST
 from uncertain_lti.identification import fit
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain, Sampling
-from uncertain_lti.model.repeats import Repeats, needs, repeat_words, repeats_in, together
+from uncertain_lti.model.repeats import Repeats, far_longer, needs, repeat_words, repeats_in, together
 from uncertain_lti.monitor.reason import over_recording
 from uncertain_lti.monitor.session import ERROR, WARN
 from uncertain_lti.reports.check import check_data, check_text
@@ -328,6 +328,12 @@ def test_no_sentence_on_a_repeat_contradicts_itself() -> None:
     assert repeat_words(3.0, 2.0) == "repeats exactly for 3 s (at most 2 s in the fit)"
     assert repeat_words(3.0, 0.0) == "repeats exactly for 3 s (never in the fit)"
     assert repeat_words(36000.0, 510.0) == "repeats exactly for 10 h (at most 8.5 min in the fit)"
+
+
+def test_a_warning_tells_of_a_repeat_that_is_far_longer_and_not_by_chance():
+    """Of a healthy car the yaw rate repeated for four samples at 50 Hz, two in the fit, 'as of a machine at rest'."""
+    assert not any(far_longer(*times) for times in [(0.08, 0.04), (0.03, 0.02), (0.0801, 0.04), (2.9, 2.0)])
+    assert all(far_longer(*times) for times in [(0.09, 0.04), (0.3, 0.15), (3.1, 2.0), (0.02, 0.0)])
 
 
 def test_a_training_recording_with_bounds_of_no_width_is_not_frozen() -> None:

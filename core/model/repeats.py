@@ -303,6 +303,8 @@ USUAL_S, USUAL = 0.25, 10
 """Seconds, and usual steps, up to which a repeat is usual if the fit has some half as long: a coarse sensor in motion.
 The seconds must one of a state last that noise changes: a machine that stops does not stop in all states at once."""
 
+_FAR_LONGER, _BY_CHANCE = 1.5, 2.1  # of repeats of up to `USUAL_S`, whose stamps may jitter
+
 LEAST = 3
 """Steps that a repeat must have, but of a slow sensor that noise changes: two equal samples may be chance."""
 
@@ -455,6 +457,11 @@ class Partly:
     def packed(self) -> bytes:
         """As of `Judgement`."""
         return self._values.tobytes()
+
+
+def far_longer(seconds: float, longest: float) -> bool:
+    """Whether a repeat is worth a warning: one in three healthy recordings passes the longest of the fit a little."""
+    return seconds > (_BY_CHANCE if seconds <= USUAL_S else _FAR_LONGER) * longest
 
 
 def repeat_words(seconds: float, longest: float) -> str:

@@ -38,7 +38,7 @@ from uncertain_lti.base.text import (
 )
 from uncertain_lti.model.domain import STRANGE, jump_words, jumps, outside_in_words, vouched
 from uncertain_lti.model.operating_point import recorded
-from uncertain_lti.model.repeats import repeat_words
+from uncertain_lti.model.repeats import far_longer, repeat_words
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised, back_and_restarts
 from uncertain_lti.monitor.likeness import LEAST, over_recording
@@ -61,8 +61,6 @@ MOST_EPISODES, MOST_EXPLAINED = 1000, 100
 _TOGETHER = 1000  # samples whose verdicts are made into plain data at once
 MOST_SHOWN = 5
 """Frozen repeats, patterns and rules that the text names."""
-_FAR_LONGER = 1.5
-"""Times the longest repeat of the fit, which one in three healthy recordings passes a little."""
 _REMEDIES = {
     Status.FIRST: "a verdict needs two samples: check a longer recording",
     Status.GAP: "every step is longer than max_gap: is a topic slower than in the fit? see `uncertain-lti topics`",
@@ -267,7 +265,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
 
 def long_repeats(data: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The longest repeat of each state, if far longer than any of the fit; the longest first."""
-    far = [r for r in data["repeats"] if r["seconds"] > _FAR_LONGER * r["longest_in_fit"]]
+    far = [r for r in data["repeats"] if far_longer(r["seconds"], r["longest_in_fit"])]
     every = {r["state"]: r for r in sorted(far, key=lambda repeat: repeat["seconds"])}
     return sorted(every.values(), key=lambda repeat: -repeat["seconds"])
 
