@@ -18,6 +18,7 @@ import subprocess
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -194,6 +195,7 @@ def test_names_from_files_are_text(engine):
         assert (facts["validation"] is not None) == ("notes" in validation and HOSTILE in validation["notes"])
         text = html_report(changed, verdicts, facts)
         needs_nothing_else(text)
+        assert re.search(r"<th>[^<]*/<wbr>", text), "on paper a matrix is no wider than the page"
         assert "\u202e" not in text and "\x07" not in text and "alert(1)" in text  # shown, as text
         assert data_of(text)[0]["views"]["values"][0]["title"].startswith("</script>")
         json.dumps(facts, allow_nan=False)
@@ -325,3 +327,18 @@ def test_a_browser_that_speaks_no_language_draws():
         ["node", "-"], input=f"{browser}{drawing};console.log(typeof uPlot)", capture_output=True, text=True
     )
     assert said.stdout == "function\n", said.stderr
+
+
+def test_a_page_that_follows_a_monitor_says_its_alarm_from_the_start():
+    """It said so at the first look at the monitor only."""
+    browser = shutil.which("chromium") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no browser")
+    plotted = plotted_transient(Transient(np.arange(9) * 0.1, np.zeros((9, 1)), np.zeros((9, 1))))
+    page = interactive_page("/m", [replace(plotted, title="ALARM /m")], every=10**6)
+    command = [browser, "--headless", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=1000", "--dump-dom"]
+    with TemporaryDirectory() as folder:
+        (Path(folder) / "page.html").write_text(page)
+        command += [f"--user-data-dir={folder}/browser", f"file://{folder}/page.html"]
+        shown = subprocess.run(command, capture_output=True, text=True, timeout=120).stdout
+    assert '<h1 class="bad">ALARM /m</h1>' in shown

@@ -281,5 +281,5 @@
     for (const u of plots) u.setSize({ width: u.root.parentNode.clientWidth, height: 170 });
   });
   choose(0);
-  if (page.every) setInterval(look, page.every);
+  if (page.every) { call(page.recordings[0].title); setInterval(look, page.every); }
 })();
