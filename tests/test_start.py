@@ -17,6 +17,7 @@ from engine_bag import engine_bag
 from uncertain_lti import UncertainLTI
 from uncertain_lti.cli.main import main
 from uncertain_lti.plants.leibov import STATE_TOPIC
+from uncertain_lti.proposal.init import propose
 from uncertain_lti.recordings.bag import Bag
 
 
@@ -130,3 +131,16 @@ def test_what_cannot_be_written_is_found_before_the_work(folder, capsys, monkeyp
     except SystemExit as end:
         assert end.code == 2
     assert sentence in capsys.readouterr().err
+
+
+def test_a_signals_file_that_comes_meanwhile_is_not_replaced(folder, capsys, monkeypatch):
+    """Of two that were started at once, one wrote over the other's signals file and model."""
+
+    def proposed_late(*words, **more):
+        (folder / "m.yaml").write_text("of another")
+        return propose(*words, **more)
+
+    monkeypatch.setattr("uncertain_lti.proposal.init.propose", proposed_late)
+    assert main(["start", *HEALTHY, "--output", "m"]) == 2
+    assert "m.yaml: came while this ran; choose another output, or move it away" in capsys.readouterr().err
+    assert (folder / "m.yaml").read_text() == "of another" and not list(folder.glob("*m.model.json"))

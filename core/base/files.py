@@ -68,11 +68,13 @@ def whole_file(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def written(path: str | os.PathLike[str], refusal: type[UncertainLTIError]) -> Iterator[BinaryIO]:
-    """`whole_file`; what the system refuses is one sentence."""
+def written(path: str | os.PathLike[str], refusal: type[UncertainLTIError], new: bool = False) -> Iterator[BinaryIO]:
+    """`whole_file`; what the system refuses is one sentence, as is, of a new one, a file that came meanwhile."""
     try:
         with whole_file(path) as stream:
             yield stream
+            if new and os.path.exists(path):
+                raise refusal(f"{path}: came while this ran; choose another output, or move it away")
     except OSError as error:
         raise refusal(f"{path}: cannot be written: {error.strerror}; choose another place") from None
 

@@ -112,7 +112,7 @@ def init(options: argparse.Namespace) -> Result:
     data = {"output": output, **proposed, **more}
     if output is None:
         return Result(data=data, text=proposal.text.removesuffix("\n"))
-    with written(output, SignalError) as stream:
+    with written(output, SignalError, new=True) as stream:
         stream.write(proposal.text.encode())
     options.say(
         f"{_proposed(data)}\n"
