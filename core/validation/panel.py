@@ -87,6 +87,7 @@ COARSE = 0.5
 """Likewise, of jumps that are worth little to see."""
 _LEAST, _FINE = 0.25, 1.02
 """Thresholds are lowered for a rate to this share of their largest at most, in this ratio."""
+_DOUBTED = 2.0  # times the thresholds of the others, as hardly a healthy recording goes
 _FAR = 10.0
 """A jump of so many times the range of a state is none that anybody need be told the size of."""
 _NAMED = 6
@@ -575,6 +576,8 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
             further = "about as many" if panel.alarming else f"at most about one in {panel.units + 1}"
             far = int(panel.reached.argmax())
             one = f", {panel.names[far]} farthest at {panel.reached[far]:.3g} times" if panel.names else ""
+            if panel.reached[far] > _DOUBTED:
+                one += " (was the machine healthy in it, and are its units those of the others?)" * bool(panel.names)
             further = f"expect {further} of further ones"
             higher = panel.asked is None and evidence.factor > 1.0
             if panel.alarming and panel.asked is None and not higher:
