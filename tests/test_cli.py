@@ -253,6 +253,11 @@ def test_a_recording_of_one_robot_of_several_is_checked_below_its_prefix(folder,
         assert judged(robot, "--topic-prefix", prefix) == judged(folder / "bad.mcap")
     said = refused(cli, "check", folder / "m.model.json", robot)
     assert "is /robot1/engine/state meant?" in said and "with --remap /engine/state:=NAME" in said
+    table = tmp_path / "table.csv"
+    table.write_text("t,x\n" + "".join(f"{k},{k}\n" for k in range(9)))
+    assert "/engine/state; topics there: /table\n" in refused(cli, "check", folder / "m.model.json", table), (
+        "no name would help"
+    )
 
 
 def test_a_recording_of_remapped_topics_is_checked_by_their_names_there(folder, tmp_path, cli):

@@ -356,7 +356,7 @@ def test_a_disk_that_is_full_ends_recording_in_a_sentence(world: World, tmp_path
     ("arguments", "sentence"),
     [
         (["/a", "-o", "there.mcap"], "is there already"),
-        (["/a", "-o", "no/x.mcap"], "cannot be written"),
+        (["/a", "-o", "no/x.mcap"], "no/x.mcap: the folder no is not there; make it first"),
         (["/a", "/b", "-o", "x.mcap", "--wait", "0.2"], "/a, /b: not there after 0.2 s"),
         (["/a b", "-o", "x.mcap", "--wait", "0.2"], "'/a b' is no topic name"),
         (["", "-o", "x.mcap", "--wait", "0.2"], "'' is no topic name"),
@@ -550,7 +550,7 @@ def test_what_cannot_be_played_is_said(command: Command, tmp_path: Path) -> None
         ([bag, "--topics", "good"], "there is no topic good (is /good meant?); topics there: /foreign, /good"),
         ([tmp_path / "none.mcap"], "none.mcap"),
         ([bag, "--lockstep", "nobody", "--wait", "0.2"], "/nobody/status: no such service after 0.2 s"),
-        ([bag, "--lockstep", "no body", "--wait", "0.2"], "'no body' is no topic name; write letters, digits"),
+        ([bag, "--lockstep", "no body", "--wait", "0.2"], "'no body' is no node name; write letters, digits"),
         ([bag, "--lockstep", "nobody", "--rate", "2"], "leave out --rate"),
     ):
         status, said = command("play", *arguments)

@@ -1510,7 +1510,7 @@ def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(digits, tmp_p
         ("time (millisec)", 5, 0.005, "taken for ms"),
         ("ms_today", 40, 0.04, "taken for ms"),
         ("us_since_boot", 2500, 0.0025, "taken for us"),
-        ("timestamp", 90, 90.0, "taken for s, 90 from row to row"),
+        ("timestamp", 90, 90.0, "or give `--table unit=ms` (in a signals file `table: {unit: ms}`)"),
         ("timestamp", 7200, 7200.0, ""),  # by the hour or so
         ("timestamp", 5, 5.0, "taken for s, 5 from row to row"),
         ("timestamp_s", 5, 5.0, ""),

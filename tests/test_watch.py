@@ -153,7 +153,7 @@ def test_a_name_that_no_node_has_and_a_port_that_is_taken_are_refused(tmp_path, 
     with own_domain() as domain, socket.create_server(("127.0.0.1", 0)) as taken:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         for words, said in (
-            (["a b", "--port", "0"], "'a b' is no topic name; write letters"),
+            (["a b", "--port", "0"], "'a b' is no node name; write letters, digits, _ and /, as in /envelope_monitor"),
             (["--port", str(taken.getsockname()[1])], "choose another --port"),
         ):
             assert main(["watch", *words]) == 2

@@ -283,7 +283,7 @@ def _lockstep(
     life: Life, played: dict[str, _Played], clock: Publisher | None, node: str, messages: Iterator[RawMessage],
     wait: float,
 ) -> None:  # fmt: skip
-    follower = _Follower(life, f"{resolved_name(life.node, node)}/status", wait)
+    follower = _Follower(life, f"{resolved_name(life.node, node, 'node', '/envelope_monitor')}/status", wait)
     if clock is not None and not follower.status.get("use_sim_time", True):
         remedy = "start it with -p use_sim_time:=true, or leave out --clock"
         raise UncertainLTIError(f"{node}: does not follow /clock; {remedy}")

@@ -29,6 +29,7 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.base.files import target
 from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, arrival_of
@@ -99,14 +100,12 @@ def run(args: argparse.Namespace) -> Result:
     return Result(data={"bag": str(output), **counts})
 
 
-def resolved_name(node: Node, topic: str) -> str:
+def resolved_name(node: Node, name: str, kind: str = "topic", example: str = "/joint_states") -> str:
     """The name in full; raises ArgumentError where it is none."""
     try:
-        return node.resolve_topic_name(topic)
+        return node.resolve_topic_name(name)
     except (RuntimeError, ValueError):  # RuntimeError: what rcl raises, under names that rclpy does not export
-        raise ArgumentError(
-            f"{topic!r} is no topic name; write letters, digits, _ and /, as in /joint_states"
-        ) from None
+        raise ArgumentError(f"{name!r} is no {kind} name; write letters, digits, _ and /, as in {example}") from None
 
 
 def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable[[str], None]) -> dict[str, str]:
@@ -252,6 +251,7 @@ class _File:
         for path in (self.path, self._part):
             if path.exists():
                 raise BagError(f"{path}: is there already; choose another output or move it away")
+        target(self.path, holds=b"", kind="recording", example="run.mcap")
         try:
             self._stream: BinaryIO = open(self._part, "xb")
         except OSError as error:

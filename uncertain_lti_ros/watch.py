@@ -74,7 +74,7 @@ class Watched:
     """
 
     def __init__(self, node: Node, name: str, window: float) -> None:
-        self.name, self._window, self._node = resolved_name(node, name), window, node
+        self.name, self._window, self._node = resolved_name(node, name, "node", "/envelope_monitor"), window, node
         self._lock = threading.Lock()
         self._said = _Said([])
         self._heard, self._reason = 0.0, ""

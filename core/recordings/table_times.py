@@ -120,12 +120,12 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             unit, doubt = "d", ""
         if unit == "s" and not stated and (step := _coarse(values)):
             doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
-            ask = f"name it time_us or time_ms, or give `--table unit={likely}`"
+            given = f"`--table unit={likely}` (in a signals file `table: {{unit: {likely}}}`)"
             dated = _since_1970(float(np.nanmedian(values)))
             if step >= _UNLIKELY[dated] or (step >= _ODD and step % 5 and not dated):
                 none = "has no unit, which may be s, ms or us"
-                raise BagError(f"{where}{doubt}: {none}; {ask} (in a signals file `table: {{unit: {likely}}}`)")
-            doubt += f": for others {ask}"
+                raise BagError(f"{where}{doubt}: {none}; name it time_us or time_ms, or give {given}")
+            doubt += f": for others name it time_us or time_ms, or give {given}"
         elif unit == "s" and not stated and _counts_rows(values):
             said.append("its numbers are those of the rows, taken for s: of another rate give `--table step=0.01`")
         if layout.unit is None and (unit != "s" or doubt):

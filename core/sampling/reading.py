@@ -38,6 +38,7 @@ from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
+from uncertain_lti.signals.values import of_table
 
 _CLOCK = "rosgraph_msgs/msg/Clock"
 
@@ -403,7 +404,7 @@ def require(bag: Recording, topic: str, remap: bool = False) -> None:
     if topic not in bag.topics:
         there = shortlist(sorted(bag.topics), 50) or "none"
         none = f"there is no topic {topic}{meant(topic, bag.topics)}; topics there: {there}"
-        if remap and bag.topics:
+        if remap and bag.topics and not any(map(of_table, (topic, *bag.topics))):
             none += f"; one of another name is checked with --remap {topic}:=NAME"
         raise BagError(f"{bag.path}: {none}") from None
 
