@@ -1640,8 +1640,9 @@ def test_signals_of_several_rates_in_one_table_are_topics_of_their_own(tmp_path)
         assert list(table.topics) == ["/table", "/table/Eng_rpm", "/table/Cool"]
         assert [fact.fields for fact in table.facts()] == [("Whl_km_h", "Yaw"), ("Eng_rpm", "Ped"), ("Cool",)]
         assert [fact.rate for fact in table.facts()] == pytest.approx([100, 20, 1])
-    columns = table.columns(["/table/Cool"], [[FieldPath("Cool")]])
+    columns = table.columns(["/table/Cool", "/table"], [[FieldPath("Cool")]] * 2)  # of a file that names but /table
     assert columns.values[0][:, 0].tolist() == [20 + k for k in range(30)]
+    assert np.flatnonzero(np.isfinite(columns.values[1][:, 0])).tolist() == list(range(7, 3000, 100))
 
 
 def _by_turns(rows, more=lambda k: ""):

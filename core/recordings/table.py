@@ -31,7 +31,7 @@ from uncertain_lti.base.errors import BagError, SignalError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
-from uncertain_lti.recordings.table_files import read_table
+from uncertain_lti.recordings.table_files import by_message, read_table
 from uncertain_lti.recordings.table_text import (
     ODD_SHARE,
     QUANTITY,
@@ -45,10 +45,9 @@ from uncertain_lti.recordings.table_text import (
     without_bad,
 )
 from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
-from uncertain_lti.recordings.table_topics import by_message
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
-from uncertain_lti.signals.values import TABLE, TableLayout
+from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout
 
 _PACKED = re.compile(r"[(\[\s]*[-+]?\d[\d.]*([,;|\s]+[-+]?\d[\d.eE+-]*)+[)\]\s]*")
 _RUN = re.compile(r"(?P<file>.*)\[(?P<run>[^\[\]]*)\]")
@@ -196,7 +195,9 @@ class Table(Recording):
         steps = np.diff(self.times[self._rows[topic]])
         step = float(np.median(steps)) if len(steps) else 0.0
         columns, quaternions = self._of(topic)
-        numbers = [(name, c) for name, c in columns.items() if _field_type(c).kind == "number"]
+        slower = {f for of, fields in self._fields.items() if of != topic == TABLE_TOPIC for f in fields}
+        quaternions = {base: names for base, names in quaternions.items() if slower.isdisjoint(names)}
+        numbers = [(name, c) for name, c in columns.items() if _field_type(c).kind == "number" and name not in slower]
         numbered = [base for base, names in quaternions.items() if names[3].endswith("0")]
         parts = {name for base, names in quaternions.items() if base not in numbered for name in names}
         whole = [(name, c) for name, c in numbers if name not in parts]
