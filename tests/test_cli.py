@@ -477,6 +477,7 @@ def test_the_rate_of_bursts_is_that_of_the_whole(tmp_path, cli):
             ["topics", "a.mcap", "b.mcap"],
             "arguments: b.mcap; that is one more than it takes: uncertain-lti topics --help",
         ),
+        (["check", "m", "a.mcap", "--window", "5", "b.mcap"], "arguments: b.mcap; name every BAG in one row, without"),
         (["check", "m", "a.mcap", "--discard", "1"], "--discard 1 (an option of fit)"),
         (["chek", "m", "b"], "(is check meant?)"),
         (["fit", "b", "--signals", "s", "--output", "m", "--additive", "noies"], "(is noise meant?)"),

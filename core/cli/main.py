@@ -252,7 +252,9 @@ class _Parser(argparse.ArgumentParser):
             takes = sorted(name for name, parser in commands.items() if word in parser._option_string_actions)
             message += f" (an option of {', '.join(takes)})" if takes else meant(word, chosen._option_string_actions, 1)
             if not word.startswith("-"):
-                message += f"; that is one more than it takes: {chosen.prog} --help"
+                row = [str(a.metavar) for a in chosen._actions if not a.option_strings and a.nargs == "+"]
+                several = f"name every {' or '.join(row)} in one row, without an option in between"
+                message += f"; {several if row else f'that is one more than it takes: {chosen.prog} --help'}"
         if files := [word for word in self._given if word.startswith("-") and os.path.exists(word)]:
             message += f"; the file {files[0]} is given as ./{files[0]}"
         super().error(message)
