@@ -633,15 +633,21 @@ def test_an_altitude_that_is_held_is_measured(tmp_path):
         assert signals_of(found)[1] == control, found.text
 
 
-def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_told_and_no_signals(tmp_path):
+@pytest.mark.parametrize("even", [True, False])
+def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_of_their_rate_or_told_and_no_signals(tmp_path, even):
     """Of an engine's log at two rates no transition was left, and its gearbox was the command, which stood still."""
     rng, rows, speed = np.random.default_rng(6), [], 1000.0
     for k, throttle in enumerate(np.repeat(rng.uniform(0, 50, 40), 30).tolist()):
-        slow = ["", ""] if k % 2 else [throttle, f"{throttle + rng.normal():.3f}"]
+        slow = ["", ""] if k % 2 or not (even or k % 10) else [throttle, f"{throttle + rng.normal():.3f}"]
         rows.append([f"{0.02 * k:.2f}", speed, 3, *slow, f"{0.019 * k**1.01:.3f}"])
         speed += 0.1 * (1000 + 40 * throttle - speed) + rng.normal()
     path = csv(tmp_path / "a.csv", ["time", "rpm", "drivetrain_gear", "dbw_target", "tps", "Test (Sec)"], rows)
     proposal = propose([path])
+    if even:
+        states, controls = signals_of(proposal)
+        assert ("/table", "rpm") in states and controls == [("/table/dbw_target", "dbw_target")], proposal.text
+        assert fitted([path], proposal).fit_summary["violations"] == 0
+        return
     assert signals_of(proposal) == ([("/table", "rpm")], []), proposal.text
     (warning,) = proposal.warnings
     assert re.search("a number of (dbw_target, tps|tps, dbw_target); where it holds.* fill the empty cells", warning)
