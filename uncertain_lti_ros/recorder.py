@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Result:
-    """Record until SIGINT, SIGTERM or the end of the duration; the file is whole or not there.
+    """Record until a signal of `endings` or the end of the duration; the file is whole or not there.
 
     While recording it is called BAG.part, with all but the last seconds readable.
     """

@@ -219,7 +219,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> Result:
-    """Serve the page until SIGINT or SIGTERM."""
+    """Serve the page until a signal of `endings`."""
     with living(lambda: Node("uncertain_lti_watch")) as life:
         with serving(Watched(life.node, args.monitor, args.seconds), args.host, args.port) as address:
             args.say(f"watching {args.monitor} at {address}; stop with Ctrl-C")

@@ -117,8 +117,9 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
     for topic, fact in facts.items():
         total = sum(_messages(bag, topic) for bag in bags)
         if fact.info.type == TABLE:
-            sources += _of_table(topic, total, {f: number == len(bags) for f, number in held[topic].items()})
-            for candidate in (c for source in sources if source.topic == topic for c in source.candidates):
+            parts = _of_table(topic, total, {f: number == len(bags) for f, number in held[topic].items()})
+            sources += parts
+            for candidate in (c for source in parts for c in source.candidates):
                 of_each = {bag.units.get(candidate.path, "") for bag in bags}
                 candidate.unit = of_each.pop() if len(of_each) == 1 else ""
             continue

@@ -348,7 +348,7 @@ def units_of(names: Sequence[str], stated: Mapping[str, str]) -> dict[str, str]:
     alike.update(names)
     units = {n: m["a"] or m["b"] or m["c"] for n, m in parts.items() if alike[m["of"]] == 1}
     units |= {name: unit.strip("[](){} ") for name, unit in stated.items() if name in names}
-    return {name: unit.strip() for name, unit in units.items() if _UNIT.fullmatch(unit.strip())}
+    return {name: bare for name, unit in units.items() if _UNIT.fullmatch(bare := unit.strip())}
 
 
 QUALITY = re.compile(r"(?i)(?P<of>(.*[\W_])?)(q|qc|qual|quality)\d*")
