@@ -28,6 +28,7 @@ from sensor_msgs.msg import JointState
 
 from uncertain_lti import EnvelopeMonitor, fit, read_transients
 from uncertain_lti.base.errors import BagError, UncertainLTIError
+from uncertain_lti.base.text import plural
 from uncertain_lti.cli.command import BAD_INPUT, DONE, Result
 from uncertain_lti.plants.turbofan_runs import turbofan_signals
 from uncertain_lti.recordings.bag_files import metadata_pairs
@@ -189,7 +190,7 @@ def _shown(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -
     where = ", ".join(f"{name} {count}" for name, count in counts if count)
     word = f"VIOLATED {int(violated.any(axis=1).sum())}: {where}" if where else "contained"
     begin, end = ((t_ns - start_ns) * 1e-9 for t_ns in (stamps[0], stamps[-1]))
-    return f"   t = {begin:6.2f} to {end:6.2f} s: {int(judged.sum())} verdicts, {word}"
+    return f"   t = {begin:6.2f} to {end:6.2f} s: {plural(int(judged.sum()), 'verdict')}, {word}"
 
 
 @contextlib.contextmanager

@@ -150,8 +150,10 @@ def start(options: argparse.Namespace) -> Result:
     from uncertain_lti.reports.pages import page_target
     from uncertain_lti.signals.values import of_table
 
-    signals, model, page = (f"{options.output}{ending}" for ending in (".yaml", ".model.json", ".html"))
-    if not os.path.basename(options.output):
+    endings = (".yaml", ".model.json", ".html")
+    name = next((options.output.removesuffix(e) for e in endings if options.output.endswith(e)), options.output)
+    signals, model, page = (f"{name}{ending}" for ending in endings)
+    if not os.path.basename(name):
         raise SignalError(f"--output '{options.output}' names no file; give a name such as machine or models/machine")
     model_target(model, options.force, options.bags)  # what cannot be written is found before the work
     page_target(page, model, [])

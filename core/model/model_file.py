@@ -244,7 +244,7 @@ def read(path: str | os.PathLike[str]) -> Any:
     try:
         if os.path.getsize(path) > MAX_FILE_BYTES:
             raise ModelError(f"{path}: larger than {MAX_FILE_BYTES >> 20} MiB, so not a model file; check the path")
-        with open(path, encoding="utf-8") as stream:
+        with open(path, encoding="utf-8-sig") as stream:
             return json.load(stream, object_pairs_hook=_distinct)
     except FileNotFoundError:
         raise ModelError(f"{path}: there is no such model file; write one with `uncertain-lti fit`") from None
