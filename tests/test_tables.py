@@ -1631,15 +1631,15 @@ def test_signals_of_several_rates_in_one_table_are_topics_of_their_own(tmp_path)
 
     def row(k):
         lost = rng.random() < 0.02
-        slow = f"{k % 7},{math.sin(0.01 * k):.4f}" if k % 5 == 3 and not lost else ","
+        slow = f"{k % 7 if k % 500 != 3 else ''},{math.sin(0.01 * k):.4f}" if k % 5 == 3 and not lost else ","
         return f"{0.01 * k:.2f},{'' if lost else k % 5},{k % 3},{slow},{20 + k // 100 if k % 100 == 7 else ''}"
 
-    for rows in (350, 3000):
+    for rows in (60, 250, 350, 3000):  # a model of long ones refused those of fewer than four slow messages
         path = write(tmp_path / f"{rows}.csv", "time,Whl [km/h],Yaw,Eng [rpm],Ped,Cool", *map(row, range(rows)))
         table = open_recording(path)
         assert list(table.topics) == ["/table", "/table/Eng_rpm", "/table/Cool"]
         assert [fact.fields for fact in table.facts()] == [("Whl_km_h", "Yaw"), ("Eng_rpm", "Ped"), ("Cool",)]
-        assert [fact.rate for fact in table.facts()] == pytest.approx([100, 20, 1])
+        assert [fact.rate for fact in table.facts()] == pytest.approx([100, 20, 1] if rows > 60 else [100, 20, None])
     columns = table.columns(["/table/Cool", "/table"], [[FieldPath("Cool")]] * 2)  # of a file that names but /table
     assert columns.values[0][:, 0].tolist() == [20 + k for k in range(30)]
     assert np.flatnonzero(np.isfinite(columns.values[1][:, 0])).tolist() == list(range(7, 3000, 100))

@@ -316,12 +316,15 @@ def _slower(names: Mapping[bytes, list[str]], number: int) -> dict[str, tuple[li
             groups.append((there, [*names[kind]]))
     if not groups or np.count_nonzero(groups[0][0]) < _SAME * number:
         return {}
-    slower = {}
+    slower: dict[str, tuple[list[str], NDArray[np.intp]]] = {}
+    order = [*chain(*names.values())]
     for there, group in groups[1:]:
         rows = np.flatnonzero(there)
         steps = np.diff(rows)
         usual = float(np.median(steps)) if len(rows) > 3 else 0.0
-        if usual >= 2 and np.mean((steps > usual / 2) & (steps < 2 * usual)) >= _SAME:
+        few = len(rows) <= 3 and (len(rows) > 1 or bool(slower))  # as of a short recording
+        if few or usual >= 2 and np.mean((steps > usual / 2) & (steps < 2 * usual)) >= _SAME:
+            group.sort(key=order.index)  # whichever has a number more
             slower[f"{TABLE_TOPIC}/{group[0]}"] = group, rows
     return slower
 
