@@ -410,8 +410,11 @@ def test_what_a_tile_is_filled_up_with_counts_nowhere_and_on_a_bound_is_not_outs
     outside, width, *_ = arithmetic.verdicts(tables, z, dt, after, z[:1], blocks, np.zeros((1, 3)), np.ones((1, 1)))
     assert (outside.tolist(), width.tolist()) == ([1], [1.0])
     given = z, dt, after, z[:1], None, None, 0, (False,), np.zeros((2, 1)), np.array([[0.0], [0.0], [0.5]])
-    at, distance = arithmetic.near_bounds(1, *given, None, None, [0])
-    assert (at.tolist(), distance.tolist()) == ([2], [2.0])
+    of = np.array([0.0, 0.0, 1.0]), [2.0], [0.0], [0.0]  # sizes, by twice of which slack is told
+    at, slack = arithmetic.near_bounds(1, *given, *of, None, [0])
+    assert (at.tolist(), slack.tolist()) == ([2], [-0.75])
+    at, slack = arithmetic.near_bounds(1, *given, *of[:2], [0.1], [0.0], None, [0])
+    assert (at.tolist(), slack.tolist()) == ([1, 2], [0.0, -0.75]), "and those within the reach"
     given = z, np.array([0.5, 1.0, 2.0]), z[:1], z[:1], None, None, 0, (True,), np.zeros((2, 1)), given[-1]
-    at, _ = arithmetic.near_bounds(1, *given, None, np.array([1.5]), [0])
-    assert at.tolist() == [2], "by its width at its step, which alone is over the limit"
+    at, slack = arithmetic.near_bounds(1, *given, *of, np.array([1.5]), [0])
+    assert (at.tolist(), slack.tolist()) == ([2], [-0.0625]), "by its width at its step, which alone is over the limit"

@@ -104,7 +104,7 @@ class Fleet:
         each = replace(candidate, most=most)  # all parts together bring about twice as many as one that is alone
         results = self.map(passes.scan, [(each, offset) for offset in self.offsets])
         by_row = (zip(*of_row, strict=True) for of_row in zip(*results, strict=True))
-        return [(Samples.join(samples, self.p), min(reach)) for samples, reach in by_row]
+        return [(Samples.join([*itertools.chain(*samples)], self.p), min(reach)) for samples, reach in by_row]
 
     def judge(self, model: Envelope) -> Judged:
         """What the bounds of a model are on all transitions, by the verdict's own arithmetic."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 from operator import add
 from typing import Any, Protocol, TypeVar
 
@@ -26,9 +27,6 @@ from uncertain_lti.identification.problem import Block, Columns, Partition
 from uncertain_lti.kernel.arithmetic import Blocks, near_bounds, occupy, pair_count, sums_of, verdicts
 
 T = TypeVar("T", "Moments", "Judged")
-
-_ROUNDING = 1e-11
-"""Slack, in scaled units, by which equal widths differ."""
 
 
 def _merged(a: T, b: T, least: Collection[str], greatest: Collection[str]) -> T:
@@ -193,7 +191,7 @@ class Samples:
     def __len__(self) -> int:
         return len(self.index)
 
-    def __getitem__(self, chosen: Index | NDArray[np.bool_]) -> Samples:
+    def __getitem__(self, chosen: Index | NDArray[np.bool_] | slice) -> Samples:
         every = (getattr(self, field.name) for field in fields(self))
         some: list[Any] = [None if values is None else values[..., chosen] for values in every]
         return Samples(*some)
@@ -212,13 +210,10 @@ class Samples:
             return cls(np.empty(0, dtype=np.intp), np.empty((p, 0)), nothing, nothing, nothing)
         if len(parts) == 1:
             return parts[0]
-        whole = cls.beside(parts)
+        whole = cls(*(_joined([getattr(s, field.name) for s in parts]) for field in fields(cls)))
+        if (np.diff(whole.index) > 0).all():
+            return whole
         return whole[np.unique(whole.index, return_index=True)[1]]
-
-    @classmethod
-    def beside(cls, parts: Sequence[Samples]) -> Samples:
-        """All of them, one after the other."""
-        return cls(*(_joined([getattr(s, field.name) for s in parts]) for field in fields(cls)))
 
 
 @dataclass(frozen=True)
@@ -243,110 +238,63 @@ class Candidate:
     rows: Index
 
 
-def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[Samples, float]]:
-    """Samples whose slack is below the reach, per row: one pass.
+def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[list[Samples], float]]:
+    """Samples whose slack is below the reach, per row, in parts that follow one another: one pass.
 
     The slack of a sample is its distance from leaving the bounds (8)(9), or from being wider than (11) allows, in
     scaled units; negative if it is outside. If more than `most` samples of a row qualify, those of least slack
     are returned, and the reach is the least slack of the others.
     """
-    columns, p = part.columns, part.p
-    theta, d, rows = candidate.theta, candidate.d, candidate.rows
-    n = len(rows)
-    found: list[_Near] = []
-    kept = np.zeros(n, dtype=np.intp)
+    rows, most = candidate.rows, candidate.most
+    of = candidate.theta, candidate.d, candidate.size_unit, candidate.scale
     reach = np.minimum(candidate.reach, 1e100)  # inf asks for all, and inf x 0 is nothing
-    unit = np.reshape(candidate.size_unit, (len(d), -1)) * candidate.scale
+    found: list[list[tuple[Samples, Array]]] = [[] for _ in rows]  # with the slack of each
 
-    # slack < reach is a comparison with half-widths that are smaller, for the width of (11) larger, by the reach
-    def shifted() -> tuple[Array, Array | None]:
-        outer = None if candidate.limit is None else d + np.minimum(reach, candidate.room) * unit
-        return d - reach * unit, outer
+    def keep_nearest(i: int) -> None:
+        parts, slacks = zip(*found[i], strict=True)
+        nearest, least = _nearest(np.concatenate(slacks), most)
+        reach[i] = min(reach[i], least)
+        ends = np.cumsum([len(slack) for slack in slacks])
+        each = zip(parts, slacks, np.split(nearest, np.searchsorted(nearest, ends[:-1])), [0, *ends], strict=False)
+        found[i] = [(part[k - start], slack[k - start]) for part, slack, k, start in each]
 
-    halves = shifted()
     for block in part.blocks():
         limit = None if candidate.limit is None else candidate.limit[:, None] / block.root_weights()[rows]
-        chosen, distance = near_bounds(part.n, *_given(block, columns), *columns.extra, theta, *halves, limit, rows)
-        if not len(chosen):
-            continue
-        found.append(_near(candidate, block, columns, chosen, distance, offset))
-        kept += np.bincount(found[-1].row, minlength=n)
-        if (kept > 2 * candidate.most).any():
-            each, reach = _least(found, n, candidate.most, reach)
-            found = [_Near.join([near[np.sort(np.concatenate(some))] for near, some in zip(found, each, strict=True)])]
-            kept, halves = np.bincount(found[0].row, minlength=n), shifted()
-    samples = [Samples.join([], p)] * n
-    if found:
-        each, reach = _least(found, n, candidate.most, reach)
-        samples = [Samples.beside([near.samples[a[i]] for near, a in zip(found, each, strict=True)]) for i in range(n)]
+        given = *_given(block, part.columns), *part.columns.extra
+        chosen, slack = near_bounds(part.n, *given, *of, reach, candidate.room, limit, rows)
+        edges = np.searchsorted(chosen, len(block) * np.arange(len(rows) + 1))
+        near = []
+        for i, (first, end) in enumerate(pairwise(edges.tolist())):
+            nearest, least = _nearest(slack[first:end], most)
+            near.append(nearest + first)
+            reach[i] = min(reach[i], least)
+        seen = _seen(block, rows, chosen[np.concatenate(near)], offset)
+        for i, (k, end) in enumerate(zip(near, np.cumsum([len(k) for k in near]).tolist(), strict=True)):
+            found[i].append((seen[end - len(k) : end], slack[k]))
+            if sum(len(slack) for _, slack in found[i]) > 2 * most:
+                keep_nearest(i)
+    for i in range(len(rows)):
+        keep_nearest(i)
     held = reach if candidate.limit is None else np.minimum(reach, candidate.room)
-    return list(zip(samples, held.tolist(), strict=True))
+    return [([samples for samples, _ in each], end) for each, end in zip(found, held.tolist(), strict=True)]
 
 
-@dataclass(frozen=True)
-class _Near:
-    """Samples of several rows with their slack; those of a row are in order of index."""
-
-    row: Index
-    samples: Samples
-    slack: Array
-
-    def __getitem__(self, chosen: Index) -> _Near:
-        return _Near(self.row[chosen], self.samples[chosen], self.slack[chosen])
-
-    @classmethod
-    def join(cls, parts: Sequence[_Near]) -> _Near:
-        """One after the other."""
-        row, slack = (_joined([getattr(part, name) for part in parts]) for name in ("row", "slack"))
-        return cls(row, Samples.beside([part.samples for part in parts]), slack)
+def _nearest(slack: Array, most: int) -> tuple[Index, float]:
+    """The samples of least slack, at most this many, in order, and the least slack of the others."""
+    if len(slack) <= most:
+        return np.arange(len(slack)), np.inf
+    order = np.argpartition(slack, most)
+    return np.sort(order[:most]), float(slack[order[most]])
 
 
-def _near(candidate: Candidate, block: Block, columns: Columns, chosen: Index, residual: Array, offset: int) -> _Near:
-    """Samples of a piece; chosen (K,): row of the candidate x length of the piece + transition; residual (K,)."""
-    row, k = np.divmod(chosen, len(block))
-    which = candidate.rows[row]
-    z, dt = block.z[:, k], block.dt[k]
-    root = block.root_weights()
-    s = None if block.s is None else block.s[:, k]
-    psi = columns.psi(z, dt, s)
-    samples = Samples(
-        k + (block.start + offset),
-        z,
-        (block.x_next[which, k] - block.origin[which, k]) / dt,
-        dt,
-        root[which, k if root.shape[1] > 1 else 0],
-        s,
-    )
-    half = np.einsum("qk,qk->k", candidate.d[:, row], psi)
-    unit = candidate.size_unit
-    size = unit @ psi if unit.ndim == 1 else np.einsum("qk,qk->k", unit[:, row], psi)
-    size[size == 0.0] = 1.0  # at rest without an additive term nothing but rest is contained
-    size *= candidate.scale[row]
-    slack = (half - residual) / size
-    if candidate.limit is not None:
-        room = (candidate.limit[row] / (2.0 * samples.root_weight * dt) - half) / size
-        wanted = room < candidate.room[row] - _ROUNDING  # where noise alone makes widths, all are the widest
-        slack = np.where(wanted, np.minimum(slack, room), slack)
-    return _Near(row, samples, slack)
-
-
-def _least(found: Sequence[_Near], rows: int, most: int, reach: Array) -> tuple[list[list[Index]], Array]:
-    """Of each part and row the samples of least slack, at most this many per row, and the slack below which none lacks.
-
-    The samples are not put together for it: of many signals they are hundreds of MB.
-    """
-    each, reach = [], reach.copy()
-    starts = np.cumsum([0, *(len(near.row) for near in found[:-1])])
-    of, slack = (np.concatenate([getattr(near, name) for near in found]) for name in ("row", "slack"))
-    for i in range(rows):
-        own = np.flatnonzero(of == i)
-        if len(own) > most:
-            order = np.argpartition(slack[own], most)
-            reach[i] = min(reach[i], slack[own[order[most]]])
-            own = np.sort(own[order[:most]])
-        parts = np.split(own, np.searchsorted(own, starts[1:]))
-        each.append([part - start for part, start in zip(parts, starts, strict=True)])
-    return [list(part) for part in zip(*each, strict=True)], reach
+def _seen(block: Block, rows: Index, chosen: Index, offset: int) -> Samples:
+    """Transitions of a piece as rows of the model see them, together; chosen (K,): row x length of it + transition."""
+    of, k = np.divmod(chosen, len(block))
+    row, dt, root = rows[of], block.dt[k], block.root_weights()
+    rate = (block.x_next[row, k] - block.origin[row, k]) / dt
+    s = None if block.s is None else np.take(block.s, k, axis=1)
+    weights = root[row, k if root.shape[1] > 1 else 0]
+    return Samples(k + (block.start + offset), np.take(block.z, k, axis=1), rate, dt, weights, s)
 
 
 @dataclass(frozen=True)

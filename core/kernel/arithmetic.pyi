@@ -210,8 +210,11 @@ def near_bounds(
     ones: int,
     times_dt: Sequence[bool],
     theta: Array,
-    inner: Array,
-    outer: Array | None,
+    d: Array,
+    unit: Array,
+    scale: Array,
+    reach: Array,
+    room: Array,
     limit: Array | None,
     rows: Any,
 ) -> tuple[NDArray[np.intp], Array]: ...

@@ -15,6 +15,9 @@ schedule and the scheduling vectors s (axes, K), as of `Tiles`. Of the regressor
 """
 
 
+cdef double _ALIKE = 1e-11  # slack by which equal widths differ: where noise alone makes them, all are the widest
+
+
 cdef void add_products(
     const double* a, Py_ssize_t rows, const double* b, Py_ssize_t columns, const double* factor, Tiles tiles,
     double* room, double[:, ::1] total,
@@ -121,34 +124,39 @@ def sums_of(Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones,
 
 
 def near_bounds(
-    Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones, times_dt, theta, inner, outer, limit, rows
+    Py_ssize_t n, z, dt, after, base, Blocks blocks, s, Py_ssize_t ones, times_dt, theta, d, unit, scale, reach, room,
+    limit, rows
 ):
-    """Transitions outside a candidate's bounds, or wider than its limit, of each of some rows of the model.
+    """Transitions of less slack than the reach in a candidate's bounds, or than the room below its limit.
 
-    `theta` (R r, k): nominal elements; `inner` (R q, k): half-widths of the bounds; `outer` (R q, k) and `limit` (k,)
-    or (k, K): those of which twice the width per step is held against the limit, or None; `rows` (k,): rows of the
-    model. Returns positions row x K + transition, in order, and |rate - centre| of each.
+    `theta` (R r, k): nominal elements; `d` (R q, k): half-widths; `unit` (R q,) or (R q, k): the size of a transition is
+    unit . psi; `scale` (k,): slack is counted in size x scale; `reach`, `room` (k,); `limit` (k,) or (k, K): what twice
+    the width per step is held against, or None; `rows` (k,): rows of the model. Returns positions row x K + transition,
+    in order, and the slack of each: half - |rate - centre|, or limit - half if that is less than the room, too.
     """
     cdef Tiles tiles = Tiles(n, z.shape[0] + ones, z, dt, base, after, blocks, s)
     cdef Py_ssize_t p = tiles.p, r = tiles.p + ones, size = tiles.p + len(times_dt), count = len(rows)
-    cdef Py_ssize_t i, j, k, q, kept = 0, held = tiles.blocks.count
+    cdef Py_ssize_t i, j, k, q, kept = 0, held = tiles.blocks.count, units = len(unit.T) if unit.ndim > 1 else 1
     cdef const unsigned char[::1] by_dt = np.array([*times_dt, 0], dtype=np.uint8)
     cdef const Py_ssize_t[::1] which = np.ascontiguousarray(rows, dtype=np.intp)
-    cdef arrays.array nominal = doubles(theta), within = doubles(inner)
-    cdef arrays.array wider = doubles(inner if outer is None else outer)
+    cdef arrays.array nominal = doubles(theta), within = doubles(d), sized = doubles(unit), by = doubles(scale)
+    cdef arrays.array near = doubles(reach), below = doubles(room)
     cdef bint limited = limit is not None
     cdef const double[:, :] most = np.zeros((1, 1)) if limit is None else np.reshape(limit, (count, -1))
     cdef bint each = limited and most.shape[1] > 1
-    if not (len(nominal) >= held * r * count and len(within) >= held * size * count <= len(wider)):
+    cdef double slack, of_size, narrower, free_of
+    if not (len(nominal) >= held * r * count and len(within) >= held * size * count) or units not in (1, count) or (
+        len(sized) != held * size * units or not len(by) == len(near) == len(below) == count
+    ):
         raise ValueError("the candidate does not fit the terms")
-    found, distances = np.empty(count * tiles.count, dtype=np.intp), np.empty(count * tiles.count)
+    found, slacks = np.empty(count * tiles.count, dtype=np.intp), np.empty(count * tiles.count)
     cdef Py_ssize_t[::1] position = found
-    cdef double[::1] distance = distances
+    cdef double[::1] least = slacks
     cdef double* psi = room_for(size + 4)
     cdef double* left = psi + size * _TOGETHER
     cdef double* half = left + _TOGETHER
-    cdef double* wide = half + _TOGETHER
-    cdef double* beyond = wide + _TOGETHER
+    cdef double* large = half + _TOGETHER
+    cdef double* beyond = large + _TOGETHER
     cdef const double* step = tiles.step
     cdef const double* start
     cdef const double* end
@@ -162,23 +170,34 @@ def near_bounds(
                 start, end = tiles.start + which[i] * _TOGETHER, tiles.end + which[i] * _TOGETHER
                 tiles.sum(nominal.data.as_doubles, i, count, r, tiles.phi, left)
                 tiles.sum(within.data.as_doubles, i, count, size, psi, half)
+                if i == 0 or units > 1:
+                    tiles.sum(sized.data.as_doubles, i, units, size, psi, large)
+                narrower = near.data.as_doubles[i] * by.data.as_doubles[i]
                 for q in range(tiles.whole):
                     left[q] = fabs(left[q] * step[q] - (end[q] - start[q]))
-                    beyond[q] = left[q] - half[q] * step[q]
+                for q in range(tiles.whole):  # of more arrays at once a compiler makes no vectors
+                    beyond[q] = left[q] - (half[q] - narrower * large[q]) * step[q]
                 if limited:
-                    tiles.sum(wider.data.as_doubles, i, count, size, psi, wide)
+                    free_of = fmin(near.data.as_doubles[i], below.data.as_doubles[i]) * by.data.as_doubles[i]
                     for q in range(tiles.many):
-                        if 2.0 * wide[q] * step[q] > most[i, tiles.index[q] if each else 0]:
+                        if 2.0 * (half[q] + free_of * large[q]) * step[q] > most[i, tiles.index[q] if each else 0]:
                             beyond[q] = 1.0
                 if greatest_of(beyond, tiles.many) > 0.0:
                     for q in range(tiles.many):
                         if beyond[q] > 0.0:
+                            # at rest without an additive term nothing but rest is contained
+                            of_size = (large[q] if large[q] != 0.0 else 1.0) * by.data.as_doubles[i]
+                            slack = (half[q] - left[q] / step[q]) / of_size
+                            if limited:
+                                free_of = (most[i, tiles.index[q] if each else 0] / (2.0 * step[q]) - half[q]) / of_size
+                                if free_of < below.data.as_doubles[i] - _ALIKE and free_of < slack:
+                                    slack = free_of
                             position[kept] = i * tiles.count + tiles.index[q]
-                            distance[kept] = left[q] / step[q]
+                            least[kept] = slack
                             kept += 1
     free(psi)
     order = np.argsort(found[:kept])
-    return found[order], distances[order]
+    return found[order], slacks[order]
 
 
 def verdicts(tables, z, dt, after, base, Blocks blocks, s, roots):
