@@ -250,7 +250,9 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[l
     reach = np.minimum(candidate.reach, 1e100)  # inf asks for all, and inf x 0 is nothing
     found: list[list[tuple[Samples, Array]]] = [[] for _ in rows]  # with the slack of each
 
-    def keep_nearest(i: int) -> None:
+    def keep_nearest(i: int, limit: int) -> None:
+        if sum(len(slack) for _, slack in found[i]) <= limit:
+            return
         parts, slacks = zip(*found[i], strict=True)
         nearest, least = _nearest(np.concatenate(slacks), most)
         reach[i] = min(reach[i], least)
@@ -271,10 +273,9 @@ def scan(part: Partition, candidate: Candidate, offset: int = 0) -> list[tuple[l
         seen = _seen(block, rows, chosen[np.concatenate(near)], offset)
         for i, (k, end) in enumerate(zip(near, np.cumsum([len(k) for k in near]).tolist(), strict=True)):
             found[i].append((seen[end - len(k) : end], slack[k]))
-            if sum(len(slack) for _, slack in found[i]) > 2 * most:
-                keep_nearest(i)
+            keep_nearest(i, 2 * most)
     for i in range(len(rows)):
-        keep_nearest(i)
+        keep_nearest(i, most)
     held = reach if candidate.limit is None else np.minimum(reach, candidate.room)
     return [([samples for samples, _ in each], end) for each, end in zip(found, held.tolist(), strict=True)]
 
