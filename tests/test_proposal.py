@@ -2070,6 +2070,18 @@ def test_a_column_in_degrees_that_jumps_by_a_turn_is_unwrapped(tmp_path):
         assert {c.path for c in proposal.states} == {f"unwrap({name}, 360)", "heater_power"}, proposal.text
 
 
+@pytest.mark.parametrize(("unit", "angle"), [("°", True), ("deg", True), ("°C", False), ("", False)])
+def test_the_unit_says_that_a_column_is_an_angle(tmp_path, unit, angle):
+    """A nacelle and a crane that pass north were fitted to jumps of 360, as their names say nothing of an angle."""
+    rng = np.random.default_rng(3)
+    on = np.repeat(rng.choice([0.0, 350.0], size=60), 25)
+    rows = zip(np.cumsum(0.02 * on) % 360, on + rng.normal(size=1500), strict=True)
+    lines = ["time;Slew;power", f"s;{unit};kW", *(f"{0.02 * k};{a};{b}" for k, (a, b) in enumerate(rows))]
+    (tmp_path / "a.csv").write_text("\n".join(lines) + "\n")
+    proposal = propose([tmp_path / "a.csv"])
+    assert ("unwrap(Slew, 360)" in {c.path for c in proposal.states}) == angle, proposal.text
+
+
 def test_channels_of_an_aircraft_and_inputs_are_controls_and_what_is_in_a_cabinet_is_measured():
     plane = ["aileron", "elevator", "throttle", "roll"]
     assert [role_of_column(name, plane) for name in plane] == ["control", "control", "control", "state"]

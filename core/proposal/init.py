@@ -413,7 +413,7 @@ def _wrapped(source: Source) -> None:
         low, high, turning = candidate.finite.min(), candidate.finite.max(), of_compass(candidate)
         compass = bool(turning and -180 <= low and high <= 360 and max(-low, high) > math.tau)
         called = f"{source.topic.rpartition('/')[2]} {candidate.path}".lower()
-        named = turning or _ANGLE.search(called)
+        named = turning or _ANGLE.search(called) or _ANGLE.search(f"_{candidate.unit.replace('°', 'deg')}".lower())
         turned = (t for t in (math.tau, 360.0) if any(s <= 1.1 * t and step > 0.8 * t for s, step in steps))
         turn = math.tau if angle else next(turned if named else iter(()), 360.0 * compass or turn_of_count(candidate))
         if turn:
