@@ -578,12 +578,13 @@ def promises(model: UncertainLTI, panel: Panel, shown: str = "left out") -> list
             one = f", {panel.names[far]} farthest at {panel.reached[far]:.3g} times" if panel.names else ""
             if panel.reached[far] > _DOUBTED:
                 one += " (was the machine healthy in it, and are its units those of the others?)" * bool(panel.names)
-            further = f"expect {further} of further ones"
+            further = f"expect {further} of further ones" + " that stay there" * bool(panel.unlike)
             higher = panel.asked is None and evidence.factor > 1.0
             if panel.alarming and panel.asked is None and not higher:
                 low = float(f"{min(0.1 * most, _LOW):.1g}")  # one above the limit lowers the thresholds
                 further += f"; to have fewer, ask for a low rate (--false-alarms {low:g})"
             how = f", {evidence.factor - 1.0:.0%} higher as most pass them," if higher else " alone"
+            how += f"{',' * (not higher)} within what they cover," * bool(panel.unlike)
             would = f"{alarming} would alarm{one * (panel.alarming > 0)}"
             found.append(f"at thresholds of the others{how} {would}: {further}")
     else:
