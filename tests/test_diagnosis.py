@@ -193,6 +193,12 @@ def test_a_machine_at_rest_is_not_frozen():
     settle = put(slice(400, 700), slice(None), 0.0)
     assert "frozen" not in said(messages(run(u=u, change=settle, noise=0.0)))
 
+    def beside_noise(x, u):  # which moves at any time: a load at its limit was a frozen sensor beside a voltage
+        x, u = put(slice(300, 400), 1, lambda x: x[300, 1])(x, u)
+        return np.column_stack([np.random.default_rng(1).normal(size=len(x)), x[:, 1]]), u
+
+    assert "frozen" not in said(messages(run(u=u, change=beside_noise)))
+
 
 def test_a_block_of_a_long_recording_that_ends_as_a_rest_begins_is_not_frozen():
     """Of 28500 transitions 0 to 999 and 1447 to 2446 are looked at: the first end in a repeat, and the others at 0."""

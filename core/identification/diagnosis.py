@@ -421,13 +421,14 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
     found = list[tuple[int, str, str]]()
     low, high = problem.z.min(axis=1), problem.z.max(axis=1)
     spread = high - low
+    noise = np.array([np.square(np.diff(z, prepend=z[0])).mean() > z.var() for z in problem.z])  # moves at any time
     for i in range(problem.n):
         still = problem.x_next[i] == problem.z[i]
         if still.mean() > 0.5:  # held, quantised, or at rest most of the time
             continue
         still[1:] &= (problem.source[1:] == problem.source[:-1]) & (problem.z[i, 1:] == problem.x_next[i, :-1])
         for start, stop in (run for run in runs(still) if run[1] - run[0] >= FROZEN):
-            others = (spread > 0) & (np.arange(problem.p) != i)
+            others = (spread > 0) & ~noise & (np.arange(problem.p) != i)
             moving = others & (np.ptp(problem.z.T[start:stop], axis=0) > 0.2 * spread)
             if moving.any() and low[i] < problem.z[i, start] < high[i]:
                 where, other = _where(problem, [start], transients), names[int(np.argmax(moving))]
