@@ -22,6 +22,7 @@ from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, read_transients
 from uncertain_lti.identification import evidence, fit
 from uncertain_lti.identification.diagnosis import remedies
 from uncertain_lti.reports.check import check_data, check_text
+from uncertain_lti.reports.findings import findings
 from uncertain_lti.reports.model_text import next_text
 from uncertain_lti.sampling.steady_state import resolve_auto
 from uncertain_lti.signals.signal_map import Signal
@@ -519,7 +520,9 @@ def test_a_coarse_encoder_that_is_sampled_fast_is_no_slow_sensor():
     assert any("new about every 5 samples: its topic or its sensor is slower than the clock" in text for text in found)
 
 
-def test_what_asks_for_nothing_is_not_what_to_look_at_first():
+def test_what_asks_for_nothing_is_neither_what_to_look_at_first_nor_a_reason_for_care():
     model = fit([run()], "qp", additive="both")
     told = "Δt is constant, so dc and v cannot be told apart: v takes the width and dc is 0"
     assert told in model.fit_summary["messages"] and "look first at: Δt" not in next_text(model, "m.json")
+    reasons = findings(model, "m.json", [EnvelopeMonitor(model).check(run(1))])["rely"]["reasons"]
+    assert not any("Δt is constant" in reason["text"] for reason in reasons)

@@ -68,6 +68,7 @@ UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
 
 CONSTANT = "never moved in what was fitted"
 """Words on controls that never moved: nothing is to be mended for the operation that was recorded."""
+HARMLESS = (CONSTANT, "dc is 0", "keeps the steady state", "keeps them there")  # the others on what was chosen
 _CODE, _NOISE = "a number that stands for no value", "like noise from sample to sample"
 _BEFORE, _FEW = "one sample earlier explains", "as wide as the rest needs"
 _QUATERNION = re.compile(r"((?:.*\.)?(?:orientation|rotation|quaternion|quat|q)(?:\.|_?))[xyzw]")

@@ -31,7 +31,7 @@ from uncertain_lti.base.text import (
     shortlist,
     times,
 )
-from uncertain_lti.identification.diagnosis import CONSTANT
+from uncertain_lti.identification.diagnosis import HARMLESS
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.domain import UNVOUCHED
 from uncertain_lti.model.interchange import block_facts
@@ -234,7 +234,7 @@ def _messages(model: UncertainLTI) -> list[str]:
 
 def _fit_reasons(model: UncertainLTI) -> Reasons:
     for message in _messages(model):  # widths and the blocks of a schedule have reasons of their own below
-        if not message.startswith(("the bounds are over", "the block at")) and CONSTANT not in message:
+        if not message.startswith(("the bounds are over", "the block at")) and not any(w in message for w in HARMLESS):
             yield CARE, "fit", message
     if not model.fit_summary:
         yield CARE, "fit", "the model file does not say how it was fitted"

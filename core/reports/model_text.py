@@ -16,7 +16,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from uncertain_lti.base.text import Block, Table, list_of, named, number, numbers_of, plural, share, shortlist, text_of
-from uncertain_lti.identification.diagnosis import CONSTANT, remedies
+from uncertain_lti.identification.diagnosis import HARMLESS, remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -113,8 +113,7 @@ def alarm_text(model: UncertainLTI) -> str:
 def next_text(model: UncertainLTI, file: str) -> str:
     """What to look at after a fit: the first thing that a person can mend, and the commands that tell more."""
     facts = model.fit_summary
-    harmless = ["schedules nothing", CONSTANT, "the bounds hold as they are", "the bounds hold, but", "stay valid"]
-    harmless += ["dc is 0", "keeps the steady state", "keeps them there"]  # what was chosen, and asks for nothing
+    harmless = [*HARMLESS, "schedules nothing", "the bounds hold as they are", "the bounds hold, but", "stay valid"]
     minded = [text for text in facts.get("messages", []) if not any(words in text for words in harmless)]
     blind = facts.get("alarm", {}).get("worth") in ("none", "some")
     remedy = remedies(facts.get("messages", []), facts["additive"], model.state_names[0]) if blind else ""
