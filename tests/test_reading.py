@@ -400,6 +400,16 @@ def test_values_that_are_nan_or_infinite_cost_the_transitions_that_need_them(tmp
     assert not transient.usable.any()
 
 
+def test_missing_values_of_others_are_not_told_as_those_of_the_signal_that_lacks_most(tmp_path: Path) -> None:
+    """Of 50 transitions of a turbine that lacked a value 20 lacked another one than was named."""
+    rows = [(NAN if k in (2, 3, 4) else k, NAN if k == 8 else k) for k in range(12)]
+    messages = [("/x", k * 10 * MS, joint_state((k + 1) * 10 * MS, row, ["fan", "core"])) for k, row in enumerate(rows)]
+    path = save(tmp_path, {"/x": JOINT_STATE}, messages)
+    signals = Signal("fan", "/x", "position[fan]"), Signal("core", "/x", "position[core]")
+    (transient,) = read_transients(path, SignalMap(signals))
+    assert unused(transient) == ["6 missing fan or others"]
+
+
 def test_a_dropped_message_and_more_than_one_sample_in_a_hundred_without_a_transition_are_worth_a_line() -> None:
     t, x, u = np.arange(1000.0), np.zeros((1000, 1)), np.zeros((1000, 1))
     ten, eleven, twice = x.copy(), x.copy(), t.copy()

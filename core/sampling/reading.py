@@ -441,8 +441,8 @@ def unused(transient: Transient) -> list[str]:
     parts = [f"{count} {kind}" for kind, count in counts.items()]
     lacking = counters.of(MISSING)
     if counts[MISSING] > max(1.0, _FEW * len(transient)) and (most := max(lacking.values(), default=0)):
-        names = [name for name, count in lacking.items() if count > 0.5 * most]
-        parts[list(counts).index(MISSING)] += f" {' or '.join(names[:3])}{' or others' * (len(names) > 3)}"
+        names = [name for name, count in lacking.items() if count > 0.5 * most][:3]
+        parts[list(counts).index(MISSING)] += f" {' or '.join(names)}{' or others' * (len(lacking) > len(names))}"
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]
     kinds = [(kind, *of) for kind in (LATE, TOO_OLD, INVALID) for of in sorted(counters.of(kind).items())]
     return parts + [f"{count} {kind} {name}" for kind, name, count in kinds]
