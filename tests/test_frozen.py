@@ -465,6 +465,10 @@ def test_what_noise_changes_at_every_step_is_frozen_at_its_first_slow_repeat() -
         said = "FROZEN: x1 repeats exactly for 27 s (never in the fit)"
         (line,) = [line for line in check_text(check_data(model, verdicts)).splitlines() if line.startswith(said)]
         assert ", told after 1 s, while at constant controls noise changed it " in line
+        u = frozen.u.copy()
+        u[33:36] = np.nan  # without a control no verdict, and yet it is one repeat
+        data = check_data(model, EnvelopeMonitor(model).check(frozen.replace(u=u)))
+        assert [x for x in check_text(data).splitlines() if x.startswith("FROZEN")] == [line]
         few = model.replace(repeats=Repeats([0.0], [0.0], [0.0], [LARGEST], [4999.0]))
         assert np.flatnonzero(EnvelopeMonitor(few).check(frozen).frozen)[0] == 25
     off = noisy(4, 60)

@@ -236,7 +236,7 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
     """The repeats that some samples (N+1, n) belong to, in order of time; without those that go on to be frozen."""
     if model.repeats is None or not which.any():
         return []
-    transient, found = verdicts.transient, []
+    transient, first, found = verdicts.transient, dict[tuple[int, int], int](), dict[tuple[int, int], dict[str, Any]]()
     z = np.hstack([transient.x, transient.u])
     for i, name in enumerate(model.state_names):
         fresh = np.concatenate([[True], (np.diff(transient.x[:, i]) != 0) | (np.diff(transient.segment) > 0)])
@@ -245,22 +245,21 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
             if not verdicts.frozen[start, i] and stop < len(which) and verdicts.frozen[stop, i]:
                 continue
             begin = int(begins[start])
-            seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, start))
+            since = first.setdefault((i, begin), start)  # where verdicts pause, the repeat goes on
+            seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, since))
             longest = float(model.repeats.longest_repeat_s[i])
             moving = np.flatnonzero(np.ptp(z[begin:stop], axis=0) > MOVES * np.ptp(z, axis=0))
-            found.append(
-                {
-                    "state": name,
-                    **_instant(transient, begin),
-                    "seconds": seconds,
-                    "told_after": told,
-                    "longest_in_fit": longest,
-                    "why": verdicts.why_frozen.get((start, i), ""),
-                    "moving": [model.signals.signals[j].name for j in moving],
-                    "text": f"{name} {repeat_words(seconds, longest)} from {instant_text(_instant(transient, begin))}",
-                }
-            )
-    return sorted(found, key=lambda repeat: (repeat["k"], repeat["state"]))
+            found[i, begin] = {
+                "state": name,
+                **_instant(transient, begin),
+                "seconds": seconds,
+                "told_after": told,
+                "longest_in_fit": longest,
+                "why": verdicts.why_frozen.get((since, i), ""),
+                "moving": [model.signals.signals[j].name for j in moving],
+                "text": f"{name} {repeat_words(seconds, longest)} from {instant_text(_instant(transient, begin))}",
+            }
+    return sorted(found.values(), key=lambda repeat: (repeat["k"], repeat["state"]))
 
 
 def long_repeats(data: Mapping[str, Any]) -> list[dict[str, Any]]:
