@@ -1107,6 +1107,8 @@ ROWS = [f"{k / 10},{k % 7},{k % 5}" for k in range(50)]
         (["time,x,y", *(f"{row},,," for row in ROWS)], ["x", "y"]),
         (["time,x,y", *ROWS[:25], "\ufefftime,x,y", *ROWS[25:]], ["x", "y"]),  # one file put behind another
         (["time,x,y", *ROWS, "\0" * 4096], ["x", "y"]),  # after a power cut
+        (["time,x,y", *ROWS[:25], "\0" * 134 + ROWS[25], *ROWS[26:]], ["x", "y"]),  # and of a log that went on
+        (["time,x,y", *ROWS[:25], "2.5,4" + "\0" * 4096 + ROWS[25], *ROWS[26:]], ["x", "y"]),  # in a cut line
         (['"Format","MoTeC CSV File",,,"Workbook",""', '"Rate","20.0","Hz"', "", "time,x,y", *ROWS], ["x", "y"]),
     ],
 )
