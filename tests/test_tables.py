@@ -969,7 +969,7 @@ def test_what_is_odd_in_a_table_of_the_office_is_read_or_told(tmp_path):
             (f"{k // 10},{k % 10}" for k in range(100)),
             "90 of 100 rows have the time of a row before in column 'time', and only.*or take another, `--table time=",
         ),
-        ("Date,x", (f"{45717 + k / 288:.6f},{k}" for k in range(9)), "write days of a spreadsheet"),
+        ("Date,x", (f"{45717 + k / 300:.6f},{k}" for k in range(9)), "write days of a spreadsheet"),
     ):
         assert re.search(words, " ".join(read_csv(tmp_path, head, rows).warnings))
     assert not read_csv(tmp_path, "time,x", (f"{45717 + k / 50:.3f},{k}" for k in range(9))).warnings  # since the boot
@@ -1248,6 +1248,17 @@ def test_days_of_a_spreadsheet_are_read_where_they_are_said(first, hour, tmp_pat
         begin, end = (np.datetime64(int(t), "ns").astype("datetime64[s]") for t in bag.times[[0, -1]])
         assert str(begin)[10:13] == f"T{hour}" and abs(int((end - begin).astype(int)) - 399) <= 1
         assert str(begin)[:4] in ("2017", "2018")
+
+
+@pytest.mark.parametrize(("seconds", "digits"), [(300, 10), (300, 6), (1, 10), (3600, 6)])
+def test_days_on_the_clock_are_no_seconds(seconds, digits, tmp_path):
+    """Rows of a greenhouse, 5 min apart by `GHtime` in days, had no time; with it named, they were at 288 Hz."""
+    bag = read_csv(tmp_path, "x,GHtime", (f"{k},{43326 + k * seconds / 86_400:.{digits}f}" for k in range(50)))
+    assert np.abs(np.diff(bag.times) * 1e-9 - seconds).max() < 0.1
+    assert str(np.datetime64(int(bag.times[0]), "ns"))[:10] == "2018-08-14" and "are taken for d" in bag.warnings[0]
+    for hertz in (1000, 162, 100, 60, 50, 30):  # since the boot
+        bag = read_csv(tmp_path, "time,x", (f"{43326.0003 + k / hertz:.4f},{k}" for k in range(50)))
+        assert abs(np.median(np.diff(bag.times)) * 1e-9 * hertz - 1) < 0.1
 
 
 def test_runs_of_the_same_times_are_not_all_compared_with_each_other(monkeypatch):

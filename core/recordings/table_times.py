@@ -38,7 +38,7 @@ _NAMES = (
 _LASTS = re.compile(r"time_(since|until|till|to|run|running|on|off|in|left|remaining|with(out)?)(_.*)?")
 _LONGEST_STEP = 3600  # s that a number beside the columns may say, as `Ts` of a benchmark
 _GOES_BACK = 0.1  # share of rows older than the one before from which on a column `t_...` has temperatures
-_OF_WHAT, _GROWS = re.compile(r"\w+_time"), "it is taken for the time, as it grows from row to row"
+_OF_WHAT, _GROWS = re.compile(r"\w+time"), "it is taken for the time, as it grows from row to row"
 _UNIT = {
     "s": r"s|secs?|seconds?", "ms": r"ms|msecs?|milli(s|secs?|seconds?)", "us": r"us|µs|usecs?|micro(s|secs?|seconds?)",
     "ns": r"ns|nsecs?|nano(s|secs?|seconds?)", "min": r"mins?|minutes?", "h": r"h|hrs?|hours?", "d": r"days?",
@@ -113,8 +113,9 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         stated = layout.unit or _unit(column, values, table.units.get(column, ""))
         unit, days = stated or "s", "write days of a spreadsheet as ISO times, or give `--table unit=d`"
         doubt = f"; {days}" * (not stated and _like_days(values))
-        if doubt and np.median(np.abs(np.diff(values[np.isfinite(values)]))) < _HARDLY:
-            if not _says_days(table, column):
+        clock = bool(doubt) and _on_the_clock(values)
+        if clock or (doubt and np.median(np.abs(np.diff(values[np.isfinite(values)]))) < _HARDLY):
+            if not (clock or _says_days(table, column)):
                 no = "has no unit, which may be s or days"
                 raise BagError(f"{where}: {no}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
             unit, doubt = "d", ""
@@ -413,24 +414,28 @@ def _unit(name: str, values: Column, stated: str = "") -> str:
 def _compact(values: Column) -> bool:
     """Whether numbers are days and times such as 20240313115503."""
     known = values[np.isfinite(values)]
-    if not len(known) or known.min() < 19e12 or known.max() > 21e12:
-        return False
-    return all(_COMPACT.fullmatch(f"{value:.0f}") for value in known[:1000].tolist())
+    inside = bool(len(known)) and 19e12 <= known.min() <= known.max() <= 21e12
+    return bool(inside) and all(_COMPACT.fullmatch(f"{value:.0f}") for value in known[:1000].tolist())
 
 
 def _like_days(values: Column) -> bool:
     """Whether numbers with more than three decimals are such as Excel and MATLAB write for days of these decades."""
-    known = values[np.isfinite(values)]
-    fine = bool((np.abs(1e3 * known - np.rint(1e3 * known)) > 1e-3).any())
-    return fine and _first_day(values) > 0
+    return _first_day(values) > 0 and bool(((values != values.round(3)) & (values == values)).any())
+
+
+def _on_the_clock(values: Column) -> bool:
+    """Whether days fall on whole seconds, an even part of an hour apart, as no decimal step of seconds does."""
+    seconds = 86_400 * values[np.isfinite(values)]
+    step = float(np.median(np.abs(np.diff(seconds, prepend=0))))
+    even = 3600 % max(round(step), 1) == 0 and abs(step / max(round(step), 1) - 1) < 1e-3
+    return even and bool(np.mean(np.abs(seconds - np.rint(seconds)) < 0.1) > 0.9)
 
 
 def _first_day(values: Column) -> int:
     """The first of January 1970 as Excel or MATLAB count days, whichever fits; 0 if neither."""
     known = values[np.isfinite(values)]
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 0.0)
-    fits = (first for least, most, first in _CALENDARS if least < low and high < most)
-    return next(fits, 0)
+    return next((first for least, most, first in _CALENDARS if least < low and high < most), 0)
 
 
 def _counts_rows(values: Column) -> bool:
@@ -476,8 +481,7 @@ def _exactly(cell: str, factor: int, value: float) -> int:
 
 
 def _too_late(where: str) -> BagError:
-    remedy = "say what unit it has in the signals file, `table: {unit: ms}`"
-    return BagError(f"{where}: is past the year 2262 in ns; {remedy}")
+    return BagError(f"{where}: is past the year 2262 in ns; say its unit in the signals file, `table: {{unit: ms}}`")
 
 
 def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
