@@ -374,8 +374,10 @@ def test_a_parked_machine_is_a_warning(model: UncertainLTI) -> None:
     assert f"{said}as of a machine at rest" in check_text(data)
     u = parked.u.copy()
     u[400:600] = u.max()
-    verdicts = replace(verdicts, transient=parked.replace(u=u))  # by its own verdicts it would be frozen
-    assert f"{said}while {model.control_names[0]} moved" in check_text(check_data(model, verdicts))
+    for last in (u[-1], np.nan):  # a value that is missing hid what moved
+        u[-1] = last
+        verdicts = replace(verdicts, transient=parked.replace(u=u))  # by its own verdicts it would be frozen
+        assert f"{said}while {model.control_names[0]} moved" in check_text(check_data(model, verdicts))
     data = check_data(model, EnvelopeMonitor(model).check(run(5, seconds=12.0, rest=(2.0, 3.2))))
     assert data["repeats"] and "warning: " not in check_text(data), "a little longer than the 0.99 s of the fit"
 

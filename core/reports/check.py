@@ -65,8 +65,8 @@ _REMEDIES = {
     Status.FIRST: "a verdict needs two samples: check a longer recording",
     Status.GAP: "every step is longer than max_gap: is a topic slower than in the fit? see `uncertain-lti topics`",
     Status.RESET: "time steps back: name the runs in it as recordings of their own",
-    Status.MISSING: "a signal is missing, stale or not finite: compare `uncertain-lti topics` with max_hold and "
-    "max_skew in the signals file",
+    Status.MISSING: "a signal is missing, stale or not finite: record it, or fit without it; of topics that are there "
+    "compare `uncertain-lti topics` with max_hold and max_skew in the signals file",
     Status.STEP: "check a recording at the rate of the fit, or fit recordings at this rate",
     Status.MODE: "fit recordings of this mode too",
     Status.FROZEN: "states repeat exactly: see whether their sensors and drivers still send",
@@ -248,7 +248,8 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
             since = first.setdefault((i, begin), start)  # where verdicts pause, the repeat goes on
             seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, since))
             longest = float(model.repeats.longest_repeat_s[i])
-            moving = np.flatnonzero(np.ptp(z[begin:stop], axis=0) > MOVES * np.ptp(z, axis=0))
+            here, ever = (np.fmax.reduce(part) - np.fmin.reduce(part) for part in (z[begin:stop], z))  # without NaN
+            moving = np.flatnonzero(here > MOVES * ever)
             found[i, begin] = {
                 "state": name,
                 **_instant(transient, begin),
@@ -526,8 +527,7 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
     longest = [(r["text"], f"while {shortlist(r['moving'], 3)} moved" * bool(r["moving"])) for r in long_repeats(data)]
     blocks += _first([f"warning: {text}, {moved or rest}" for text, moved in longest], "warning")
     told = [f"the alarm from {instant_text(like)} {like['text']}" for like in data["explained"] if like["text"]]
-    blocks += _first(told, "alarm")
-    return [*blocks, *_alarms(data)]
+    return [*blocks, *_first(told, "alarm"), *_alarms(data)]
 
 
 def _tables(data: Mapping[str, Any]) -> Iterator[Table]:
