@@ -1250,13 +1250,13 @@ def test_days_of_a_spreadsheet_are_read_where_they_are_said(first, hour, tmp_pat
         assert str(begin)[:4] in ("2017", "2018")
 
 
-@pytest.mark.parametrize(("seconds", "digits"), [(300, 10), (300, 6), (1, 10), (3600, 6)])
+@pytest.mark.parametrize(("seconds", "digits"), [(300, 10), (300, 5), (60, 5), (1, 10), (3600, 6)])
 def test_days_on_the_clock_are_no_seconds(seconds, digits, tmp_path):
     """Rows of a greenhouse, 5 min apart by `GHtime` in days, had no time; with it named, they were at 288 Hz."""
     bag = read_csv(tmp_path, "x,GHtime", (f"{k},{43326 + k * seconds / 86_400:.{digits}f}" for k in range(50)))
-    assert np.abs(np.diff(bag.times) * 1e-9 - seconds).max() < 0.1
+    assert np.abs(np.diff(bag.times) * 1e-9 - seconds).max() < 1.0
     assert str(np.datetime64(int(bag.times[0]), "ns"))[:10] == "2018-08-14" and "are taken for d" in bag.warnings[0]
-    for hertz in (1000, 162, 100, 60, 50, 30):  # since the boot
+    for hertz in (1000, 162, 100, 60, 50, 30, 1, 0.2):  # since the boot
         bag = read_csv(tmp_path, "time,x", (f"{43326.0003 + k / hertz:.4f},{k}" for k in range(50)))
         assert abs(np.median(np.diff(bag.times)) * 1e-9 * hertz - 1) < 0.1
 

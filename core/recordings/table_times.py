@@ -116,8 +116,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
         clock = bool(doubt) and _on_the_clock(values)
         if clock or (doubt and np.median(np.abs(np.diff(values[np.isfinite(values)]))) < _HARDLY):
             if not (clock or _says_days(table, column)):
-                no = "has no unit, which may be s or days"
-                raise BagError(f"{where}: {no}: {days} (in a signals file `table: {{unit: d}}`); for seconds, `unit=s`")
+                raise BagError(f"{where}: may be s or days: {days} (in a file `table: {{unit: d}}`); for s, `unit=s`")
             unit, doubt = "d", ""
         if unit == "s" and not stated and (step := _coarse(values)):
             doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
@@ -424,11 +423,12 @@ def _like_days(values: Column) -> bool:
 
 
 def _on_the_clock(values: Column) -> bool:
-    """Whether days fall on whole seconds, an even part of an hour apart, as no decimal step of seconds does."""
-    seconds = 86_400 * values[np.isfinite(values)]
-    step = float(np.median(np.abs(np.diff(seconds, prepend=0))))
-    even = 3600 % max(round(step), 1) == 0 and abs(step / max(round(step), 1) - 1) < 1e-3
-    return even and bool(np.mean(np.abs(seconds - np.rint(seconds)) < 0.1) > 0.9)
+    """Whether days come by an even part of an hour, as far as their digits tell; no decimal step of seconds does."""
+    known = values[np.isfinite(values)]
+    since = 86_400 * (known - known[0])
+    step = float(np.median(np.abs(np.diff(since, prepend=0.0))))
+    even = min((part for part in range(1, 3601) if 3600 % part == 0), key=lambda part: abs(part - step))
+    return step < 3601 and bool(np.mean(np.abs(since - even * np.rint(since / even)) < min(0.9, 0.1 * even)) > 0.9)
 
 
 def _first_day(values: Column) -> int:
