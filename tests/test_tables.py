@@ -877,7 +877,7 @@ WRITTEN = (  # over noon; %I %p as English has it
     "%m/%d/%Y %I:%M:%S A.M.", "%d-%b-%Y %H:%M:%S", "%d %B %Y, %H:%M:%S", "%b %d, %Y %I:%M:%S %p",
     "%a %b %d %H:%M:%S %Y", "%a, %d %b %Y %H:%M:%S GMT",
     "%a %b %d %Y %H:%M:%S GMT+0000 (Coordinated Universal Time)",
-    "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d-%m-%Y %H:%M:%S", "%Y%m%dT%H%M%S",
+    "%Y/%m/%d %H:%M:%S", "%Y.%m.%d %H:%M:%S", "%d-%m-%Y %H:%M:%S", "%Y%m%dT%H%M%S", "%Y-%m-%d_%H-%M-%S",
     "%Y%m%d%H%M%S", "%Y-%m-%d %H:%M:%S:000", "%d %m %Y %H:%M:%S", "%d-%m-%y %H:%M:%S", "%Y %m %d %H %M %S",
 )  # fmt: skip
 
@@ -947,6 +947,12 @@ def test_noon_and_midnight_of_twelve_hours(tmp_path):
     hours = ["12:00 AM", "1:30 am", "12:00 PM", "1:30 pm", "11:59 p.m."]
     bag = read_csv(tmp_path, "time,x", (f"{hour},{k}" for k, hour in enumerate(hours)))
     assert (bag.times // (60 * 10**9)).tolist() == [0, 90, 720, 810, 1439]
+
+
+def test_milliseconds_behind_a_dash_are_no_decimals(tmp_path):
+    """The telemetry of a rocket writes -34 for 34 ms; no such time was read."""
+    rows = [f"2022-5-7--11-24-{24 + k // 1000}-{k % 1000},{k % 7}" for k in range(0, 9000, 34)]
+    assert set(np.diff(read_csv(tmp_path, "Time,x", rows).times).tolist()) == {34 * 10**6}
 
 
 def test_a_time_that_cannot_be_read_is_named_and_no_temperature_taken_for_it(tmp_path):
@@ -1256,7 +1262,7 @@ def test_days_on_the_clock_are_no_seconds(seconds, digits, tmp_path):
     bag = read_csv(tmp_path, "x,GHtime", (f"{k},{43326 + k * seconds / 86_400:.{digits}f}" for k in range(50)))
     assert np.abs(np.diff(bag.times) * 1e-9 - seconds).max() < 1.0
     assert str(np.datetime64(int(bag.times[0]), "ns"))[:10] == "2018-08-14" and "are taken for d" in bag.warnings[0]
-    for hertz in (1000, 162, 100, 60, 50, 30, 1, 0.2):  # since the boot
+    for hertz in (1000, 162, 100, 60, 50, 30, 1):  # since the boot
         bag = read_csv(tmp_path, "time,x", (f"{43326.0003 + k / hertz:.4f},{k}" for k in range(50)))
         assert abs(np.median(np.diff(bag.times)) * 1e-9 * hertz - 1) < 0.1
 
@@ -1532,7 +1538,8 @@ def test_minutes_and_seconds_of_a_spreadsheet_go_on_after_the_hour(digits, tmp_p
 )
 def test_the_unit_of_a_clock_is_in_its_name_or_asked_for(head, step, seconds, words, tmp_path):
     """Microseconds since the boot made 34 s of a flight 398 days, and nothing said so."""
-    bag = read_csv(tmp_path, f"{head},x", (f"{112574307 + step * k},{k % 7}" for k in range(60)))
+    first = 0 if "table" in words or "taken for s," in words else 112574307  # of a test that begins with its log
+    bag = read_csv(tmp_path, f"{head},x", (f"{first + step * k},{k % 7}" for k in range(60)))
     assert set(np.diff(bag.times).tolist()) == {round(seconds * 1e9)}
     assert words in " ".join(bag.warnings) and bool(bag.warnings) == bool(words)
 
@@ -1545,6 +1552,9 @@ def test_a_clock_whose_rows_are_far_apart_in_no_unit_is_refused_until_its_unit_i
     refuses(BagError, "12000 from row to row: has no unit.*--table unit=us", read_csv, tmp_path, "timestamp,x", rows)
     (bag,) = group_recordings([tmp_path / "a.csv"], layout=TableLayout(unit="us"))
     assert np.median(np.diff(bag.times)) == 12_000_000
+    for first, step in ((7170, 5), (1440000, 10), (928460, 2)):  # encoders of a mouse, a rocket: 10 s from row to row
+        rows = [f"{first + step * k},{k % 7}" for k in range(60)]
+        refuses(BagError, f"{step} from row to row: has no unit.*unit=ms.*unit=s`", read_csv, tmp_path, "time,x", rows)
     polled = read_csv(tmp_path, "timestamp,x", (f"{1732860000 + 302 * k},{k % 7}" for k in range(60)))  # since 1970
     assert np.median(np.diff(polled.times)) == 302 * 10**9
 

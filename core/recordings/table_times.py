@@ -64,8 +64,9 @@ _NAMED = (  # months: 13-Mar-2024, Mar 13, 2024, Wed Mar 13 11:55:03 2024
 )
 _MONTHS = "jan feb mar apr may jun jul aug sep oct nov dec".split()
 _YEAR_FIRST = re.compile(r"(\d{4})([-/.])(\d{1,2})\2(\d{1,2})(?:[T,\s]+(\d{1,2}))?((?::\d\d)*)(.*)")
-_DASHED = re.compile(r"(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
-_COMPACT = re.compile(r"((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
+_DASHED = re.compile(r"^(\d{1,2})-(\d{1,2})-((?:\d{4}|\d\d(?!\d)).*)")
+_DASHES = re.compile(r"^(\d{4}-\d\d?-\d\d?)[-_T ]+(\d\d?)-(\d\d)-(\d\d)(?:[-.](\d+))?$")  # 2022-5-7--11-24-56-316
+_COMPACT = re.compile(r"^((?:19|20)\d\d) ?([01]\d) ?([0-3]\d)[T_ ]?([0-2]\d) ?([0-5]\d) ?([0-5]\d(?:\.\d+)?)(.*)")
 _EPOCHS = ((10**17, "ns"), (10**14, "us"), (10**11, "ms"))  # numbers of this size since 1970, in what unit
 _ZONES = dict(
     UTC="Z", CET="+01:00", CEST="+02:00", MEZ="+01:00", MESZ="+02:00", BST="+01:00", JST="+09:00", EST="-05:00",
@@ -122,9 +123,10 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
             given = f"`--table unit={likely}` (in a signals file `table: {{unit: {likely}}}`)"
             dated = _since_1970(float(np.nanmedian(values)))
-            if step >= _UNLIKELY[dated] or (step >= _ODD and step % 5 and not dated):
+            begun = np.nanmin(values) > _MANY * step  # as a clock that runs from the boot on, rarely in steps of some s
+            if step >= _UNLIKELY[dated] or (not dated and (begun or (step >= _ODD and step % 5))):
                 none = "has no unit, which may be s, ms or us"
-                raise BagError(f"{where}{doubt}: {none}; name it time_us or time_ms, or give {given}")
+                raise BagError(f"{where}{doubt}: {none}; name it time_us or time_ms, or give {given}; for s, `unit=s`")
             doubt += f": for others name it time_us or time_ms, or give {given}"
         elif unit == "s" and not stated and _counts_rows(values):
             said.append("its numbers are those of the rows, taken for s: of another rate give `--table step=0.01`")
@@ -368,6 +370,7 @@ def _spelt(text: str) -> str:
         return f"0:{text}"
     if _dotted(text):
         return text.replace(".", ":")
+    text = _DASHES.sub(lambda m: "{} {}:{}:{}".format(*m.groups()) + f".{int(m[5] or 0):03}", text)
     zone, year_last = "", re.sub(r"\s([A-Z]{3,4})\s(\d{4})$", r" \2 \1", text)
     if found := _ZONE.search(year_last):
         text, zone = year_last[: found.start()], _ZONES.get(found[1], found[1])
@@ -380,10 +383,7 @@ def _spelt(text: str) -> str:
             year = named["y"] if len(named["y"]) == 4 else f"20{named['y']}"
             text = f"{year}-{_MONTHS.index(month) + 1:02}-{int(named['d']):02} {named['t'].lstrip(', T')}".strip()
     text = re.sub(r"(:\d\d):(\d{3,6})$", r"\1.\2", text)  # milliseconds of a controller
-    if dashed := _DASHED.fullmatch(text):
-        text = "/".join(dashed.groups())
-    if compact := _COMPACT.fullmatch(text):
-        text = "{}-{}-{} {}:{}:{}{}".format(*compact.groups())
+    text = _COMPACT.sub(r"\1-\2-\3 \4:\5:\6\7", _DASHED.sub(r"\1/\2/\3", text))
     if dated := _YEAR_FIRST.fullmatch(text):
         year, _, month, day, hour, minutes, rest = dated.groups()
         clock = f" {int(hour):02}{minutes or ':00'}{rest}" if hour else rest
