@@ -696,17 +696,18 @@ def test_the_place_of_a_body_that_turns_goes_and_the_load_of_its_computer(turn, 
     for k in range(2000):
         u = float(rng.normal()) if k % 40 == 0 else u
         rows.append([f"{0.02 * k:.2f}", x, y, math.remainder(heading, math.tau), v + 1e-3 * rng.normal(), 30 + u, u])
-        rows[-1].append(20_000 * (k % 50))
+        rows[-1] += [20_000 * (k % 50), k // 30 % 60, (math.sin(k / 300), math.cos(k / 200))[k % 2], math.sin(k / 99)]
         x, y, heading = (
             x + 0.02 * v * math.cos(heading),
             y + 0.02 * v * math.sin(heading),
             heading + 0.02 * turn * (1 + 2 * math.sin(k / 90)),
         )
         v += 0.02 * (5 + 2 * u - v)
-    names = ["time", "vicon x", "vicon y", "vicon yaw", "speed", "CPU0", "throttle", "state_usec"]
+    names = ["time", "vicon x", "vicon y", "vicon yaw", "speed", "CPU0", "throttle", "state_usec", "minute", "hdop"]
+    names.append("Vertical Accuracy (m)")
     proposal = propose([csv(tmp_path / "car.csv", names, rows)])
-    assert "/table CPU0: of a computer, by its name" in proposal.text
-    assert "/table state_usec: grows as a clock" in proposal.text, proposal.text
+    assert "/table CPU0, hdop, Vertical_Accuracy_m: of a computer or a receiver, by its name" in proposal.text
+    assert "/table state_usec, minute: grows as a clock" in proposal.text, proposal.text
     assert proposal.text.count("a place of a body that turns") == 2 * left, proposal.text
 
 
@@ -1425,7 +1426,7 @@ def test_what_counts_the_hours_of_running_is_no_signal(tmp_path):
     columns = {"speed": answers(rng, u)[:, 0], "speed_cmd": u[:, 0], "run_minutes": 1e4 + rows // 60, "warm": warm}
     text = propose([table_of(tmp_path / "run.csv", columns | {"crc": rng.integers(0, 1 << 32, 1800)}, rows)]).text
     assert "run_minutes: grows as a clock or a counter does" in text and "warm: grows" not in text
-    assert "crc: of a computer, by its name" in text
+    assert "crc: of a computer or a receiver, by its name" in text
 
 
 def answers(rng, commands, noise=1e-4, pole=0.95):

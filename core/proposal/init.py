@@ -86,10 +86,10 @@ _RUN = re.compile(
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
 _CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
-_CLOCK |= {"hours", "runtime", "betriebsstunden", "horas"}  # of running
+_CLOCK |= {"hours", "runtime", "betriebsstunden", "horas", "second", "minute", "hour"}  # of running, of a day
 _COMPUTER = re.compile(
-    r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum)(_|$)|^dt$"
-)  # what it took for a cycle, how busy it is
+    r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum|rssi|lqi|[hvptg]dop|nsats?|satellites?|accuracy)(_|$)|^dt$"
+)  # what it took for a cycle, how busy it is, how well something is received
 _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
@@ -337,7 +337,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if clock or (source.role != "control" and all(map(_counts, candidate.values, source.arrival, repeat(wheel)))):
         return "grows as a clock or a counter does"
     if _COMPUTER.search(name):
-        return "of a computer, by its name, and no signal of the machine"
+        return "of a computer or a receiver, by its name, and no signal of the machine"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
