@@ -1559,6 +1559,22 @@ def test_a_clock_whose_rows_are_far_apart_in_no_unit_is_refused_until_its_unit_i
     assert np.median(np.diff(polled.times)) == 302 * 10**9
 
 
+def test_a_unit_that_is_taken_for_granted_is_that_of_later_recordings(tmp_path):
+    """The second half of a log in seconds was asked for the unit by `check`, which has no option for it."""
+    rng, x, rows = np.random.default_rng(1), 0.0, []
+    for k in range(4000):
+        u = float(k // 40 % 3)
+        rows.append(f"{10 * k},{u},{x + rng.normal(0, 0.01):.4f}")
+        x += 0.15 * (u - x)
+    for name, some in (("a", rows[:2000]), ("b", rows[2000:])):
+        write(tmp_path / f"{name}.csv", "time,cmd,x", *some)
+    text = propose([tmp_path / "a.csv"]).text
+    assert "unit: s" in text.splitlines()[text.splitlines().index("table:") + 1]
+    (tmp_path / "a.yaml").write_text(text)
+    (later,) = group_recordings([tmp_path / "b.csv"], layout=SignalMap.load(tmp_path / "a.yaml").table)
+    assert later.times[0] == 20_000 * 10**9 and not later.warnings
+
+
 @pytest.mark.parametrize("suffix", [".txt", ".dat", ".TXT"])
 def test_the_name_of_a_text_file_with_numbers_does_not_matter(suffix, tmp_path):
     """As laboratories write them; what is no text is named."""

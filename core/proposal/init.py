@@ -491,6 +491,9 @@ def propose(
     bags, layout = _opened(paths, table or TableLayout())
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
+    # a unit that is taken for granted is written down, so that other recordings are read alike
+    taken = {m[1] for warning in warnings if (m := re.search(r"numbers are taken for (s|d)\b", warning))}
+    layout = TableLayout.from_dict(layout.to_dict() | {"unit": taken.pop()}, "table") if len(taken) == 1 else layout
     warnings += set_aside_labels(sources, bags) if not states else []
     if not (states or controls):  # what a person asks for stays
         _drop_computed(sources)
@@ -559,10 +562,8 @@ def _of_plant(
     if not chosen:
         raise BagError(f"{bags[0].path}: no column moves but commands and labels; record what is measured as well")
     text = signals_file(bags, sources, chosen, used, "", layout=layout, plant=True)
-    told = []
-    if all(c.why.startswith((ALWAYS, WEATHER)) for c in used):
-        load = "what loads the machine, such as a power that others draw, is a control: move its line to `controls`"
-        told.append(f"nothing in it is set or switched; {load}")
+    load = "what loads the machine, such as a power that others draw, is a control: move its line to `controls`"
+    told = [f"nothing in it is set or switched; {load}"] * all(c.why.startswith((ALWAYS, WEATHER)) for c in used)
     return Proposal(tuple(chosen), tuple(used), text, (*warnings, *told))
 
 
