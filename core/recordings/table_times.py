@@ -123,8 +123,7 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
             given = f"`--table unit={likely}` (in a signals file `table: {{unit: {likely}}}`)"
             dated = _since_1970(float(np.nanmedian(values)))
-            begun = np.nanmin(values) > _MANY * step  # as a clock that runs from the boot on, rarely in steps of some s
-            if step >= _UNLIKELY[dated] or (not dated and (begun or (step >= _ODD and step % 5))):
+            if step >= _UNLIKELY[dated] or (step >= _ODD and step % 5 and not dated):
                 none = "has no unit, which may be s, ms or us"
                 raise BagError(f"{where}{doubt}: {none}; name it time_us or time_ms, or give {given}; for s, `unit=s`")
             doubt += f": for others name it time_us or time_ms, or give {given}"
