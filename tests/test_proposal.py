@@ -45,8 +45,10 @@ from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.members import all_of_them
 from uncertain_lti.proposal.signals_file import _left_out, memory_lines, name_signals, set_operating_point, signals_file
 from uncertain_lti.proposal.tune import Remembered
+from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.sampling.reading import read_as_fitted
 from uncertain_lti.signals.field_path import KINDS, FieldPath, Memory
+from uncertain_lti.signals.values import TableLayout
 
 FLOAT64, ARRAY, POSE = "std_msgs/msg/Float64", "std_msgs/msg/Float64MultiArray", "geometry_msgs/msg/PoseStamped"
 JOINT, POSE_2D = "sensor_msgs/msg/JointState", "geometry_msgs/msg/Pose2D"
@@ -655,20 +657,31 @@ def test_columns_of_which_no_two_rows_in_a_row_have_a_number_are_of_their_rate_o
     assert fitted([path], proposal).fit_summary["violations"] == 0
 
 
-def test_words_of_a_switch_are_read_where_they_are_truths_and_told_where_not(tmp_path):
-    """A heater that Excel wrote as WAHR and FALSCH and a fan with words of its own were lost without a word."""
+def test_words_of_a_switch_are_controls_each_and_read_in_other_recordings(tmp_path):
+    """A heater that Excel wrote as WAHR and FALSCH, a fan and a line with words of their own were lost."""
     rows, heat = [], 20.0
     for k in range(600):
-        on, fan = k // 40 % 2, ("low", "high", "off")[k // 70 % 3]
+        on, fan = k // 40 % 2, ("low", "high", "Off")[k // 70 % 3]
         pump, line = k // 55 % 2, ("RUN", "IDLE", "STOP")[k // 35 % 3]  # the latter with a word that is no truth
         words = ("FALSCH", "WAHR")[on], fan, "abc"[k // 50 % 3], ("STOP", "RUN")[pump], line
         rows.append([0.1 * k, f"{heat:.4f}", *words])
-        heat += 0.05 * (20 + 30 * on - 20 * pump - heat)
+        heat += 0.05 * (20 + 30 * on - 20 * pump - (fan == "high") * 25 - heat)
     names = ["time", "heat", "heater", "fan", "fault_label", "pump", "line"]
     proposal = propose([csv(tmp_path / "a.csv", names, rows)])
-    assert signals_of(proposal) == ([("/table", "heat")], [("/table", "heater"), ("/table", "pump")]), proposal.text
-    (said,) = [warning for warning in proposal.warnings if "words" in warning]
-    assert said.startswith("columns of words are no signals: fan (high, low, off), line (IDLE, RUN, STOP);")
+    states, controls = signals_of(proposal)
+    assert states == [("/table", "heat")] and ("/table", "fan_high") in controls, proposal.text
+    assert "line_STOP" in proposal.text and "a, b, c" not in proposal.text  # which does nothing, and a label
+    assert 'words: {fan: [low, high, "Off"], line: [RUN, IDLE, STOP]}' in proposal.text
+    fitted([tmp_path / "a.csv"], proposal)
+    layout = TableLayout(words={"line": ["IDLE", "RUN"], "fan": ["Off", "low"]})
+    for k, words in enumerate((["RUN", "STOP", ""], ["STOP", "RUN", ""], ["IDLE", "jam", "jam"])):  # some are truths
+        cells = [[row, 1.0, word] for row, word in zip(range(6), words * 2, strict=True)]
+        (table,) = group_recordings([csv(tmp_path / f"{k}.csv", ["time", "x", "line"], cells)], layout=layout)
+        runs = table.columns(["/table"], [[FieldPath("line_RUN")]]).values[0][:3, 0]
+        np.testing.assert_array_equal(runs, [float(word == "RUN") if word else np.nan for word in words])
+    by_turns = [[0.1 * k, *((k % 9, "", "") if k % 2 else ("", math.sin(k), k % 7)), "AB"[k % 2]] for k in range(300)]
+    names = ["time", "CMD.u", "ATT.r", "ATT.p", "kind"]
+    assert "words" not in propose([csv(tmp_path / "turns.csv", names, by_turns)], states=["*"]).text
 
 
 @pytest.mark.parametrize(

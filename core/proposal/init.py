@@ -94,8 +94,8 @@ _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # like
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
-MOST_WORDS = 8
-"""Words of a column that is switched, at most."""
+MOST_WORDS, _SWITCHED = 8, 0.1
+"""Words of a column that is switched, and share of the rows in which it is, at most."""
 _FILL = "fill the empty cells with the number above"
 
 
@@ -181,15 +181,17 @@ def run_column(bags: Sequence[Recording]) -> str:
     return max(told, key=lambda name: (_RUN.search(name.lower()) is not None, found[name]), default="")
 
 
-def _in_words(bags: Sequence[Recording], runs: str | None) -> list[str]:
-    """Columns of tables in which a few words change, as of a switch, with the words."""
-    found: dict[str, set[str]] = {}
+def _in_words(bags: Sequence[Recording], runs: str | None) -> dict[str, list[str]]:
+    """Columns of tables in which a few words change in most recordings, as of a status; the words, the usual first."""
+    found: dict[str, list[Counter[str]]] = {}
     for table in (bag for bag in bags if isinstance(bag, Table)):
         for name, column in table.columns_by_field.items():
-            if column.dtype.kind == "O" and name != runs and not is_label(name) and not may_be(column):
-                found.setdefault(name, set()).update(str(cell) for cell in set(column.tolist()) if cell)
-    few = {name: sorted(words) for name, words in found.items() if 1 < len(words) <= MOST_WORDS}
-    return [f"{name} ({shortlist(words, 3)})" for name, words in few.items()]
+            rarely = column.dtype.kind == "O" and np.count_nonzero(column[1:] != column[:-1]) <= _SWITCHED * len(column)
+            if rarely and name != runs and not is_label(name) and not may_be(column):
+                found.setdefault(name, []).append(Counter(cell for row in column if (cell := str(row or "").strip())))
+    words = {name: [word for word, _ in sum(each, Counter()).most_common()] for name, each in found.items()}
+    changing = (name for name, each in found.items() if 2 * sum(len(of) > 1 for of in each) >= len(bags))
+    return {name: words[name] for name in changing if len(words[name]) <= MOST_WORDS}
 
 
 def _runs_told(table: Table, name: str) -> int:
@@ -497,8 +499,6 @@ def propose(
     warnings += set_aside_labels(sources, bags) if not states else []
     if not (states or controls):  # what a person asks for stays
         _drop_computed(sources)
-    if words := _in_words(bags, layout.runs):
-        warnings.append(f"columns of words are no signals: {shortlist(words, 4)}; write numbers in place of them")
     if rare := [c.path for s in sources for c in s.candidates if c.reason.endswith(_FILL)]:
         few = "few rows, or no two in a row, have a number of"
         warnings.append(f"{few} {shortlist(rare, 4)}; where it holds until the next one, {_FILL}")
@@ -551,6 +551,9 @@ def _opened(paths: Sequence[str | os.PathLike[str]], layout: TableLayout) -> tup
         raise BagError("no recording is named; give at least one file or folder")
     if not layout.runs and (runs := run_column(bags)):
         layout = replace(layout, runs=runs)
+        bags = group_recordings(list(paths), layout=layout)
+    if layout.words is None and (words := _in_words(bags, layout.runs)):
+        layout = replace(layout, words=words)
         bags = group_recordings(list(paths), layout=layout)
     return bags, layout
 

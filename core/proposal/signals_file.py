@@ -340,9 +340,13 @@ def _sample_times(bags: Sequence[Recording], states: Sequence[Candidate], contro
 def _layout_lines(layout: TableLayout) -> list[str]:
     if not (table := layout.to_dict()):
         return []
+    words = [f"{_quoted(k)}: [{', '.join(map(_quoted, v))}]" for k, v in table.pop("words", {}).items()]
     texts = {key: _number(v, exact=True) if key == "step" else _quoted(v) for key, v in table.items()}
+    texts |= {"words": f"{{{', '.join(words)}}}"} if words else {}
     said = ["", "# Columns of the time and of the runs, each value of which is a recording; or the"]
-    return [*said, "# seconds from row to row.", "table:", *(f"  {key}: {text}" for key, text in texts.items())]
+    said.append("# seconds from row to row.")
+    said += ["# words: COLUMN_WORD of each but the first is 1 where it stands, else 0."] * bool(words)
+    return [*said, "table:", *(f"  {key}: {text}" for key, text in texts.items())]
 
 
 def _of_controls(controls: Sequence[Candidate], further: Sequence[Candidate], clock: Source | None) -> list[str]:

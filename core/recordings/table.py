@@ -114,6 +114,12 @@ class Table(Recording):
         units = units_of(names, raw.units)
         self.units = {field: units[name] for field, name in fields.items() if name in units}
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields.items()}
+        self._words: dict[str, Column] = {}
+        for field, those in (layout.words or {}).items():
+            if (cells := self.columns_by_field.get(field)) is not None:
+                if cells.dtype.kind != "O" and raw.exact is not None:  # as of Run and Stop alone, which are numbers
+                    cells = np.array(raw.exact(fields[field]), dtype=object)[here]
+                self._words |= _of_words(field, those[1:], [str(cell or "").strip() for cell in cells])
         self._quaternions = _quaternions(self.columns_by_field)
         reason = ""
         if not names:
@@ -127,6 +133,9 @@ class Table(Recording):
     def _tell_topics(self, reason: str, kind: str) -> None:
         """Rows and columns of each topic, of a table of such a kind, and the reason why it cannot be read, if any."""
         every = by_message(self.columns_by_field, len(self.times))
+        if TABLE_TOPIC in every:
+            every[TABLE_TOPIC][0].extend(name for name in self._words if name not in self.columns_by_field)
+        self.columns_by_field |= self._words
         one = len(every) == 1 and not reason
         texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
         some = len(texts) < len(self.columns_by_field)
@@ -247,6 +256,14 @@ class Table(Recording):
         if unread := next((self.topics[topic].reason for topic in wanted if not self.topics[topic].readable), ""):
             raise BagError(f"{self.path}: cannot be used: {unread}")
         return wanted
+
+
+def _of_words(field: str, words: Sequence[str], cells: Sequence[str]) -> dict[str, Column]:
+    """A column of numbers for each word of a column."""
+    there = np.array([cell != "" for cell in cells])
+    names = (f"{field}_{name}" for name in once(map(field_name, words), "_"))
+    of = (np.where(there, np.array([cell == word for cell in cells], dtype=float), np.nan) for word in words)
+    return dict(zip(names, of, strict=True))
 
 
 def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:

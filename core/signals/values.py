@@ -15,7 +15,7 @@ import math
 import os
 import re
 import reprlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, TextIO, TypeVar, get_args
 
@@ -231,18 +231,21 @@ class TableLayout:
 
     `time`: column of the time; None to look for one; `unit`: unit of a time column of numbers; None to take it from the
     column's name and size; `runs`: column whose values tell the recordings in one file apart; None where a file is one
-    recording; `step`: s from row to row, where no column is a time.
+    recording; `step`: s from row to row, where no column is a time; `words`: of columns of words, such as a status, by
+    their names the words, the usual one first: NAME_WORD of each of the others is 1 where it stands, else 0, and no
+    number where no word stands.
     """
 
     time: str | None = None
     unit: TimeUnit | None = None
     runs: str | None = None
     step: float | None = None
+    words: Mapping[str, Sequence[str]] | None = None
 
     @classmethod
     def from_dict(cls, data: Any, where: str) -> TableLayout:
         """Build from the structure of a signals file or a model file."""
-        keys = {"time", "unit", "step", "runs"}
+        keys = {"time", "unit", "step", "runs", "words"}
         given = {k: v for k, v in checked_mapping(data, where, keys).items() if v is not None}
         for key in {"time", "runs"} & given.keys():
             if isinstance(given[key], bool) or not isinstance(given[key], (str, int, float)) or not given[key]:
@@ -257,6 +260,9 @@ class TableLayout:
                 raise wrong(f"{where}: step", given["step"], "the s from row to row, such as 0.01")
             if beside := sorted({"time", "unit"} & given.keys()):
                 raise SignalError(f"{where}: step is of rows without a time, and {beside[0]} of a time; take one away")
+        for column, words in checked_mapping(given.get("words", {}), f"{where}: words", None).items():
+            if not (isinstance(words, list) and words and all(isinstance(word, str) for word in words)):
+                raise wrong(f"{where}: words of {column}", words, 'a list of words in quotes, such as ["Run", "Stop"]')
         return cls(**given)
 
     def to_dict(self) -> dict[str, Any]:
