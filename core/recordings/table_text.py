@@ -49,7 +49,6 @@ _WIDE = {  # by which of a text's first four bytes are not 0
     b"\1\0\1\0": "utf-16-le", b"\0\1\0\1": "utf-16-be",
 }  # fmt: skip
 _CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
-_CUT_OFF = re.compile(r"[^\r\n]*\0")  # what a power cut left of a line, and the zeros behind it
 _NO_TEXT = re.compile(r"[\0-\x08\x0e-\x1a\x1c-\x1f\ufffd]")
 _ARROW = re.compile(r"(\d\d:\d\d:\d\d\.\d{3}) -> (.*)", re.DOTALL)  # as the serial monitor of Arduino writes a line
 QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?P<unit>[^\W\d_]\S{0,7}|[%°]\S{0,7})")
@@ -102,6 +101,11 @@ class _Shape:
     mend: Callable[[str], str] | None = None
 
 
+def _behind_zeros(line: str) -> str:
+    """A line without what a power cut left of the one before, and the zeros behind that."""
+    return line.rpartition("\0")[2]
+
+
 def read_csv(path: Path) -> RawTable:
     """Read CSV, in any encoding, with what stands above its rows."""
     with open(path, "rb") as stream:
@@ -114,14 +118,16 @@ def read_csv(path: Path) -> RawTable:
     except UnicodeDecodeError as error:
         if encoding == "utf-8-sig" and error.start < len(head) - 8:
             encoding = "cp1252"  # of Windows
-    start, zeros = _CUT_OFF.subn("", head.decode(encoding, errors="replace").rstrip("\0"))
+    start = head.decode(encoding, errors="replace").rstrip("\0")
+    if zeros := "\0" in start:
+        start = "\n".join(map(_behind_zeros, re.split(r"\r\n|\r|\n", start)))
     if zeros and _NO_TEXT.search(start):
         raise BagError(f"{path}: holds bytes that are no text, so it is no CSV file; unpack it if it is compressed")
     whole, decimals = start.rpartition("\n")[0], [match[2] for match in _CUT_TIME.finditer(start)]
     cut_times = any(three.startswith("0") for three in decimals)  # which numbers do not
     cut_times = cut_times and len(_CUT_TIME.findall(whole)) == len(re.findall(r"\d:\d\d:\d\d", whole))
     lines = _names_on_one_line(re.split(r"\r\n|\r|\n", start)[:_LOOK_LINES])
-    mend = partial(_CUT_OFF.sub, "") if zeros else _without_arrow if any(map(_ARROW.match, lines)) else None
+    mend = _behind_zeros if zeros else _without_arrow if any(map(_ARROW.match, lines)) else None
     mend = partial(_CUT_TIME.sub, r"\1.") if cut_times else mend
     lines = list(map(mend, lines)) if mend else lines
     shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), mend=mend)
