@@ -517,6 +517,25 @@ def test_what_is_proposed_and_written_as_json(folder, tmp_path, cli):
     assert cli.json("layout", folder / "m.model.json", "--foxglove", layout)["layouts"] == [str(layout)]
 
 
+def test_no_line_names_every_signal_of_a_large_plant(tmp_path, cli):
+    rng, count = np.random.default_rng(1), 18
+    x, u = np.zeros((2, 800, count))
+    for k in range(799):  # a feedback sets every valve
+        u[k] = 0.1 * rng.standard_normal(count) - 2.0 * x[k]
+        x[k + 1] = x[k] + 0.1 * (u[k] - x[k]) + 0.2 * rng.standard_normal(count)
+    names = [f"{what}_{i}" for what in ("speed", "valve_cmd") for i in range(count)]
+    table, signals, model = tmp_path / "a.csv", tmp_path / "s.yaml", tmp_path / "m.json"
+    rows = np.column_stack([0.1 * np.arange(800), x, u])
+    np.savetxt(table, rows, delimiter=",", header="time," + ",".join(names), comments="", fmt="%.5f")
+    given = ["--states", "/table:speed_*", "--controls", "/table:valve_cmd_*"]
+    said = [cli("init", table, *given, "--output", signals), cli("fit", table, "--signals", signals, "--output", model)]
+    said.append(cli("info", model))
+    lines = [line for part in said for line in (part.out + part.err).splitlines()]
+    for line in lines:
+        most = 24 if line.startswith("UncertainLTI(") else 12  # states and controls
+        assert sum(name in re.findall(r"\w+", line) for name in names) <= most, line
+
+
 def test_an_alarm_is_red_where_colours_are_wanted(monkeypatch, capsys):
     monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
     monkeypatch.delenv("NO_COLOR", raising=False)

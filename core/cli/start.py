@@ -123,7 +123,7 @@ def init(options: argparse.Namespace) -> Result:
 
 
 def _proposed(data: Mapping[str, Any]) -> str:
-    named = {kind: ", ".join(signal["name"] for signal in data[kind]) for kind in ("states", "controls")}
+    named = {kind: shortlist([signal["name"] for signal in data[kind]], 12) for kind in ("states", "controls")}
     alike = f"\nand the same for each of {shortlist(data['members'], 12)}" if data["members"] else ""
     return f"states: {named['states']}\ncontrols: {named['controls'] or 'none found'}{alike}"
 

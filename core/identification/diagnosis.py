@@ -259,7 +259,8 @@ def _weak(
 
 def _controls(found: Collection[int], names: Sequence[str]) -> str:
     """One control, or each of several."""
-    return ("each of the controls " if len(found) > 1 else "control ") + ", ".join(f"'{names[j]}'" for j in found)
+    named = shortlist([f"'{names[j]}'" for j in found], 12)
+    return ("each of the controls " if len(found) > 1 else "control ") + named
 
 
 def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], later: Sequence[int]) -> list[str]:

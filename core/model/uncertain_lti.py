@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, numbers
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.kernel.arithmetic import blended, edges
 from uncertain_lti.model import horizon as nominal
 from uncertain_lti.model import interchange
@@ -287,8 +287,8 @@ class UncertainLTI(Envelope):
         return tuple(s.name for s in self.signals.controls)
 
     def __repr__(self) -> str:
-        text = f"UncertainLTI({plural(self.n, 'state')}: {', '.join(self.state_names)}; {plural(self.m, 'control')}"
-        text += f": {', '.join(self.control_names)}" * bool(self.m)
+        text = f"UncertainLTI({plural(self.n, 'state')}: {shortlist(self.state_names, 12)}; {plural(self.m, 'control')}"
+        text += f": {shortlist(self.control_names, 12)}" * bool(self.m)
         if self.schedule is not None:
             text += f"; {plural(self.schedule.blocks, 'block')} over {self.schedule.words}"
         if self.horizons:

@@ -285,7 +285,7 @@ def read_transients(
     resolved, words = _resolve_operating_point(resolved, transients)
     if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
         transients = [sample(stream, resolved)[0] for stream in streams]
-    numbers = ", ".join(f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals)
+    numbers = shortlist([f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals], 12)
     first = (*transients[0].notes, f"operating point from {words}: {numbers}")
     return _overlaps_told(
         [t.replace(signals=resolved, notes=first if t is transients[0] else t.notes) for t in transients]
