@@ -223,6 +223,15 @@ def found(validation):
     return detectable(validation.model, validation.parts)
 
 
+def test_progress_is_told_within_a_round(validation, found, monkeypatch):
+    monkeypatch.setattr(module, "TOLD", 5)
+    told = []
+    assert repr(detectable(validation.model, validation.parts, progress=told.append)) == repr(found)
+    assert len(told) > 2 * (module.ROUNDS + 2)
+    numbers = [step.number for step in told]
+    assert numbers == sorted(numbers) and numbers[-1] <= told[-1].total
+
+
 def by_name(found):
     return {(fault.kind, fault.signal): fault for fault in found.faults}
 

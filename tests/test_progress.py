@@ -146,6 +146,17 @@ def test_a_log_gets_a_line_now_and_then_with_the_time_left(monkeypatch):
     assert log.getvalue().splitlines()[3:] == ["reading: 1024 of 5000 messages, about 8 s left"]
 
 
+def test_a_log_gets_a_line_of_many_short_parts(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(time, "perf_counter", lambda: now)
+    log = io.StringIO()
+    with Progress(stream=log) as progress:
+        for _ in range(25):  # files of 1 s each
+            for _ in progress.iterate("reading")(range(10), 10):
+                now += 0.1
+    assert [line.partition(":")[0] for line in log.getvalue().splitlines()] == ["reading"] * 2
+
+
 def test_bars_go_where_an_error_passes_through():
     screen = Terminal()
     with pytest.raises(KeyboardInterrupt), Progress(stream=screen) as progress:

@@ -53,7 +53,7 @@ class Progress:
     def __init__(self, quiet: bool = False, verbose: bool = False, stream: TextIO | None = None) -> None:
         self.quiet, self.verbose = quiet, verbose
         self._stream = stream or sys.stderr or io.StringIO()  # a process may have none
-        self._began = time.perf_counter()
+        self._began = self._spoke = time.perf_counter()
         self._bars: list[Any] = []
         self._noted: set[str] = set()
 
@@ -152,9 +152,10 @@ class Progress:
         def log(text: str, done: int, total: int) -> None:
             nonlocal following
             now = time.perf_counter()
-            if now < following or self.quiet or self.verbose:  # who sees every line anyway
+            due = min(following, self._spoke + _LINE)  # many parts that are short are long together
+            if now < due or self.quiet or self.verbose:  # who sees every line anyway
                 return
-            following = now + _LINE
+            self._spoke, following = now, now + _LINE
             if done and " left" not in text:
                 text += f", about {(now - began) / done * (total - done):.0f} s left"
             self.write(f"{what}: {printable(text)}")

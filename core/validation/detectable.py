@@ -67,6 +67,8 @@ OFF = 1.1
 """Factor by which the nominal model's response to actuators and dynamics may be off, for the interval of a share."""
 MOST_TOGETHER = 2_000_000
 """Numbers that are judged at a time, about."""
+TOLD = 32
+"""Faults from one line of progress to the next: a round of those of eighty states takes minutes."""
 GROWS = 10.0
 """Growth of a deviation within the time, by the nominal model, from which on its response to faults says nothing."""
 
@@ -390,12 +392,15 @@ def detectable(
         else:
             searches.append(_Search(kind, i, name, largest, every, seed))
     for number in range(ROUNDS + 2):
-        if progress is not None:
-            progress(CountedStep("faults of each kind", number + 1, ROUNDS + 2))
         going = [s for s in searches if number == 0 or s.reached.any()]
-        faults = [faulty(every, s.kind, s.i, s.signs * s.sizes(number), every.noise, model) for s in going]
-        for search, delay in zip(going, every.delays(faults), strict=True):
-            search.learn(delay, number)
+        for first in range(0, len(going), TOLD):
+            if progress is not None:
+                done = number * len(searches) + first
+                progress(CountedStep("faults of each kind", done + 1, (ROUNDS + 2) * len(searches)))
+            some = going[first : first + TOLD]
+            faults = [faulty(every, s.kind, s.i, s.signs * s.sizes(number), every.noise, model) for s in some]
+            for search, delay in zip(some, every.delays(faults), strict=True):
+                search.learn(delay, number)
     found |= {(s.kind, s.name): s.seen(model, every.unit, confidence) for s in searches}
     return Detectable(within, confidence, count, left_out, tuple(found[kind, name] for kind, _, name in pairs))
 
