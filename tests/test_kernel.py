@@ -10,6 +10,8 @@
 """The kernel against the equations written naively: one number after another, for one sample, many, and runs."""
 
 import math
+from itertools import pairwise
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,8 @@ from refusals import refuses
 
 from uncertain_lti import EnvelopeMonitor, SignalMap, Transient, UncertainLTI
 from uncertain_lti.base.arrays import LARGEST
+from uncertain_lti.identification.passes import Candidate, Samples, scan
+from uncertain_lti.identification.problem import Block
 from uncertain_lti.kernel import arithmetic
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION, Repeating
 from uncertain_lti.model.alarm_rule import StatisticRule
@@ -400,6 +404,59 @@ def test_sums_over_several_tiles_are_those_of_numpy() -> None:
     for short in (after[:1], after[:, :9]):
         fit = z, dt, short, None, None, None, 1, [1], None
         refuses(ValueError, "the samples do not fit the terms", arithmetic.sums_of, n, *fit)
+
+
+@pytest.mark.parametrize("limited", ["", "alike", "each"])
+@pytest.mark.parametrize(("of_rows", "most"), [(False, 10_000), (True, 10_000), (True, 7)])
+def test_a_scan_finds_every_transition_within_the_reach(limited: str, of_rows: bool, most: int) -> None:
+    """By the formula, of transitions in pieces, one at rest, rows in another order, and no more than are asked for."""
+    rng = np.random.default_rng(len(limited) + 10 * of_rows)
+    n, p, count, offset, edges, rows = 3, 4, 700, 50, [0, 150, 151, 700], np.array([2, 0])
+    z, dt, theta = rng.normal(size=(p, count)), rng.uniform(0.1, 0.4, count), rng.normal(size=(p + 1, 2))
+    z[:, 5] = 0.0
+    d, scale, reach = rng.uniform(0.1, 0.4, (p + 2, 2)), np.array([2.0, 0.5]), np.array([0.05, 0.2])
+    unit = rng.uniform(0.5, 2.0, (p + 2, 2) if of_rows else p + 2)
+    unit[p:] *= of_rows  # or what is at rest has no size
+    phi, psi = np.vstack([z, np.ones(count)]), np.vstack([np.abs(z), np.ones(count), 1.0 / dt])
+    half, after = d.T @ psi, z[:n] + rng.normal(size=(n, count))
+    after[rows] = z[rows] + dt * (theta.T @ phi + half * rng.uniform(-1.1, 1.1, (2, count)))
+    after[rows, 5] = dt[5] * (theta.T @ phi + 1.5 * half)[:, 5]
+    weights = rng.uniform(0.5, 2.0, (count, n)) if limited == "each" else rng.uniform(0.5, 2.0, n)
+    room = np.array([0.3, 0.1])
+    root = np.broadcast_to(np.sqrt(weights).T if limited == "each" else np.sqrt(weights)[:, None], (n, count))
+    limit = np.quantile(2.0 * half * dt * root[rows], 0.9, axis=1) if limited else None
+    part: Any = SimpleNamespace(n=n, columns=SimpleNamespace(regimes=None, extra=(1, (True, False))))
+    part.blocks = lambda: (
+        Block(
+            z[:, a:b], after[:, a:b], dt[a:b], weights[a:b] if limited == "each" else weights, start=a
+        ) for a, b in pairwise(edges)
+    )  # fmt: skip
+    found = scan(part, Candidate(theta, d, unit, scale, limit, reach.copy(), room, most, rows), offset)
+    size = (unit.T @ psi if of_rows else np.tile(unit @ psi, (2, 1))) * scale[:, None]
+    size[:, 5] = size[:, 5] if of_rows else scale
+    rate = (after[rows] - z[rows]) / dt
+    slack = (half - np.abs(rate - theta.T @ phi)) / size
+    within = reach if limit is None else np.minimum(reach, room)
+    if limit is not None:
+        left = (limit[:, None] / (2.0 * dt * root[rows]) - half) / size
+        slack = np.where(left < room[:, None], np.minimum(slack, left), slack)
+    for i, (parts, end) in enumerate(found):
+        some = Samples.join(parts, p)
+        k = some.index - offset
+        wanted = np.flatnonzero(slack[i] < end - 1e-9)
+        assert len(wanted) > 3 and np.isin(wanted, k).all(), "none that is nearer is left out"
+        assert len(k) <= most and (end == within[i] or (len(k) == most and np.isclose(end, np.sort(slack[i])[most])))
+        assert most == 7 or set(k) <= set(np.flatnonzero(slack[i] < reach[i])), "and none that is farther is taken"
+        for values, truth in ((some.z, z), (some.rate, rate[i]), (some.dt, dt), (some.root_weight, root[rows[i]])):
+            np.testing.assert_allclose(values, truth[..., k])
+
+
+def test_samples_that_are_joined_are_in_order_each_once() -> None:
+    every = Samples(np.arange(6), np.arange(12.0).reshape(2, 6), *np.arange(18.0).reshape(3, 6))
+    for parts in ([[4, 5], [0, 2]], [[0, 1], [1, 3]], [[0, 1], [], [2, 5]], [[3], []], [[], []]):
+        some = Samples.join([every[np.array(k, dtype=int)] for k in parts], 2)
+        assert some.index.tolist() == sorted({k for part in parts for k in part})
+        assert some.z[1].tolist() == [6.0 + k for k in some.index]
 
 
 def test_what_a_tile_is_filled_up_with_counts_nowhere_and_on_a_bound_is_not_outside() -> None:
