@@ -414,7 +414,7 @@ def test_a_scan_finds_every_transition_within_the_reach(limited: str, of_rows: b
     n, p, count, offset, edges, rows = 3, 4, 700, 50, [0, 150, 151, 700], np.array([2, 0])
     z, dt, theta = rng.normal(size=(p, count)), rng.uniform(0.1, 0.4, count), rng.normal(size=(p + 1, 2))
     z[:, 5] = 0.0
-    d, scale, reach = rng.uniform(0.1, 0.4, (p + 2, 2)), np.array([2.0, 0.5]), np.array([0.05, 0.2])
+    d, scale, reach = rng.uniform(0.1, 0.4, (p + 2, 2)), np.array([2.0, 0.8]), np.array([0.05, 0.2])
     unit = rng.uniform(0.5, 2.0, (p + 2, 2) if of_rows else p + 2)
     unit[p:] *= of_rows  # or what is at rest has no size
     phi, psi = np.vstack([z, np.ones(count)]), np.vstack([np.abs(z), np.ones(count), 1.0 / dt])

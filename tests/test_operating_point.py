@@ -10,6 +10,7 @@
 """Normalisation, and what `auto` resolves to."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -279,3 +280,14 @@ ELEVEN, TENS = np.linspace(-1.0, 1.0, 11), np.linspace(0.0, 10.0, 11)
 )
 def test_which_numbers_stand_for_no_value(others: np.ndarray, numbers: list[float], found: dict[float, int]) -> None:
     assert codes(np.concatenate([others, numbers, [NAN, INF]])) == found
+
+
+def test_the_operating_point_of_much_takes_the_room_of_its_samples_twice() -> None:
+    rows = np.random.default_rng(0).uniform(size=(5, 4000, 60))
+    tracemalloc.start()
+    try:
+        resolve_auto([Signal(f"s{j}", "/t", f"s{j}", steady="auto", scale="auto") for j in range(60)], list(rows))
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 2.0 * rows.nbytes

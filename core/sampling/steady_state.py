@@ -154,17 +154,18 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
 
     `recordings` (samples, signals): in recorded units.
     """
-    finite = [np.where(np.isfinite(r), r, np.nan) for r in recordings]
-    pooled = np.concatenate(finite)
+    pooled = np.concatenate(recordings, dtype=float)
+    pooled[~np.isfinite(pooled)] = np.nan
+    finite = np.split(pooled, np.cumsum([len(r) for r in recordings])[:-1])  # no copies: there may be much of it
     left = []
     for j, signal in enumerate(signals):  # of a number that stands for none there is no steady state
         for code, count in codes(pooled[:, j]).items():
             left.append(f"{signal.name} {code:.9g} in {count}")
-            for r in (pooled, *finite):
-                r[r[:, j] == code, j] = np.nan
+            pooled[pooled[:, j] == code, j] = np.nan
     seen = np.isfinite(pooled).any(axis=0)
     span = np.zeros(len(signals))
-    span[seen] = np.nanmax(pooled[:, seen], axis=0) - np.nanmin(pooled[:, seen], axis=0)
+    ends = (end.reduce(pooled, axis=0, initial=np.nan) for end in (np.fmax, np.fmin))
+    span[seen] = np.subtract(*ends)[seen]
     for band in (STILL_BAND * 2.0**k for k in range(7)):  # up to beyond every range
         found = [r[a:b] for r in finite for a, b in still_stretches(r, span, band)]
         if found:
