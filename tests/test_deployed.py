@@ -179,13 +179,17 @@ def test_from_a_time_on_the_condition_is_the_last_that_was_heard(values):
         (["--rules", "nowhere.json"], "nowhere.json: there is no such"),
         (["--rules", "empty.json"], "empty.json: no rules of an alarm; give a model file"),
         (["--rules", "far.json"], "far.json: does not fit the model: "),
+        (["--rules", "turned.json"], "turned.json: its thresholds are of the states "),
         (["--rules", "odd.json"], "odd.json: field 'alarm.rules[0].kind' is 'median'"),
     ],
 )
 def test_what_cannot_be_deployed_is_refused(machine, options, words, cli, tmp_path, monkeypatch):
-    _, folder, _ = machine
+    model, folder, _ = machine
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty.json").write_text("[]")
+    model.replace(alarm=[StatisticRule("energy", 0.5, (1.0,) * model.n)]).save("turned.json")
+    turned = json.loads((tmp_path / "turned.json").read_text())
+    (tmp_path / "turned.json").write_text(json.dumps(turned | {"states": turned["states"][::-1]}))
     (tmp_path / "odd.json").write_text('{"rules": [{"kind": "median", "window_s": 1.0, "threshold": 1.0}]}')
     far = {"kind": "mean", "window_s": 1.0, "threshold": 1.0, "horizon": 50}
     (tmp_path / "far.json").write_text(json.dumps({"rules": [far]}))

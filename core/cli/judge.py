@@ -57,7 +57,7 @@ def deployed_monitor(options: argparse.Namespace, model: UncertainLTI) -> Deploy
     from uncertain_lti.signals.signal_map import below
 
     if options.rules is not None:
-        rules = read_rules(options.rules)
+        rules = read_rules(options.rules, model.state_names)
         try:
             model = model.replace(alarm=rules)
         except ModelError as error:

@@ -22,8 +22,8 @@ from typing import Any
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import kind_of, written
-from uncertain_lti.base.text import finite_data, plural
-from uncertain_lti.model.alarm_rule import AlarmRule, Rule, checked_rules, rule_from_dict
+from uncertain_lti.base.text import finite_data, plural, shortlist
+from uncertain_lti.model.alarm_rule import CONTAINMENT, AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Residuals, Run
 from uncertain_lti.model.repeats import Repeats
@@ -255,15 +255,23 @@ def read(path: str | os.PathLike[str]) -> Any:
         raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
 
 
-def read_rules(path: str | os.PathLike[str]) -> tuple[Rule, ...]:
-    """Read the rules of an alarm from a file."""
-    data = read(path)
+def read_rules(path: str | os.PathLike[str], states: Sequence[str]) -> tuple[Rule, ...]:
+    """Read the rules of an alarm from a file, for a model of these states."""
+    data = whole = read(path)
     if isinstance(data, dict):
         data = data.get("alarm", data)
     try:
         if not (isinstance(data, dict) and data.keys() & {"rules", "violations", "window", "margin"}):
             raise ModelError("no rules of an alarm; give a model file, or JSON as its field 'alarm' has it")
-        return _alarm(data, newer=True)
+        rules = _alarm(data, newer=True)
+        listed = whole.get("states")
+        own = [str(s.get("name")) for s in listed if isinstance(s, dict)] if isinstance(listed, list) else []
+        if own not in ([], list(states)) and any(rule.kind != CONTAINMENT for rule in rules):
+            raise ModelError(
+                f"its thresholds are of the states {shortlist(own, 5)}, and the model has {shortlist(states, 5)}; take "
+                f"the rules of a model of the same states in the same order"
+            )
+        return rules
     except ModelError as error:
         raise ModelError(f"{os.fspath(path)}: {error}") from None
 
