@@ -142,6 +142,17 @@ def test_a_state_that_follows_its_control_is_named_with_the_cure():
     assert "'speed' and 'valve'" in message and "steps of 'valve' that are sharper than 'speed' can follow" in message
 
 
+def test_a_steady_state_far_from_what_was_recorded_is_named():
+    """Such as of another unit: controls of which every step shows were said to move too little, or to move together."""
+    one = run()
+    for x, u, name in (([0, 1e3], [0, 0], "flow"), ([0, 0], [300, 0], "valve"), ([1e9, 2e9], [0, 0], "")):
+        moved = one.replace(x=one.x + x, u=one.u + u)
+        found = [m for m in messages(moved) if WORDS["weak"] in m or "rank def" in m or "steady: auto" in m]
+        assert len(found) == 1 and f"'{name}" in found[0] and "and its steady state 0, so" in found[0], found
+        assert not any("steady: auto" in m for m in messages(moved, additive="both"))
+    assert not any("steady: auto" in m for m in messages(one))
+
+
 def test_control_lost_in_the_noise_is_named():
     u = steps(np.random.default_rng(4), 1501)
     u[:, 1] *= 1e-5

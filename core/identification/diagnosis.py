@@ -61,6 +61,8 @@ MOST_GROUPS, MOST_TIED = 3, 5
 """Combinations of signals, and blocks with elements of another, that are named."""
 FED_BACK = 0.9
 """Share of a control's changes explained by the states, from which on that is reported."""
+DRIFTS = 2.0
+"""What a drift makes of the residuals, from which on a model without one has a wrong steady state."""
 FROZEN = 25
 """Samples for which a value does not change while the others move, from which on it may be frozen."""
 UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
@@ -134,11 +136,13 @@ def describe(
     regimes_said = _tied(model, scheduled, sums) + _beyond_knots(model, scheduled)
     sums = sums.one_block()
     rank, messages = _rank(problem, sums, names, rows := rows_of(model))
-    apart = not messages
+    part, past = _stretches(problem), lagged_states(signals, model.n)
+    if far := _far(part, signals):  # every level moves with every other then
+        messages = [text for text in messages if "move together" not in text]
+    apart = not (messages or far)
     coded = [*_coded(problem, sums, signals), *_wrapped(problem, signals, transients)]
     messages = [*coded, *_bursting(model, transients), *messages, *regimes_said]
     if not coded:  # the envelope is fitted to the jumps, and what follows would be about them
-        part, past = _stretches(problem), lagged_states(signals, model.n)
         messages += _carried(few, discarded, problem, names, transients)
         alike = _collinear(problem, sums, names, past, rows)
         noisy, late, held = _noise_like(part), _delayed(part, signals, past), _held(part, signals)
@@ -146,7 +150,7 @@ def describe(
         lacking = {} if late else _missing(part, signals)
         lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
         messages += lacking.values()
-        messages += _weak(problem, sums, signals, past, lacking)
+        messages += far or _weak(problem, sums, signals, past, lacking)
         messages += _fed_back(part, names, past, [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)])
         messages += _noisy({i: share for i, share in noisy.items() if i not in lacking}, names, part.dt)
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
@@ -239,6 +243,28 @@ def _collinear(
             f"{len(free)} signals can be told apart; use fewer, or more controls of their own"
         ]
     return messages
+
+
+def _far(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """The signal farthest from its steady state, where a drift, which no term allows for, explains much of a state."""
+    z, rate = problem.z.T, problem.rate()
+    if "c" in problem.columns.names or len(z) < 4 * problem.p:
+        return []
+    level, moves = z.mean(axis=0), np.ptp(z, axis=0)
+    pairs = ((z, rate), (z - level, rate - rate.mean(axis=0)))
+    alone, drifting = (np.sum((b - a @ np.linalg.lstsq(a, b)[0]) ** 2, axis=0) ** 0.5 for a, b in pairs)
+    worse = alone / np.maximum(drifting, 1e-3 * rate.std(axis=0) * len(z) ** 0.5 + 1e-300)
+    away = np.where(moves > 0, np.abs(level) / np.maximum(moves, 1e-300), 0.0)
+    i, j = int(np.argmax(worse)), int(np.argmax(away))
+    if worse[i] < DRIFTS or away[j] < 1:
+        return []
+    steady, scale = float(signals[j].steady), float(signals[j].scale)
+    low, high = (recorded(v, steady, scale) for v in (z[:, j].min(), z[:, j].max()))
+    return [
+        f"'{signals[j].name}' is {low:.4g} to {high:.4g} in the recordings, and its steady state {steady:.4g}, so "
+        f"'{signals[i].name}' is {worse[i]:.2g} times as far from the model as it need be: write "
+        f"`steady: auto`, or the value at rest"
+    ]
 
 
 def _weak(
