@@ -395,6 +395,7 @@ def test_nothing_usable_is_said():
         (some, some, 0.01, "no two in a row are at most max_gap and at least min_step apart"),
     ):
         refuses(FitError, words, fit, Transient(t, x, u, max_gap=max_gap, name="silent.mcap"))
+    refuses(FitError, "time steps back before 19 more, .* in the order of", fit, Transient(t[::-1], some, some))
 
 
 def on_the_bounds(model, z, dt, rng, weights, columns):

@@ -170,7 +170,7 @@ def test_a_jump_larger_than_any_of_the_fit_is_named_with_its_limit() -> None:
         (1, {}, "a verdict needs two samples: check a longer recording"),
         (50, {"u": np.full((50, 1), np.nan)}, "record it, or fit without it; of topics"),
         (50, {"max_gap": 0.01}, "is a topic slower than in the fit"),
-        (50, {"t": round(3e9) * np.arange(50)}, "check a recording at the rate of the fit"),
+        (50, {"t": round(3e9) * np.arange(50)}, "is its time in another unit? check one at the rate of the fit"),
     ],
 )
 def test_where_no_verdict_was_possible_the_reason_comes_with_a_remedy(steps, change, remedy):

@@ -305,6 +305,8 @@ def validate(options: argparse.Namespace) -> Result:
     bags = options.bags or list(dict.fromkeys(_found(s["file"], options.model) for s in sources))
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
+    if not options.bags and not os.path.exists((first := bags[0]).partition("[")[0]):
+        raise BagError(f"{options.model}: {first}, to which it was fitted, is not there; name its recordings after it")
     if options.output is not None:
         own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
         model_target(options.output, options.force or own, bags)

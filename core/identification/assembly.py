@@ -163,6 +163,8 @@ def _without_values(transients: Sequence[Transient]) -> str:
             f"no two in a row have every signal; there is a value of {', '.join(seldom)} of them (otherwise missing, "
             f"not finite or too old, see max_hold and max_skew), so check the signals file"
         )
+    if (late := sum(t.counters["late"] for t in transients)) > total:
+        return f"time steps back before {late} more, which are left out; put them in the order of their times"
     return "no two in a row are at most max_gap and at least min_step apart, so check these in the signals file"
 
 

@@ -67,7 +67,7 @@ _REMEDIES = {
     Status.RESET: "time steps back: name the runs in it as recordings of their own",
     Status.MISSING: "a signal is missing, stale or not finite: record it, or fit without it; of topics that are there "
     "compare `uncertain-lti topics` with max_hold and max_skew in the signals file",
-    Status.STEP: "check a recording at the rate of the fit, or fit recordings at this rate",
+    Status.STEP: "is its time in another unit? check one at the rate of the fit, or fit recordings at this rate",
     Status.MODE: "fit recordings of this mode too",
     Status.FROZEN: "states repeat exactly: see whether their sensors and drivers still send",
     Status.UNASKED: "ask for a longer time with --from and --to",
