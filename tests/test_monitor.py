@@ -231,6 +231,20 @@ def test_predicted_bounds_are_those_that_will_be_judged(seed: int, n: int, m: in
     assert lower.tobytes() == verdict.lower.tobytes() and upper.tobytes() == verdict.upper.tobytes()
 
 
+def test_steps_made_by_hand_are_judged_as_the_transient() -> None:
+    model, rng = a_model(2, 1, 3), np.random.default_rng(3)
+    run = Transient(np.arange(50) * 0.02, rng.normal(size=(50, 2)), rng.normal(size=(50, 1)))
+    monitor, z = EnvelopeMonitor(model), np.hstack([run.x, run.u])
+    pairs = [
+        Step(Status.OK, t, t, 0.02, *pair) for t, *pair in zip(run.t_ns[1:].tolist(), z[:-1], run.x[1:], strict=True)
+    ]
+    by_hand, expected = [monitor.judge(step) for step in pairs], EnvelopeMonitor(model).check(run)
+    assert [v.alarm for v in by_hand] == expected.alarm[1:].tolist()
+    assert np.array([v.lower for v in by_hand]).tobytes() == expected.lower[1:].tobytes()
+    with pytest.raises(ModelError, match=r"step: 3 and 3 values for 3 and 2 signals; give \[x; u; s\] before and x"):
+        monitor.judge(Step(Status.OK, 0, 0, 0.02, z[0], z[1]))
+
+
 def test_a_transient_of_other_size_is_refused() -> None:
     transient = Transient([0.0, 1.0], np.zeros((2, 2)), np.zeros((2, 1)), name="run")
     with pytest.raises(ModelError, match="run: 2 states and 1 control, and the model has 1 and 0"):

@@ -295,13 +295,20 @@ class EnvelopeMonitor:
         """
         return self._back_from_ns > -_BEYOND_NS and not step.status.dropped and step.t_ns <= self._back_from_ns
 
+    def _judgement(self, step: Step) -> Any:
+        try:
+            return self._judge.judge(step.before, step.after, step.dt)
+        except ValueError as error:  # of a step made by hand
+            raise ModelError(f"step: {error}; give [x; u; s] before and x after") from None
+
     def judge(self, step: Step, armed: bool = True) -> Verdict:
         """Verdict on one step of the sampler.
 
         Parameters
         ----------
         step : Step
-            Of the sampler.
+            Of the sampler, or `uncertain_lti.sampling.sampler.Step(Status.OK, t_ns, t_ns, dt, z, x_next)` of two
+            samples, z = [x; u; s] of the first, recorded units; Status is that of `uncertain_lti.sampling.clock`.
         armed : bool, default True
             Whether it may count for the alarm; otherwise there is none, and the window is empty afterwards.
 
@@ -325,7 +332,7 @@ class EnvelopeMonitor:
                 status = Status.STEP
             elif not all_carried(step.before):  # the bounds would be no numbers
                 status = Status.MISSING
-            elif (judgement := self._judge.judge(step.before, step.after, step.dt)) is None:
+            elif (judgement := self._judgement(step)) is None:
                 status = Status.MODE
         if judgement is not None and watch is not None:
             bounds = partial(self._bounds_of, step, judgement)
