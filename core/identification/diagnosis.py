@@ -29,6 +29,7 @@ from uncertain_lti.identification.evidence import (
     FASTEST,
     NOISE,
     autocorrelation,
+    far_from_steady,
     held_for,
     lagged_states,
     late_controls,
@@ -51,25 +52,17 @@ from uncertain_lti.signals.signal_map import ARRIVAL, Signal
 
 LOOKED_AT, STRETCHES = 20_000, 20
 """Transitions, and stretches, that are examined at most for what shows in any of them."""
-FAST = 0.7
-"""|eigenvalue| x dt above which a step of forward Euler is long for the mode."""
-WIDE = 0.5
-"""Mean width, as a share of the state's own range, above which few faults can show."""
-COLLINEAR = 1e-3
-"""Smallest eigenvalue of the regressors' correlation below which signals move nearly together (and above rank)."""
+FAST = 0.7  # |eigenvalue| x dt above which a step of forward Euler is long for the mode
+WIDE = 0.5  # mean width, as a share of the state's own range, above which few faults can show
+COLLINEAR = 1e-3  # smallest eigenvalue of the regressors' correlation below which signals move nearly together
 MOST_GROUPS, MOST_TIED = 3, 5
 """Combinations of signals, and blocks with elements of another, that are named."""
-FED_BACK = 0.9
-"""Share of a control's changes explained by the states, from which on that is reported."""
-DRIFTS = 2.0
-"""What a drift makes of the residuals, from which on a model without one has a wrong steady state."""
-FROZEN = 25
-"""Samples for which a value does not change while the others move, from which on it may be frozen."""
+FED_BACK = 0.9  # share of a control's changes explained by the states, from which on that is reported
+FROZEN = 25  # samples for which a value does not change while the others move, from which on it may be frozen
 UNEVEN, JITTER, SLOW_STEP = 0.22, 1.15, 0.5
 """|log(step / median)| of an uneven step, and by how much a constant one must explain them better; see `jittering`."""
 
-CONSTANT = "never moved in what was fitted"
-"""Words on controls that never moved: nothing is to be mended for the operation that was recorded."""
+CONSTANT = "never moved in what was fitted"  # nothing is to be mended for the operation that was recorded
 HARMLESS = (CONSTANT, "dc is 0", "keeps the steady state", "keeps them there")  # the others on what was chosen
 _CODE, _NOISE = "a number that stands for no value", "like noise from sample to sample"
 _BEFORE, _FEW = "one sample earlier explains", "as wide as the rest needs"
@@ -137,7 +130,7 @@ def describe(
     sums = sums.one_block()
     rank, messages = _rank(problem, sums, names, rows := rows_of(model))
     part, past = _stretches(problem), lagged_states(signals, model.n)
-    if far := _far(part, signals):  # every level moves with every other then
+    if far := far_from_steady(part, signals):  # every level moves with every other then
         messages = [text for text in messages if "move together" not in text]
     apart = not (messages or far)
     coded = [*_coded(problem, sums, signals), *_wrapped(problem, signals, transients)]
@@ -243,28 +236,6 @@ def _collinear(
             f"{len(free)} signals can be told apart; use fewer, or more controls of their own"
         ]
     return messages
-
-
-def _far(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """The signal farthest from its steady state, where a drift, which no term allows for, explains much of a state."""
-    z, rate = problem.z.T, problem.rate()
-    if "c" in problem.columns.names or len(z) < 4 * problem.p:
-        return []
-    level, moves = z.mean(axis=0), np.ptp(z, axis=0)
-    pairs = ((z, rate), (z - level, rate - rate.mean(axis=0)))
-    alone, drifting = (np.sum((b - a @ np.linalg.lstsq(a, b)[0]) ** 2, axis=0) ** 0.5 for a, b in pairs)
-    worse = alone / np.maximum(drifting, 1e-3 * rate.std(axis=0) * len(z) ** 0.5 + 1e-300)
-    away = np.where(moves > 0, np.abs(level) / np.maximum(moves, 1e-300), 0.0)
-    i, j = int(np.argmax(worse)), int(np.argmax(away))
-    if worse[i] < DRIFTS or away[j] < 1:
-        return []
-    steady, scale = float(signals[j].steady), float(signals[j].scale)
-    low, high = (recorded(v, steady, scale) for v in (z[:, j].min(), z[:, j].max()))
-    return [
-        f"'{signals[j].name}' is {low:.4g} to {high:.4g} in the recordings, and its steady state {steady:.4g}, so "
-        f"'{signals[i].name}' is {worse[i]:.2g} times as far from the model as it need be: write "
-        f"`steady: auto`, or the value at rest"
-    ]
 
 
 def _weak(

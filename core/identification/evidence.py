@@ -22,6 +22,7 @@ from uncertain_lti.base.arrays import Array, in_stretches
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.model.horizon import unbroken_over
+from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.signals.signal_map import Signal
 
 FASTEST = 1.05
@@ -51,6 +52,8 @@ WHITE, OWN = 0.3, 0.5
 two sensors has of its own."""
 ROUNDED = 1e-6
 """Standard deviation of the difference of two signals, as a share, up to which it is rounding."""
+DRIFTS = 2.0
+"""What a drift makes of the residuals, from which on a model without one has a wrong steady state."""
 _EXACT = 0.01  # what a fit on others leaves of a signal's steps, as a share, up to which it is computed from them
 _ENOUGH, _STRETCH = 5_000_000, 128  # elements of the regressors from which on stretches of samples do
 _STRETCHES = 10  # of the samples, dealt out to the halves in turn
@@ -357,3 +360,25 @@ def _lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[in
         if scores[best] - score([[*undelayed, first + best - 1]])[0] < 0.3 * gain:
             found[j] = (best, float(1 - np.exp(-gain / n / 2)))
     return found
+
+
+def far_from_steady(problem: Problem, signals: Sequence[Signal]) -> list[str]:
+    """The signal farthest from its steady state, where a drift, which no term allows for, explains much of a state."""
+    z, rate = problem.z.T, problem.rate()
+    if "c" in problem.columns.names or len(z) < 4 * problem.p:
+        return []
+    level, moves = z.mean(axis=0), np.ptp(z, axis=0)
+    pairs = ((z, rate), (z - level, rate - rate.mean(axis=0)))
+    alone, drifting = (np.sum((b - a @ np.linalg.lstsq(a, b)[0]) ** 2, axis=0) ** 0.5 for a, b in pairs)
+    worse = alone / np.maximum(drifting, 1e-3 * rate.std(axis=0) * len(z) ** 0.5 + 1e-300)
+    away = np.where(moves > 0, np.abs(level) / np.maximum(moves, 1e-300), 0.0)
+    i, j = int(np.argmax(worse)), int(np.argmax(away))
+    if worse[i] < DRIFTS or away[j] < 1:
+        return []
+    steady, scale = float(signals[j].steady), float(signals[j].scale)
+    low, high = (recorded(v, steady, scale) for v in (z[:, j].min(), z[:, j].max()))
+    return [
+        f"'{signals[j].name}' is {low:.4g} to {high:.4g} in the recordings, and its steady state {steady:.4g}, so "
+        f"'{signals[i].name}' is {worse[i]:.2g} times as far from the model as it need be: write "
+        f"`steady: auto`, or the value at rest"
+    ]
