@@ -92,7 +92,7 @@ def resolve_groups(transients: Sequence[Transient], groups: Sequence[Any] | str 
             )
     if len(set(names)) < 2:
         raise FitError(
-            f"all {plural(len(names), 'recording')} are of one group ({names[0]}), so nothing is left to fit to when "
+            f"{plural(len(names), 'recording')}, all of one group ({names[0]}), so nothing is left to fit to when "
             f"it is left out; record another, or validate without groups"
         )
     return names, grouping
