@@ -679,6 +679,9 @@ def test_words_of_a_switch_are_controls_each_and_read_in_other_recordings(tmp_pa
         (table,) = group_recordings([csv(tmp_path / f"{k}.csv", ["time", "x", "line"], cells)], layout=layout)
         runs = table.columns(["/table"], [[FieldPath("line_RUN")]]).values[0][:3, 0]
         np.testing.assert_array_equal(runs, [float(word == "RUN") if word else np.nan for word in words])
+    own = [[row, word, 7 + row] for row, word in enumerate(("RUN", "IDLE", "RUN", "IDLE"))]
+    (table,) = group_recordings([csv(tmp_path / "own.csv", ["time", "line", "line_RUN"], own)], layout=layout)
+    assert table.columns(["/table"], [[FieldPath("line_RUN")]]).values[0][:, 0].tolist() == [7, 8, 9, 10]
     by_turns = [[0.1 * k, *((k % 9, "", "") if k % 2 else ("", math.sin(k), k % 7)), "AB"[k % 2]] for k in range(300)]
     names = ["time", "CMD.u", "ATT.r", "ATT.p", "kind"]
     assert "words" not in propose([csv(tmp_path / "turns.csv", names, by_turns)], states=["*"]).text

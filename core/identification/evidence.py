@@ -368,8 +368,8 @@ def far_from_steady(problem: Problem, signals: Sequence[Signal]) -> list[str]:
     if "c" in problem.columns.names or len(z) < 4 * problem.p:
         return []
     level, moves = z.mean(axis=0), np.ptp(z, axis=0)
-    pairs = ((z, rate), (z - level, rate - rate.mean(axis=0)))
-    alone, drifting = (np.sum((b - a @ np.linalg.lstsq(a, b)[0]) ** 2, axis=0) ** 0.5 for a, b in pairs)
+    without = rate - z @ np.linalg.lstsq(z, rate, rcond=None)[0]
+    alone, drifting = (np.square(rest).sum(axis=0) ** 0.5 for rest in (without, *left(z, rate)))
     worse = alone / np.maximum(drifting, 1e-3 * rate.std(axis=0) * len(z) ** 0.5 + 1e-300)
     away = np.where(moves > 0, np.abs(level) / np.maximum(moves, 1e-300), 0.0)
     i, j = int(np.argmax(worse)), int(np.argmax(away))

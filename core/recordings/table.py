@@ -114,12 +114,13 @@ class Table(Recording):
         units = units_of(names, raw.units)
         self.units = {field: units[name] for field, name in fields.items() if name in units}
         self.columns_by_field: dict[str, Column] = {field: raw.columns[name][here] for field, name in fields.items()}
-        self._words: dict[str, Column] = {}
+        switched: dict[str, Column] = {}  # of columns of words
         for field, those in (layout.words or {}).items():
             if (cells := self.columns_by_field.get(field)) is not None:
                 if cells.dtype.kind != "O" and raw.exact is not None:  # as of Run and Stop alone, which are numbers
                     cells = np.array(raw.exact(fields[field]), dtype=object)[here]
-                self._words |= _of_words(field, those[1:], [str(cell or "").strip() for cell in cells])
+                switched |= _of_words(field, those[1:], [str(cell or "").strip() for cell in cells])
+        switched = {name: column for name, column in switched.items() if name not in self.columns_by_field}
         self._quaternions = _quaternions(self.columns_by_field)
         reason = ""
         if not names:
@@ -128,14 +129,14 @@ class Table(Recording):
             reason = f"column '{naming}' names the signal of a row's one number"
             reason += ", and they come at times of their own: export them at one interval" if called else ""
             reason += "; write a column for each signal" + ", or call it `signal`" * (not called)
-        self._tell_topics(reason, file.suffix[1:].lower())
+        self._tell_topics(reason, file.suffix[1:].lower(), switched)
 
-    def _tell_topics(self, reason: str, kind: str) -> None:
+    def _tell_topics(self, reason: str, kind: str, switched: Mapping[str, Column]) -> None:
         """Rows and columns of each topic, of a table of such a kind, and the reason why it cannot be read, if any."""
         every = by_message(self.columns_by_field, len(self.times))
         if TABLE_TOPIC in every:
-            every[TABLE_TOPIC][0].extend(name for name in self._words if name not in self.columns_by_field)
-        self.columns_by_field |= self._words
+            every[TABLE_TOPIC][0].extend(switched)
+        self.columns_by_field |= switched
         one = len(every) == 1 and not reason
         texts = [(n, c) for n, c in self.columns_by_field.items() if c.dtype.kind == "O"] if one else []
         some = len(texts) < len(self.columns_by_field)
