@@ -261,10 +261,9 @@ class Table(Recording):
 
 def _of_words(field: str, words: Sequence[str], cells: Sequence[str]) -> dict[str, Column]:
     """A column of numbers for each word of a column."""
-    there = np.array([cell != "" for cell in cells])
+    rows = np.array(cells, dtype=str)
     names = (f"{field}_{name}" for name in once(map(field_name, words), "_"))
-    of = (np.where(there, np.array([cell == word for cell in cells], dtype=float), np.nan) for word in words)
-    return dict(zip(names, of, strict=True))
+    return {name: np.where(rows != "", rows == word, np.nan) for name, word in zip(names, words, strict=True)}
 
 
 def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:
