@@ -1258,7 +1258,7 @@ def test_a_slower_topic_in_which_alone_a_command_shows_gives_states_and_the_cloc
     states = {"/imu", "/odom"} if both else {"/imu"}
     assert {c.topic for c in proposal.states} == states, proposal.text
     assert f"clock: {'/odom' if both else '/imu'}" in proposal.text
-    assert ("/odom: 50 messages a second, and 100 of /imu" in proposal.text) is not both
+    assert ("/odom: comes at 50 Hz, and /imu at 100 Hz" in proposal.text) is not both
     fitted([path], proposal)
 
 

@@ -424,6 +424,7 @@ def control(entry: str) -> str:
         (X + "topics: {/a: {time: wall}}", "topics: /a: time is 'wall'; write header or log"),
         (X + "topics: {/a: log}", "topics: /a: a mapping is wanted here, not a text"),
         (X + "topics: {/a: {time: log, queue: 1}}", "topics: /a: unknown key 'queue'; known are time"),
+        (X.replace("}", ", steady: 1,5}", 1), "states\\[0\\]: unknown key 5; write decimals with a point"),
         (X + "max_gap: 0", "max_gap is 0.0; it must be a positive number of seconds"),
         (X + "max_skew: -1", "max_skew is -1.0; it must be a positive number of seconds"),
         (X + "min_step: -1", "min_step is -1.0; it must be 0 s or more"),

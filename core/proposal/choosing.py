@@ -396,7 +396,7 @@ def choose(
         source.reason = "the controls do not show in it"
         if source in shown:
             copied = all(any(np.isin(c.finite, o.finite).mean() > 0.9 for o in main.candidates) for c in source.free)
-            slow = f"{source.rate:.3g} messages a second, and {main.rate:.3g} of {main.topic}; see --states"
+            slow = f"comes at {source.rate:.3g} Hz, and {main.topic} at {main.rate:.3g} Hz; see --states"
             source.reason = f"says what {main.topic} says already" if copied else slow
             source.apart = "slower than the states" * (not copied)
         if at_its_rate and is_physical(source.type):  # of the machine all the same: a person may want it

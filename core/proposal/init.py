@@ -494,7 +494,7 @@ def propose(
     sources = read_sources(bags, progress)
     warnings = [warning for bag in bags for warning in bag.warnings]
     # a unit that is taken for granted is written down, so that other recordings are read alike
-    taken = {m[1] for warning in warnings if (m := re.search(r"numbers are taken for (s|d)\b", warning))}
+    taken = {bag.time_unit for bag in bags if isinstance(bag, Table)} - {""}
     layout = TableLayout.from_dict(layout.to_dict() | {"unit": taken.pop()}, "table") if len(taken) == 1 else layout
     warnings += set_aside_labels(sources, bags) if not states else []
     if not (states or controls):  # what a person asks for stays

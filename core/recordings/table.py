@@ -44,7 +44,7 @@ from uncertain_lti.recordings.table_text import (
     units_of,
     without_bad,
 )
-from uncertain_lti.recordings.table_times import NO_TIME, called_time, instants, may_be, spread
+from uncertain_lti.recordings.table_times import NO_TIME, Instants, called_time, instants, may_be, spread
 from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
 from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout
@@ -77,12 +77,13 @@ class Table(Recording):
     letters, digits and underscores replaced; a matrix is an array, and four of a quaternion are one field besides.
     Where columns have their numbers in rows of their own, each group of them is a topic below.
 
-    `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run.
+    `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run. `time_unit`: of the
+    time, where it was taken for granted.
     """
 
     def __init__(self, path: Path, layout: TableLayout | None = None, run: _Run | None = None) -> None:
         layout = layout or TableLayout()
-        file, raw, (time, times, words), rows = run or _one_run(path, layout)
+        file, raw, (time, times, words, self.time_unit), rows = run or _one_run(path, layout)
         self.path, self.parts, self.layout = path, (file,), layout
         self.size = file.stat().st_size
         of_file = [*raw.notes, *([words] if words else [])]
@@ -390,7 +391,7 @@ def _file_and_run(path: Path) -> tuple[Path, str | None]:
     return path.with_name(match["file"]), match["run"]
 
 
-_Run = tuple[Path, RawTable, tuple[str, NDArray[np.int64], str], NDArray[np.intp] | None]
+_Run = tuple[Path, RawTable, Instants, NDArray[np.intp] | None]
 """A file, what it holds, its `instants`, and the rows of one run in it; None for all."""
 
 
@@ -413,12 +414,11 @@ def _every_run(path: Path, layout: TableLayout) -> list[Table]:
     if run is not None or layout.runs is None:
         return [Table(path, layout)]
     raw = _read(file)
-    column, times, words = instants(file, raw, layout)
+    timed = instants(file, raw, layout)
     tables = []
     for name, rows in _runs(file, raw, layout).items():
-        timed = column, times, words
         tables.append(Table(file.with_name(f"{file.name}[{name}]"), layout, (file, raw, timed, rows)))
-        raw.notes, words = [], ""  # once are enough
+        raw.notes, timed = [], timed._replace(words="")  # once are enough
     if not tables:
         raise BagError(f"{file}: column '{layout.runs}' is empty in every row, so it names no run")
     return tables

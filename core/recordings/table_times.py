@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from decimal import Decimal, InvalidOperation
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,19 +83,26 @@ _ODD = 10  # the same of those that are no multiple of 5 s, not since 1970
 _LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
 
-def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, NDArray[np.int64], str]:
-    """Column of the time, instants of the rows, and what was taken for granted.
+class Instants(NamedTuple):
+    """Column of the time, instants of the rows (rows,), ns, `NO_TIME` where one has none; what was taken for granted,
+    in words, and the unit if that is what was."""
 
-    Returns (rows,): ns; `NO_TIME` where a row has none.
-    """
+    column: str
+    times: NDArray[np.int64]
+    words: str = ""
+    unit: str = ""
+
+
+def instants(path: object, table: RawTable, layout: TableLayout) -> Instants:
+    """When the rows of a table are from."""
     if layout.step is not None:
         rows = len(next(iter(table.columns.values()), ()))
-        return "", np.rint(np.arange(rows) * (layout.step * 1e9)).astype(np.int64), ""
+        return Instants("", np.rint(np.arange(rows) * (layout.step * 1e9)).astype(np.int64))
     if layout.time is not None:
         column, words = find_column(path, layout.time, list(table.columns), "the time"), ""
     else:
         column, words = _likely(path, table)
-    said = [words]
+    said, granted = [words], ""
     values = table.columns[column]
     where = f"{path}: column '{column}'"
     if values.ndim != 1:
@@ -131,11 +139,12 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> tuple[str, N
             said.append("its numbers are those of the rows, taken for s: of another rate give `--table step=0.01`")
         if layout.unit is None and (unit != "s" or doubt):
             said.append(f"its numbers are taken for {unit}{doubt}")
+            granted = "" if stated else unit
         if unit == "d" and (since := _first_day(values)):
             table = replace(table, columns={column: values - since}, exact=None)
         times = _of_numbers(where, table, column, UNITS[unit])
     words = " and ".join(filter(None, said))
-    return column, times, f"column '{column}': {words}" if words else ""
+    return Instants(column, times, f"column '{column}': {words}" if words else "", granted)
 
 
 def _says_days(table: RawTable, column: str) -> bool:

@@ -15,7 +15,19 @@ import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from uncertain_lti.base.text import Block, Table, list_of, named, number, numbers_of, plural, share, shortlist, text_of
+from uncertain_lti.base.text import (
+    Block,
+    Table,
+    lasting,
+    list_of,
+    named,
+    number,
+    numbers_of,
+    plural,
+    share,
+    shortlist,
+    text_of,
+)
 from uncertain_lti.identification.diagnosis import HARMLESS, remedies
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.interchange import blocks_table, elements_table
@@ -33,7 +45,8 @@ MOST_SHOWN = 20
 def recording_text(transient: Transient) -> str:
     """One recording: what was read, and what of it is not used."""
     usable, left = int(transient.usable.sum()), ", ".join(unused(transient))
-    text = f"{plural(len(transient), 'sample')} over {passed(transient.t_ns):.4g} s"
+    span = passed(transient.t_ns)
+    text = f"{plural(len(transient), 'sample')} over {f'{span:.4g} s' if span < 1e4 else lasting(span / 3600)}"
     return f"{transient.name}: {text}, {plural(usable, 'usable transition')}{f' ({left})' * bool(left)}"
 
 

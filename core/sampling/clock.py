@@ -220,7 +220,7 @@ def resolve(
         count = sum(len(i) for i in instants[clock])
         remedy = f"record longer, or set `topics: {{{clock}: {{time: log}}}}` if its stamps stand still"
         none = f"{plural(count, 'message')} without a forward step in time, so no transition"
-        raise SignalError(f"{clock}: {none}; {remedy}")
+        raise SignalError(f"{signals.source}: {clock}: {none}; {remedy}")
     max_gap, constant = signals.max_gap, signals.step
     if max_gap is None:
         max_gap = longest_step(instants[clock], min_step_ns, bool(signals.recalled))

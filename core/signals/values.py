@@ -94,9 +94,9 @@ def checked_mapping(data: Any, where: str, known: set[str] | None) -> dict[str, 
         raise SignalError(f"{where}: a mapping is wanted here, not {kind_in_yaml(data)}; see config/signals/")
     for key in data:
         if known is not None and key not in known:
-            raise SignalError(
-                f"{where}: unknown key {reprlib.repr(key)}{meant(key, known)}; known are {', '.join(sorted(known))}"
-            )
+            comma = isinstance(key, int) and data[key] is None  # {steady: 1,5}
+            remedy = "write decimals with a point" if comma else f"known are {', '.join(sorted(known))}"
+            raise SignalError(f"{where}: unknown key {reprlib.repr(key)}{meant(key, known)}; {remedy}")
     return data
 
 
