@@ -15,6 +15,8 @@ OPENBLAS_NUM_THREADS=1 python benchmarks/large.py 100 20 20000
 
 import argparse
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 
 import numpy as np
 from measure import peak_memory, table
@@ -42,24 +44,27 @@ def seconds(function):
     return time.process_time() - cpu, time.perf_counter() - wall, result
 
 
+def measured(size, criterion, name):
+    """A row of the table; the memory is the peak of the process, which is its own."""
+    options = {"additive": "noise", "alarm": "containment"}
+    fit(plant(4, 2, 2000), criterion, **options)  # imports
+    run = plant(*size)
+    z, step = np.hstack([run.x, run.u])[:-1], np.diff(run.x, axis=0)
+    least = min(seconds(lambda: np.linalg.lstsq(z, step, rcond=None))[0] for _ in range(3))
+    cpu, wall, model = seconds(lambda: fit(run, criterion, **options))
+    fitted = f"{least:.3f} s", f"{cpu:.1f} s", f"{wall:.1f} s", f"{cpu / least:.0f}"
+    return [name, *fitted, f"{model.fit_summary['optimality_gap']:.1g}", f"{peak_memory() / 2**20:.0f} MiB"]
+
+
 def main():
     """Print a row for (10) and one for (11)."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("size", type=int, nargs="*", default=[40, 8, 20_000], help="states, controls, transitions")
-    n, m, count = parser.parse_args().size
-    options = {"additive": "noise", "alarm": "containment"}
-    for criterion in ("qp", "lp"):  # imports
-        fit(plant(4, 2, 2000), criterion, **options)
-    run = plant(n, m, count)
-    z, step = np.hstack([run.x, run.u])[:-1], np.diff(run.x, axis=0)
-    least = min(seconds(lambda: np.linalg.lstsq(z, step, rcond=None))[0] for _ in range(3))
-    rows = []
-    for criterion, name in (("qp", "(10)"), ("lp", "(11)")):
-        cpu, wall, model = seconds(lambda criterion=criterion: fit(run, criterion, **options))
-        gap, memory = model.fit_summary["optimality_gap"], peak_memory() / 2**20
-        rows.append([name, f"{cpu:.1f} s", f"{wall:.1f} s", f"{cpu / least:.0f}", f"{gap:.1g}", f"{memory:.0f} MiB"])
-    header = ["criterion", "CPU", "wall", "CPU over lstsq", "gap", "peak memory"]
-    table(f"n = {n}, m = {m}, {count} transitions; lstsq {least:.3f} s", header, rows)
+    size = parser.parse_args().size
+    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as own:
+        rows = list(own.map(measured, [size, size], ["qp", "lp"], ["(10)", "(11)"]))
+    header = ["criterion", "lstsq", "CPU", "wall", "CPU over lstsq", "gap", "peak memory"]
+    table("n = {}, m = {}, {} transitions".format(*size), header, rows)
 
 
 if __name__ == "__main__":

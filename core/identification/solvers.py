@@ -244,26 +244,30 @@ def _by_equations(of: Programme, active: Sense | None) -> _Found:
     return (xi, active) if proven else (None, None)
 
 
-def _inside(of: Programme, accuracy: float) -> Any:
+def _inside(of: Programme, accuracy: float, iterations: int) -> Any:
     import piqp
 
     solver = piqp.DenseSolver()
     solver.settings.eps_abs = accuracy
     solver.settings.eps_rel = accuracy
-    solver.settings.max_iter = 500
+    solver.settings.max_iter = iterations
     solver.setup(of.H, of.f, None, None, of.G, of.h, np.full(len(of.h), np.inf), of.lower, of.upper)
     done = (piqp.PIQP_SOLVED, piqp.PIQP_MAX_ITER_REACHED)
     return solver.result if solver.solve() in done else None
 
 
 def _piqp(of: Programme, _: Sense | None) -> _Found:
-    found = _inside(of, 1e-12)
+    found = _inside(of, 1e-12, 500)
     return (None if found is None else np.array(found.x, dtype=np.float64)), None
+
+
+_USUAL = 40
+"""Steps of an interior point, which takes some 20: from where it stands still another solver goes on as well."""
 
 
 def _active_inside(of: Programme, accuracy: float) -> Sense | None:
     """What an interior point says is active: by the ratio of multiplier and slack, as much as can be independent."""
-    found, size = _inside(_scaled(of)[0], accuracy), len(of.f)
+    found, size = _inside(_scaled(of)[0], accuracy, _USUAL), len(of.f)
     if found is None:
         return None
     multiplier = np.concatenate([found.z_bl, found.z_bu, found.z_l])
