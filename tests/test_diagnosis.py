@@ -240,6 +240,9 @@ def test_state_of_a_slower_topic_is_named_with_its_period(period):
     assert said_of(judged=True) == "take `judged: true` away"  # of a control
     topic = "/a"  # as of a table
     assert said_of() == "list it as a control, or leave it out"
+    slower = put(slice(None), slice(None), lambda x: x[np.arange(len(x)) // period * period])
+    (message,) = [m for m in messages(run(change=slower)) if WORDS["held"] in m]
+    assert message.startswith("each of 'speed' and 'flow' repeats its last value in at least ")
 
 
 @pytest.mark.parametrize(("lag", "noise"), [(1, 1e-2), (7, 1e-4)])

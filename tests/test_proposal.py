@@ -2338,7 +2338,7 @@ def test_a_number_of_the_first_row_alone_is_neither_a_time_nor_a_control(tmp_pat
 
 
 def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
-    """A row number begins again in the next file, cycles on the next day, and a gain has another value there."""
+    """A row number begins again in the next file, cycles on the next day, a gain has another value; energy adds up."""
     files = []
     for run, gain in enumerate((0.1, 0.4, 0.2)):
         level = np.cumsum(np.random.default_rng(run).normal(size=300))
@@ -2346,6 +2346,8 @@ def test_a_counter_and_a_setting_of_each_run_are_no_states(tmp_path):
             "sno": np.arange(1, 301),
             "ki": np.full(300, gain),
             "Cycle": np.arange(300) % 170 // 4,
+            "drawn": 300.0 * run + np.cumsum(np.abs(level)) / np.abs(level).max(),  # goes on in the next file
+            "used_kWh": np.cumsum(np.abs(level)),  # from 0 again
             "Robot_ProtectiveStop": (np.arange(300) > 296) * 1.0,
             "grip_lost": (np.arange(300) % 50 == 40) * 1.0,
             "level": level,

@@ -141,7 +141,7 @@ def describe(
         noisy, late, held = _noise_like(part), _delayed(part, signals, past), _held(part, signals)
         messages += [*alike, *late, *held, *jittering(model, part, names), *_frozen(part, names, transients)]
         lacking = {} if late else _missing(part, signals)
-        lacking = {i: m for i, m in lacking.items() if not any(f"'{names[i]}'" in text for text in held)}
+        lacking = {i: m for i, m in lacking.items() if not any(i in of for of in held.values())}
         messages += lacking.values()
         messages += far or _weak(problem, sums, signals, past, lacking)
         messages += _fed_back(part, names, past, [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)])
@@ -398,21 +398,22 @@ def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> li
     ]
 
 
-def _held(problem: Problem, signals: Sequence[Signal]) -> list[str]:
-    """States that repeat their last value between samples of a slower topic."""
-    messages = []
-    for i, signal in enumerate(signals[: problem.n] if len(successive(problem)) >= 0.5 * problem.N else ()):
-        before, after = problem.z[i], problem.x_next[i]
-        if rows := held_for(before, after):
-            alone = len({other.topic for other in signals}) == 1
-            remedy = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
-            remedy = "take `judged: true` away" if signal.judged else remedy
-            messages.append(
-                f"'{signal.name}' repeats its last value in {np.mean(after == before):.0%} of the steps and is "
-                f"new about every {rows} samples: its topic or its sensor is slower than the clock, and its row "
-                f"is fitted to jumps; {remedy}"
-            )
-    return messages
+def _held(problem: Problem, signals: Sequence[Signal]) -> dict[str, list[int]]:
+    """States that repeat their last value between samples of a slower topic, those of one remedy together."""
+    alone, found = len({signal.topic for signal in signals}) == 1, {}
+    slow = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
+    every = range(problem.n if len(successive(problem)) >= 0.5 * problem.N else 0)
+    for judged, remedy in ((False, slow), (True, "take `judged: true` away")):
+        if of := [i for i in every if signals[i].judged == judged and held_for(problem.z[i], problem.x_next[i])]:
+            rows = sorted({held_for(problem.z[i], problem.x_next[i]) for i in of})
+            share = min(np.mean(problem.z[i] == problem.x_next[i]) for i in of)
+            each, least = ("each of ", "at least ") if len(of) > 1 else ("", "")
+            found[
+                f"{each}{quoted([signals[i].name for i in of])} repeats its last value in {least}{share:.0%} of the "
+                f"steps and is new about every {' to '.join(map(str, sorted({rows[0], rows[-1]})))} samples: its topic "
+                f"or its sensor is slower than the clock, and its row is fitted to jumps; {remedy}"
+            ] = of
+    return found
 
 
 def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transient]) -> list[str]:
@@ -529,7 +530,7 @@ def _noisy(noise: dict[int, float], names: Sequence[str], dt: Array) -> list[str
     """States that are mostly noise, in one message."""
     slow = float(np.median(dt)) * FASTEST >= 1.0
     more = "how it moves needs faster rows" if slow else "leave it out where that says nothing, or record it at work"
-    listed, most = ", ".join(f"'{names[i]}'" for i in noise), max(noise.values(), default=0.0)
+    listed, most = shortlist([f"'{names[i]}'" for i in noise], 12), max(noise.values(), default=0.0)
     return [
         f"{listed} {'moves' if len(noise) == 1 else 'move'} {_NOISE}: signals and controls at one instant predict "
         f"{'at most ' * (len(noise) > 1)}{most:.0%} of the variance at the next; its level is judged, {more}"
@@ -555,9 +556,8 @@ def _unstable(model: UncertainLTI) -> list[str]:
     found = []
     for r, block in enumerate(model.blocks):
         at = f" at {model.block_name(r)}" if model.schedule is not None else ""
-        unstable = [v for v in block.eigenvalues() if v.real > 0]
-        if unstable:
-            found.append(f"eigenvalues {', '.join(map(_complex, unstable))} 1/s{at}")
+        if unstable := [_complex(v) for v in block.eigenvalues() if v.real > 0]:
+            found.append(f"eigenvalues {shortlist(unstable, 4)} 1/s{at}")
         elif block.spectral_radius() > 1.0 + 1e-9:
             found.append(f"spectral radius {block.spectral_radius():.4g} at the recorded step{at}")
     if not found:
