@@ -563,3 +563,16 @@ def test_a_short_name_for_the_output_of_every_command():
     taken = {name: command._option_string_actions for name, command in commands.items()}
     writing = {name for name, options in taken.items() if "--output" in options}
     assert {"init", "fit", "report", "record"} <= writing == {name for name in taken if "-o" in taken[name]}
+
+
+def test_of_many_states_the_table_shows_those_most_often_outside():
+    n = 50
+    still = np.zeros((n, n))
+    model = UncertainLTI(still, np.zeros((n, 1)), still, np.zeros((n, 1)), v=np.full(n, 0.5))
+    x = np.zeros((20, n))
+    x[::2, 44], x[10, 47] = 3.0, 3.0
+    run = Transient(0.1 * np.arange(20), x, np.zeros((20, 1)))
+    lines = check_text(check_data(model, EnvelopeMonitor(model).check(run))).splitlines()
+    head = next(i for i, line in enumerate(lines) if line.split()[:2] == ["state", "violations"])
+    assert [line.split()[0] for line in lines[head + 1 : head + 4]] == ["x45", "x48", "x1"]
+    assert "  and 10 more rows; --json has all" in lines

@@ -531,13 +531,15 @@ def check_blocks(data: Mapping[str, Any]) -> list[Block]:
 
 
 def _tables(data: Mapping[str, Any]) -> Iterator[Table]:
-    rows = []
-    for name, s in data["states"].items():
+    rows, states = [], list(data["states"].items())
+    if len(states) > Table.most:  # those most often outside are shown
+        states.sort(key=lambda state: -state[1]["violations"])
+    for name, s in states:
         counts = [str(s["violations"]), share(s["inside"]), number(s["mean_width"]), share(s["width_to_range"], 2)]
         worst = beyond(s["worst"]["utilisation"]) if s["violations"] else "-"
         when = "-" if s["first_violation"] is None else instant_text(s["first_violation"])
         rows.append([named(name, s["unit"]), *counts, when, worst])
-    yield Table(("state", "violations", "inside", "mean width", "width/range", "first", "worst"), rows, most=200)
+    yield Table(("state", "violations", "inside", "mean width", "width/range", "first", "worst"), rows)
     if data["horizons"]:
         rows = []
         for h in data["horizons"]:
