@@ -242,6 +242,18 @@ def test_the_time_that_a_serial_monitor_writes_before_an_arrow_is_read(names, by
     assert bag.columns_by_field[(names.split() or ["column_3"])[-1]].tolist() == [k + 0.5 for k in range(9)]
 
 
+@pytest.mark.parametrize(("mark", "by"), [(":", ","), (": ", " "), ("=", "\t"), (" = ", "; ")])
+def test_cells_behind_their_names_are_read(mark, by, tmp_path):
+    """As a plotter of serial lines wants them; a line of the start and one cut short are left out."""
+    rows = [by.join([f"t_ms{mark}{20 * k}", f"pos{mark}{k}.5", f"cmd{mark}-{k}e-3"]) for k in range(40)]
+    path = tmp_path / "a.txt"
+    path.write_text("\n".join(["Starting: motor 1.2", *rows, rows[-1][:9]]))
+    bag = open_recording(path)
+    assert np.diff(bag.times).tolist() == 39 * [20_000_000]
+    assert [w.rpartition(": ")[2] for w in bag.warnings][0].startswith("2 lines with another number of cells left out")
+    assert {name: column[3] for name, column in bag.columns_by_field.items()} == {"pos": 3.5, "cmd": -3e-3}
+
+
 def test_a_time_of_day_goes_on_after_midnight(tmp_path):
     """It went back by a day: alarms were dated a day before the first sample."""
     seconds = [(86_397 + k) % 86_400 for k in range(9)]

@@ -50,6 +50,7 @@ _WIDE = {  # by which of a text's first four bytes are not 0
 }  # fmt: skip
 _CUT_TIME = re.compile(r"(\d:\d\d:\d\d),(?=(\d{3}),)")  # as Python's log writes 13:24:48,075
 _NO_TEXT = re.compile(r"[\0-\x08\x0e-\x1a\x1c-\x1f\ufffd]")
+_BEFORE_LABEL = re.compile(r"\s(?=[^\W\d][^\s:=]*\s?[:=])")
 _ARROW = re.compile(r"(\d\d:\d\d:\d\d\.\d{3}) -> (.*)", re.DOTALL)  # as the serial monitor of Arduino writes a line
 QUANTITY = re.compile(r"[-+]?\d[\d.,]*\s*(?P<unit>[^\W\d_]\S{0,7}|[%°]\S{0,7})")
 _BASE = (
@@ -130,7 +131,13 @@ def read_csv(path: Path) -> RawTable:
     mend = _behind_zeros if zeros else _without_arrow if any(map(_ARROW.match, lines)) else None
     mend = partial(_CUT_TIME.sub, r"\1.") if cut_times else mend
     lines = list(map(mend, lines)) if mend else lines
-    shape = replace(_shape(path, lines if len(head) < _LOOK else lines[:-1] or lines), mend=mend)
+    whole_lines = lines if len(head) < _LOOK else lines[:-1] or lines
+    if not mend and (labels := _common_labels(whole_lines)):
+        mend, shape = _without_labels, _Shape(",", 0, labels)
+        lines = list(map(mend, lines))
+    else:
+        shape = _shape(path, whole_lines)
+    shape = replace(shape, mend=mend)
     names, notes = unique(shape.names), [shape.note] * bool(shape.note)
     units = {name: unit for name, unit in zip(names, shape.units, strict=False) if unit}
     first = [_split(line, shape.delimiter) for line in lines[shape.skip :]]
@@ -179,6 +186,29 @@ def _without_arrow(line: str) -> str:
         return line
     delimiter = next((delimiter for delimiter in _DELIMITERS if delimiter in match[2]), " ")
     return f"{match[1] if any(map(_is_value, _split(match[2], delimiter))) else 'time'}{delimiter}{match[2]}"
+
+
+def _labelled(line: str) -> dict[str, str]:
+    """Cells by the labels before them, as in `temp: 21.5, rpm: 900`; nothing where one has none."""
+    line = line.strip(" \t\r\n,;")
+    parts, cells = re.split(r"[,;\t]", line), {}
+    for part in parts if len(parts) > 1 else _BEFORE_LABEL.split(line):
+        label, mark, value = part.partition(":" if ":" in part else "=")
+        if not (mark and label.lstrip()[:1].isalpha()):
+            return {}
+        cells[label.strip()] = value.strip()
+    return cells
+
+
+def _common_labels(lines: Sequence[str]) -> tuple[str, ...]:
+    """The labels of nearly every line, as of what a controller prints; nothing where there are none."""
+    labels = Counter(tuple(_labelled(line)) for line in lines if line.strip())
+    usual, often = max(labels.items(), key=lambda item: item[1], default=((), 0))
+    return usual if len(usual) > 1 and often >= max(3, (1 - ODD_SHARE) * labels.total()) else ()
+
+
+def _without_labels(line: str) -> str:
+    return ",".join(_labelled(line).values()) or line
 
 
 def _texts(path: Path, encoding: str, shape: _Shape, names: Sequence[str], name: str) -> Sequence[str]:
