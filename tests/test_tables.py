@@ -1304,6 +1304,16 @@ def test_rows_of_whole_seconds_come_evenly_and_those_of_units_do_not(tmp_path):
     assert np.unique(units.times).size == 20 and "the 20 rows of a time one for each of 20 units" in units.warnings[0]
 
 
+def test_rows_that_a_logger_wrote_several_times_count_once(tmp_path):
+    """Each message five times, one of its columns at times without a number; said to be rows of five units."""
+    rows = [f"{k // 5 / 4},{k // 5 % 7},{'' if k // 5 % 3 else k // 5},{'ab'[k // 50 % 2]}" for k in range(400)]
+    bag = read_csv(tmp_path, "time,x,y,mode", rows)
+    assert len(bag.times) == 80 and bag.facts()[0].rate == 4 and len(bag.columns_by_field["x"]) == 80
+    assert "320 of 400 rows repeat the row before" in bag.warnings[0] and len(bag.warnings) == 1
+    rows[7] = "0.25,9,1,a"
+    assert len(read_csv(tmp_path, "time,x,y,mode", rows).times) == 400  # of one time there are two values
+
+
 def test_the_time_of_an_office_or_a_tester_is_found_by_its_name(tmp_path):
     bag = read_csv(tmp_path, "Date/Time,x", (f"01 01 2018 00:{k:02},{k}" for k in range(30)))
     assert set(np.diff(bag.times).tolist()) == {60 * 10**9}

@@ -106,7 +106,8 @@ class Table(Recording):
         written = time in raw.columns and raw.columns[time].dtype.kind in "OM"
         kept, of_run = _rows_in_order(every, times, time, written)
         names = [name for name in raw.columns if name not in apart]
-        self.times, notes = _times_of_rows(times[kept], time, {name: raw.columns[name][kept] for name in names})
+        counts, self.times, notes = _times_of_rows(times[kept], time, {n: raw.columns[n][kept] for n in names})
+        kept = kept[counts]
         self._warnings = [f"{file}: {note}" for note in of_file] + [f"{path}: {note}" for note in of_run]
         self._warnings += [f"{file}: {note}" for note in _no_numbers({name: raw.columns[name] for name in names})]
         self._warnings += [f"{path}: {note}" for note in notes]
@@ -324,11 +325,16 @@ def _no_numbers(columns: Mapping[str, Column]) -> list[str]:
 
 def _times_of_rows(
     times: NDArray[np.int64], time: str, columns: Mapping[str, Column]
-) -> tuple[NDArray[np.int64], list[str]]:
-    """Times in which rows of the same time come evenly, if they flow, and what there is to say of such rows."""
-    equal = np.count_nonzero(np.diff(times) == 0)
-    if not equal > 0.1 * len(times):
-        return times, []
+) -> tuple[NDArray[np.bool_], NDArray[np.int64], list[str]]:
+    """Rows that count, their times, evenly where rows of the same time flow, and what there is to say of such rows."""
+    again = np.append(False, np.diff(times) == 0)
+    if not (equal := np.count_nonzero(again)) > 0.1 * len(times):
+        return again | True, times, []
+    late = np.flatnonzero(again)
+    both = ((column[late], column[late - 1]) for column in columns.values())
+    if not any(((a != b) & ((a == a) | (b == b))).any() for a, b in both):  # a missing number repeats one
+        said = "repeat the row before, in its time and in all its columns, and are left out"
+        return ~again, times[~again], [f"{equal} of {len(times)} rows {said}"]
     number, unit = _for_each_time(times, columns)
     if number > 1 and not unit and (np.diff(times) >= 0).all() and _flows(columns.values(), number):
         usual = float(np.median(np.diff(np.unique(times)))) * 1e-9
@@ -338,8 +344,8 @@ def _times_of_rows(
         each += f"say so in the signals file, `table: {{runs: {unit}}}`, or " * bool(unit)
         each += "write a file for each; else "
         even, taken = times, f"only the first of such rows counts: {each * (number > 1)}"
-    same = f"{equal} of {len(times)} rows have the time of a row before in column '{time}'"
-    return even, [f"{same}, and {taken}write times with more decimals, or take another, `--table time=COLUMN`"]
+    same = f"{equal} of {len(times)} rows have the time of a row before in column '{time}', and {taken}"
+    return again | True, even, [f"{same}write times with more decimals, or take another, `--table time=COLUMN`"]
 
 
 def _numbers(columns: Mapping[str, Column]) -> list[Column]:
