@@ -1044,6 +1044,19 @@ def test_signals_one_after_the_other_that_do_not_come_together_are_no_runs(tmp_p
     refuses(BagError, words, propose, [path])
 
 
+def test_the_log_of_a_car_polled_in_turn_has_a_topic_for_each_turn(tmp_path):
+    """Of an app: `PID` names what a row is of, some come together and others not. `SECONDS` of the day were none."""
+    turns = ((0.0, ("Engine RPM",)), (0.3, ("MAF", "Power from MAF")), (0.7, ("Coolant",)))
+    rows = [f'"{46100 + k + late:.6f}";"{name}";"{math.sin(k + i):.5f}";"-";' for k in range(90)
+            for late, names in turns[: 3 - k % 2] for i, name in enumerate(names)]  # fmt: skip
+    bag = read_csv(tmp_path, '"SECONDS";"PID";"VALUE";"UNITS";', rows)
+    assert {topic: info.count for topic, info in bag.topics.items()} == {
+        "/table/Engine": 90, "/table/MAF": 90, "/table/Coolant": 45}  # fmt: skip
+    assert bag.facts()[0].rate == pytest.approx(1) and "'PID' names the signal of each number" in bag.warnings[0]
+    bag = read_csv(tmp_path, "SECONDS,x", (f"{66724.0473 + (k // 3) ** 1.1 * 0.31:.6f},{k}" for k in range(90)))
+    assert np.ptp(bag.times) * 1e-9 == pytest.approx(29**1.1 * 0.31, rel=0.05)  # said: may be s or days
+
+
 def _of_influx(fields, tag=""):
     """A table of each field with what InfluxDB writes above those of one type, a minute of 1 s."""
     for i, (name, cells) in enumerate(fields):

@@ -57,7 +57,8 @@ _INEXACT = 2**53  # above which a float does not keep each integer
 _IN_A_NAME = str.maketrans("[]/", "()-")  # a run is named as a file is
 _NO_RUN = ("", "nan", "None", "NaT")
 _OF_SIGNALS = (
-    r"(tag|var(iable)?|signal|field|point|channel|sensor|item|parameter|series|metric|topic|entity)([\W_]*(name|id))?"
+    r"(tag|pid|var(iable)?|signal|field|point|channel|sensor|item|parameter|series|metric|topic|entity)"
+    r"([\W_]*(name|id))?"
 )
 _NAMES = re.compile(rf"(?i)(.*[\W_])?(name|{_OF_SIGNALS})")
 _VALUES = re.compile(r"(?i)_?((var|tag)?[\W_]*value|val|payload|reading|wert)")
@@ -541,8 +542,9 @@ def _side_by_side(
     columns = {name: np.full(len(stamps), math.nan) for name in rows}
     for name, of in rows.items():
         columns[name][np.searchsorted(stamps, times[of[::-1]])] = values[of[::-1]]  # of one time the first counts
-    together = min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER
-    return (columns, stamps) if together else None
+    if min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER:
+        return columns, stamps
+    return (columns, stamps) if len(by_message(columns, len(stamps))) > 1 else None  # polled in turn
 
 
 _QUATERNION = "quaternion"

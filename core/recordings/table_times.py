@@ -411,7 +411,7 @@ def _unit(name: str, values: Column, stated: str = "") -> str:
     for unit, pattern in _UNIT.items():
         if re.search(rf"[\[(]\s*({pattern})\s*[\])]", low) or re.search(rf"([_\s]|time)({pattern})$", low):
             return unit
-        if unit != "s" and re.fullmatch(rf"({pattern})(_.*)?", low):
+        if (unit != "s" or low.startswith("second")) and re.fullmatch(rf"({pattern})(_.*)?", low):
             return unit
     finite = values[np.isfinite(values)] if values.dtype.kind == "f" else values
     size = float(np.median(np.abs(finite.astype(np.float64)))) if len(finite) else 0.0
