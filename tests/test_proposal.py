@@ -1434,6 +1434,19 @@ def table_of(path, columns, time=None, fmt="%.18e"):
     return path
 
 
+def test_the_way_travelled_is_no_signal_and_the_way_to_a_wall_is(tmp_path):
+    """It stands while the vehicle does: it was a state of a diving robot, that each further dive left."""
+    rng, rows, speed, way = np.random.default_rng(2), [], 0.0, 0.0
+    for k, drive in enumerate(np.repeat(rng.integers(0, 3, 30), 20).tolist()):
+        rows.append([k, speed, drive, way, 40 - 9 * math.sin(way / 20)])
+        speed += 0.3 * (drive - speed) + 0.01 * rng.normal() * (drive > 0)
+        way += max(speed - 0.5, 0.0)
+    path = csv(tmp_path / "dive.csv", ["time", "speed", "thrust", "flightDistance", "distance_to_wall"], rows)
+    proposal = propose([path])
+    assert "/table flightDistance: grows as a clock or a counter does" in proposal.text, proposal.text
+    assert "distance_to_wall: grows" not in proposal.text
+
+
 def test_what_counts_the_hours_of_running_is_no_signal(tmp_path):
     """It was taken for a set point that the others follow; degrees that rise one by one are no such count."""
     rng = np.random.default_rng(0)

@@ -85,7 +85,7 @@ _RUN = re.compile(
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
-_CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
+_CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles", "distance"}  # parts of a stamp, or the way
 _CLOCK |= {"hours", "runtime", "betriebsstunden", "horas", "second", "minute", "hour"}  # of running, of a day
 _CLOCK |= {"wh", "kwh", "mwh", "mah", "totalizer", "totaliser", "consumed", "cumulative"}  # what adds up
 _COMPUTER = re.compile(
