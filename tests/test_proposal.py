@@ -1434,6 +1434,17 @@ def table_of(path, columns, time=None, fmt="%.18e"):
     return path
 
 
+def test_how_well_something_is_received_is_no_control_where_it_hardly_moves(tmp_path):
+    """Of two values, or always the same in a plant, it was one, and another number of satellites unlike the fit."""
+    rng, heat = np.random.default_rng(4), np.repeat([0, 30, 60, 20, 50, 10] * 5, 20)
+    columns = {"oven": answers(rng, heat[:, None] / 30)[:, 0], "heater": heat, "hdop": 0.7 + 0.1 * (heat > 40)}
+    columns |= {"satellite_count": np.full(600, 10), "numsats": 27 - (heat > 20)}
+    for step in (0.1, 60):  # a robot, a plant
+        proposal = propose([table_of(tmp_path / "a.csv", columns, step * np.arange(600))])
+        assert signals_of(proposal)[1] == [("/table", "heater")], proposal.text
+        assert "/table hdop, satellite_count, numsats: of a computer or a receiver" in proposal.text
+
+
 def test_the_way_travelled_is_no_signal_and_the_way_to_a_wall_is(tmp_path):
     """It stands while the vehicle does: it was a state of a diving robot, that each further dive left."""
     rng, rows, speed, way = np.random.default_rng(2), [], 0.0, 0.0

@@ -89,7 +89,7 @@ _CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles", "distance"
 _CLOCK |= {"hours", "runtime", "betriebsstunden", "horas", "second", "minute", "hour"}  # of running, of a day
 _CLOCK |= {"wh", "kwh", "mwh", "mah", "totalizer", "totaliser", "consumed", "cumulative"}  # what adds up
 _COMPUTER = re.compile(
-    r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum|rssi|lqi|[hvptg]dop|nsats?|satellites?|accuracy)(_|$)|^dt$"
+    r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum|rssi|lqi|[hvptg]dop|n(um)?_?sats?|satellites?|accuracy)(_|$)|^dt$"
 )  # what it took for a cycle, how busy it is, how well something is received
 _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # likewise, of whole numbers
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
@@ -314,6 +314,9 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if len(finite) < 0.5 * len(values) or in_a_row < 0.1 * len(values):  # of a column that is written more rarely
         what = f"rows only, so {_FILL}" if source.type == TABLE else "messages only"
         return f"a number in {len(finite)} of {len(values)} {what}"
+    name = "_".join(words_of(candidate.path))
+    if _COMPUTER.search(name) and (np.diff(finite) <= 0).any():  # else a clock
+        return "of a computer or a receiver, by its name, and no signal of the machine"
     if finite.min() == finite.max():
         return f"{ALWAYS}{finite[0] + 0.0:.6g}"
     if source.type != TABLE and np.ptp(finite) < DUST:
@@ -329,7 +332,6 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         return "the same all through each recording: a setting, and no measurement"
     if source.role == "state" and len(counts) < 3:
         return TWO_VALUES
-    name = "_".join(words_of(candidate.path))
     if source.type == TABLE and _PLACE.search(name):
         return "a place on the map, and another run may be elsewhere"
     wheel = of_wheel(candidate)
@@ -343,8 +345,6 @@ def _unfit(candidate: Candidate, source: Source) -> str:
         clock = adds or all(map(_counts, candidate.values, source.arrival, repeat(wheel)))
     if clock:
         return "grows as a clock or a counter does"
-    if _COMPUTER.search(name):
-        return "of a computer or a receiver, by its name, and no signal of the machine"
     return "holds numbers beyond 1e15" if np.abs(finite).max() > 1e15 else ""
 
 
