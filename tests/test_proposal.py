@@ -2105,7 +2105,7 @@ def test_a_column_in_degrees_that_jumps_by_a_turn_is_unwrapped(tmp_path):
     """The fit asked for it; a power that is switched by as much is none."""
     rng = np.random.default_rng(3)
     on = np.repeat(rng.choice([0.0, 350.0], size=60), 25)
-    for name in ("shaft_position_deg", "Orient_x"):
+    for name in ("shaft_position_deg", "Orient_x", "Pitch"):  # of a sensor of a diving robot, from 0 to 360
         columns = {name: np.cumsum(0.02 * on) % 360, "heater_power": on + rng.normal(size=1500)}
         proposal = propose([table_of(tmp_path / "a.csv", columns)])
         assert {c.path for c in proposal.states} == {f"unwrap({name}, 360)", "heater_power"}, proposal.text

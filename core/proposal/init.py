@@ -408,7 +408,7 @@ def _drop_computed(sources: Sequence[Source]) -> None:
             candidate.reason = f"follows from {shortlist(of, 3)} of the same row"
 
 
-_ANGLE = re.compile(r"angle|orient|euler|yaw|heading|roll|theta|phi|psi|azimuth|course|hdg|_(deg(ree)?|rad(ian)?)s?$")
+_ANGLE = re.compile(r"angle|orient|euler|yaw|heading|roll|pitch|theta|phi|psi|azim|cours|hdg|_(deg(ree)?|rad(ian)?)s?$")
 
 
 def _wrapped(source: Source) -> None:
