@@ -1525,6 +1525,9 @@ def test_numbers_of_rows_are_no_seconds(tmp_path):
     rows = [f"{k},{k / 10:.1f},{k % 7}" for k in range(60)]
     assert set(np.diff(read_csv(tmp_path, "step,elapsed,x", rows).times).tolist()) == {10**8}
     refuses(BagError, "no column is called time", read_csv, tmp_path, "step,x,y", rows)
+    kept = [row for k, row in enumerate(rows) if k % 20 < 17]  # those of a data frame with a gap here and there
+    refuses(BagError, "no column is called time", read_csv, tmp_path, ",x,y", kept)
+    assert "taken for the time" in read_csv(tmp_path, ",x,y", [f"{2 * k},{k % 7},0" for k in range(60)]).warnings[0]
     assert "taken for the time" in read_csv(tmp_path, "k,x", (f"{2 * k},{k % 7}" for k in range(60))).warnings[0]
 
 
