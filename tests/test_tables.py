@@ -1531,6 +1531,13 @@ def test_numbers_of_rows_are_no_seconds(tmp_path):
     assert "taken for the time" in read_csv(tmp_path, "k,x", (f"{2 * k},{k % 7}" for k in range(60))).warnings[0]
 
 
+def test_of_two_times_in_words_both_are_named(tmp_path):
+    """Of cycles of a heating: of the first it said that it is not read as a time."""
+    rows = (f"{k},2011-11-30 07:{k:02}:00,2011-11-30 07:{k:02}:30,{k % 7}" for k in range(60))
+    words = "columns 'StartTime' and 'EndTime' hold times, and no column alone is called time.*`--table time=COLUMN`"
+    refuses(BagError, words, read_csv, tmp_path, "id,StartTime,EndTime,kWh", rows)
+
+
 @pytest.mark.filterwarnings("error")
 def test_a_table_of_one_row_says_nothing_but_its_sentence(tmp_path):
     refuses(BagError, "there is no time zone", read_csv, tmp_path, "time,x", ["2026-11-22T06:28:01+99:99,1"])

@@ -542,9 +542,8 @@ def _side_by_side(
     columns = {name: np.full(len(stamps), math.nan) for name in rows}
     for name, of in rows.items():
         columns[name][np.searchsorted(stamps, times[of[::-1]])] = values[of[::-1]]  # of one time the first counts
-    if min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER:
-        return columns, stamps
-    return (columns, stamps) if len(by_message(columns, len(stamps))) > 1 else None  # polled in turn
+    together = min(np.isfinite(column).mean() for column in columns.values()) >= _TOGETHER
+    return (columns, stamps) if together or len(by_message(columns, len(stamps))) > 1 else None  # polled in turn
 
 
 _QUATERNION = "quaternion"

@@ -192,8 +192,9 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     none = f"column {lasting[0]!r} says how long something has lasted, and no other" if lasting else none
     same = [float(table.columns[name][0]) for name in still if table.columns[name].dtype.kind in "iuf"]
     step = next((f"{value:g}" for value in same if 0 < value <= _LONGEST_STEP), "0.01")
+    none = f"columns {dated[0]!r} and {dated[1]!r} hold times, and no column alone" if len(dated) > 1 else none
     texts = [n for n in names if re.search("time|date|zeit|stamp", n.lower()) and table.columns[n].dtype.kind == "O"]
-    if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell), ""):
+    if cell := next((str(cell) for n in texts[:1] for cell in table.columns[n] if cell and not dated), ""):
         none = f"column {texts[0]!r} holds '{cell[:40]}', which is not read as a time, and no column"
     none = "; ".join([*table.notes, none])
     raise BagError(
