@@ -78,8 +78,7 @@ class Table(Recording):
     letters, digits and underscores replaced; a matrix is an array, and four of a quaternion are one field besides.
     Where columns have their numbers in rows of their own, each group of them is a topic below.
 
-    `path`: file; with `[run]` behind it, one run in it; `layout`: which columns are time and run. `time_unit`: of the
-    time, where it was taken for granted.
+    `path`: file; or one run in it, `FILE[run]`; `layout`: which columns are time and run; `time_unit`: if guessed.
     """
 
     def __init__(self, path: Path, layout: TableLayout | None = None, run: _Run | None = None) -> None:

@@ -84,8 +84,7 @@ _LARGE = 10**15  # ns, above which a float of seconds does not keep each
 
 
 class Instants(NamedTuple):
-    """Column of the time, instants of the rows (rows,), ns, `NO_TIME` where one has none; what was taken for granted,
-    in words, and the unit if that is what was."""
+    """Column of the time, instants (rows,), ns or `NO_TIME`, and what was taken for granted, in words and as a unit."""
 
     column: str
     times: NDArray[np.int64]
