@@ -120,6 +120,30 @@ def test_controls_that_nearly_move_together_are_named_with_the_cure():
     assert "record 'a' moving while 'b' and 'c' rest;" in f"{message};", message
 
 
+def test_signals_tied_in_several_ways_are_named_with_all_that_tie_them():
+    """Of wheels and odometry 'left' and 'right' were said to move together, of a mecanum base 'fr' and 'vx'."""
+    rng = np.random.default_rng(0)
+    for names, turns in (
+        ("left right vx wz", [[1, 1], [-0.3, 0.3]]),
+        ("fl fr rl rr vx vy wz", [[1, 1, 1, 1], [-1, 1, 1, -1], [-0.5, 0.5, -0.5, 0.5]]),
+    ):
+        u = np.repeat(rng.normal(size=(60, len(turns))), 50, axis=0)
+        base = np.zeros_like(u)
+        for k in range(len(u) - 1):
+            base[k + 1] = (
+                base[k] + 0.05 * (u[k] / np.arange(1, len(turns) + 1) - base[k]) + 0.002 * rng.normal(size=len(turns))
+            )
+        x = np.hstack([10 * base @ np.array(turns), base + 0.0005 * rng.normal(size=base.shape)])
+        found = messages(Transient(0.02 * np.arange(len(x)), x, u, state_names=names.split()))
+        named = [
+            re.findall(r"'(\w+)'", m.partition(" nearly")[0]) for m in found if WORDS["collinear"] in m and "'" in m
+        ]
+        assert named, found
+        for some in named:
+            X = x[:, [names.split().index(name) for name in some]]
+            assert np.linalg.eigvalsh(np.corrcoef(X.T))[0] < 1e-3, (some, found)
+
+
 def test_signals_of_which_the_level_is_most_are_not_said_to_move_together():
     """With the recorded values as they are, temperatures and a set point that is always 40 were."""
     one = run(noise=0.0)

@@ -91,23 +91,23 @@ def _rank(problem: Fleet | Problem, sums: Moments, names: Sequence[str], rows: R
         )
     free = np.flatnonzero(~dead)
     limit = 1e-12 * len(free)
-    for columns, value, vector in _directions(sums, np.flatnonzero(~dead & ~still), rows):
+    for columns, value, vector, _ in _axes(sums, np.flatnonzero(~dead & ~still), rows):
         if value <= limit:
             part = [names[columns[j]] for j in np.flatnonzero(np.abs(vector) > 0.05)]
             messages.append(
                 f"rank deficient: {quoted(part)} move together in every transition, so their columns cannot be told "
                 f"apart and share the effect; record them moving independently, or leave one out"
             )
-    return sum(value > limit for _, value, _ in _directions(sums, free)), list(dict.fromkeys(messages))
+    return sum(value > limit for _, value, *_ in _axes(sums, free)), list(dict.fromkeys(messages))
 
 
-def _directions(sums: Moments, of: NDArray[np.intp], rows: Rows = EVERY) -> Iterator[tuple[list[int], float, Array]]:
-    """Eigenvalues and eigenvectors of the correlation of some regressors, of those that come together in a row each."""
+def _axes(sums: Moments, of: NDArray[np.intp], rows: Rows = EVERY) -> Iterator[tuple[list[int], float, Array, Array]]:
+    """Eigenvalues, eigenvectors and correlation of some regressors, of those that come together in a row each."""
     for row in rows:
         own = of[(of >= len(row)) | row[np.minimum(of, len(row) - 1)]]
         unit = 1.0 / sums.phi_scale[own]
-        values, vectors = np.linalg.eigh(sums.centre[np.ix_(own, own)] * np.outer(unit, unit) / sums.count)
-        yield from zip(repeat(own.tolist()), values.tolist(), vectors.T, strict=False)
+        values, vectors = np.linalg.eigh(C := sums.centre[np.ix_(own, own)] * np.outer(unit, unit) / sums.count)
+        yield from zip(repeat(own.tolist()), values.tolist(), vectors.T, repeat(C), strict=False)
 
 
 def describe(
@@ -214,10 +214,15 @@ def _collinear(
     away = np.maximum(sums.low, -sums.high) > sums.high - sums.low  # a level, which says nothing on how it moves
     free = np.flatnonzero((sums.phi_scale[: problem.p] > 0) & ~away & ~np.isin(range(problem.p), list(past)))
     found: dict[str, str] = {}  # several combinations may be of the same signals
-    for columns, value, vector in sorted(_directions(sums, free, rows), key=itemgetter(1)):
-        part = [columns[j] for j in np.flatnonzero(np.abs(vector) > 0.3 * np.abs(vector).max())]
-        if not 1e-12 * problem.p < value < COLLINEAR or len(part) < 2:
+    for columns, value, vector, C in sorted(_axes(sums, free, rows), key=itemgetter(1)):
+        most, count = np.argsort(-np.abs(vector)), np.count_nonzero(np.abs(vector) > 0.3 * np.abs(vector).max())
+        if not 1e-12 * problem.p < value < COLLINEAR or count < 2:
             continue
+        for size in range(count, len(most) + 1):  # of two combinations mixed, fewer columns do not move together
+            part = sorted(columns[j] for j in most[:size])
+            least = max(value, np.linalg.eigvalsh(C[np.ix_(most[:size], most[:size])])[0])
+            if least < COLLINEAR or len(found) > MOST_GROUPS:
+                break
         states, controls = [names[j] for j in part if j < problem.n], [names[j] for j in part if j >= problem.n]
         if not states:
             still = "rests" if len(controls) == 2 else "rest"
@@ -225,9 +230,9 @@ def _collinear(
         elif controls:
             cure = f"record steps of {quoted(controls)} that are sharper than {quoted(states)} can follow"
         else:
-            cure = "excite them by other controls or from other initial states; the bounds hold as they are"
+            cure = "excite them by other controls or initial states, unless the machine ties them; the bounds hold"
         those = quoted([names[j] for j in part])
-        why = f"(all but {value**0.5:.2%} of their size), so their columns are poorly told apart and their elements may"
+        why = f"(all but {least**0.5:.2%} of their size), so their columns are poorly told apart and their elements may"
         found.setdefault(those, f"{those} nearly move together {why} trade places: {cure}")
     messages = [*found.values()]
     if (groups := len(messages)) > MOST_GROUPS:
