@@ -2046,6 +2046,24 @@ def test_a_table_faster_than_a_plant_has_its_labels_set_aside_and_its_switches_a
     refuses(BagError, "/table: not in every recording.*; give recordings of one machine", propose, [path, bag])
 
 
+@pytest.mark.parametrize("of_speed", [False, True])
+def test_a_set_point_is_a_control_where_the_command_beside_it_is_of_something_else(tmp_path, of_speed):
+    """Of a spindle and its coolant the set point of the speed was left out, as there was a command: of the pump."""
+    rng, speed, flow, ref, target, rows = np.random.default_rng(5), 0.0, 0.0, 0.0, 0.0, []
+    for k in range(3000):
+        target = rng.uniform(0, 8000) if k % 100 == 0 else target
+        ref += float(np.clip(target - ref, -60, 60))
+        pump, drive = k // 170 % 2, 0.02 * (ref - speed)
+        rows.append([0.02 * k, speed, round(ref), flow, pump, drive + 0.1 * rng.normal()][: 5 + of_speed])
+        speed += drive + 3 * rng.normal()
+        flow += 0.1 * (pump - flow) + 0.01 * rng.normal()
+    names = ["time", "spindle_rpm", "spindle_setpoint_rpm", "flow", "coolant_cmd", "spindle_cmd"][: 5 + of_speed]
+    proposal = propose([csv(tmp_path / "a.csv", names, rows)])
+    assert [c.path for c in proposal.states] == ["spindle_rpm", "flow"], proposal.text
+    of_spindle = "spindle_cmd" if of_speed else "spindle_setpoint_rpm"
+    assert {c.path for c in proposal.controls} == {"coolant_cmd", of_spindle}, proposal.text
+
+
 def test_columns_that_one_table_lacks_are_left_out_and_tables_of_two_topics_refused(tmp_path):
     rows = {name: [] for name in ("both", "first", "second", "command")}
     for k in range(200):

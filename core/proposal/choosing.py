@@ -290,7 +290,7 @@ def _within_loops(
     """Controls and states, where the loop that follows a reference is part of the machine.
 
     What an actuator has reached (`throttle_position`) is measured, where a reference or a command shows in it. A
-    reference is a control where it shows most there, or clearly in what no command does, and in no command.
+    reference is a control where it shows most there, or clearly in what commands hardly move, and in no command.
     """
     every = [c for s in controls for c in s.free]
     named = [c for c in every if _REACHED.search(c.path if c.source.type == TABLE else c.topic)]
@@ -303,9 +303,12 @@ def _within_loops(
     used = [c for s in controls for c in s.free]
     unmoved = [s for s in states if references and not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
     moved = {c: max(STEERS, most_shown([c], sent)) for c in reached}
+    columns = [c for s in states if references and s.type == TABLE for c in s.free]
+    barely = {c: STEERS * max(1.0, most_shown([c], used)) for c in columns}
     inner = [r for r in references if any(most_shown([c], r.free) > by for c, by in moved.items())]
     outer = [r for r in references if r not in inner and any(_shown(s, r) > SHOWS for s in controls)]
     inner += [r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved)]
+    inner += [r for r in references if r not in outer and any(most_shown([c], r.free) > by for c, by in barely.items())]
     return [*controls, *dict.fromkeys(inner)], states
 
 
