@@ -955,6 +955,17 @@ def test_what_is_read_alike_in_many_columns_is_noted_once(tmp_path):
     assert bag.warnings == [f"{bag.path}: columns 'a', 'c': decimal commas read as points"]
 
 
+def test_cells_that_are_no_number_part_no_note_of_columns_that_are_read_alike(tmp_path):
+    """Of three files of a plant with a few cells such as `Bad` were 22 notes, of which each had other columns."""
+    rows = [[f"{k}", f"{k},5", f"{k},25", f"{k}"] for k in range(40)]
+    rows[3][1], rows[5][1], rows[7][3] = "Bad", "No Data", "Bad"
+    bag = read_csv(tmp_path, "t;a;b;c", map(";".join, rows))
+    assert bag.warnings == [
+        f"{bag.path}: columns 'a', 'b': decimal commas read as points",
+        f"{bag.path}: columns 'a', 'c': 3 cells that are no number (such as 'Bad') left out",
+    ]
+
+
 def test_noon_and_midnight_of_twelve_hours(tmp_path):
     hours = ["12:00 AM", "1:30 am", "12:00 PM", "1:30 pm", "11:59 p.m."]
     bag = read_csv(tmp_path, "time,x", (f"{hour},{k}" for k, hour in enumerate(hours)))

@@ -278,7 +278,7 @@ def _read_cells(path: Path, encoding: str, shape: _Shape, names: Sequence[str]) 
 def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[str], delimiter: str) -> RawTable:
     """Columns of cells by what all of them tell, and what was done; those of numbers as they are."""
     found: dict[str, Column] = {}
-    noted: dict[str, list[str]] = {}
+    noted, odd = dict[str, list[str]](), dict[str, list[str]]()
     texts = [cells for cells, whole in zip(columns, wholes, strict=True) if "," in whole]
     point = ""  # what parts decimals, if a cell tells
     for cell in (cell.strip() for cells in texts for cell in cells if "," in cell):
@@ -298,22 +298,24 @@ def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[s
             with suppress(ValueError):
                 found[name] = np.where(cells == "", "nan", cells).astype(np.float64)
                 continue
-        found[name], note = _column(cells.tolist(), point, delimiter)
-        if note:
+        found[name], done, left = _column(cells.tolist(), point, delimiter)
+        for note in done:
             noted.setdefault(note, []).append(name)
+        odd |= {name: left} if left else {}
+    if every := sum(odd.values(), list[str]()):
+        noted[left_out(len(every), "number", every[0])] = [*odd]
     words = ((note, shortlist([repr(name) for name in of], 6), "s" * (len(of) > 1)) for note, of in noted.items())
     return RawTable(found, [f"column{several} {of}: {note}" for note, of, several in words])
 
 
-def _column(cells: list[str], point: str, delimiter: str) -> tuple[Column, str]:
-    """Numbers where most cells are some, else text; and what was done; `point`: what parts decimals in the file."""
+def _column(cells: list[str], point: str, delimiter: str) -> tuple[Column, list[str], list[str]]:
+    """Numbers where most cells are some, else text; what was done; cells left out. `point`: what parts decimals."""
     plain = [cell.strip().replace("\u2212", "-") for cell in cells]  # the minus of some languages
     numbers = np.full(len(plain), np.nan)
     if by := _thousands(plain, point):
         plain = [cell.replace(by, "") if (m := _GROUPED.match(cell)) and m["by"] == by else cell for cell in plain]
     decimal = point == "," or not (point or delimiter == ",")  # in quotes between commas they may part thousands
-    comma = missing = odd = truths = 0
-    first = ""
+    comma, missing, truths, odd = 0, 0, 0, list[str]()
     for i, cell in enumerate(plain):
         low = cell.lower()
         if low in _MISSING:
@@ -326,20 +328,19 @@ def _column(cells: list[str], point: str, delimiter: str) -> tuple[Column, str]:
         elif low in _TRUTH:
             numbers[i] = _TRUTH[low]
             truths += 1
-        elif not first and _INSTANT.match(cell):
-            return np.array(plain, dtype=object), ""
+        elif not odd and _INSTANT.match(cell):
+            return np.array(plain, dtype=object), [], []
         else:
-            odd += 1
-            first = first or cell
-    if odd > (ODD_SHARE if truths else 0.5) * (len(plain) - missing):
-        unit = match["unit"] if (match := QUANTITY.fullmatch(first)) else ""
+            odd.append(cell)
+    if len(odd) > (ODD_SHARE if truths else 0.5) * (len(plain) - missing):
+        unit = match["unit"] if (match := QUANTITY.fullmatch(odd[0])) else ""
         written = (QUANTITY.fullmatch(cell) for cell in plain if cell.lower() not in _MISSING)
         if not unit or len({*plain}) < 2 or not all(match and match["unit"] == unit for match in written):
-            return np.array(plain, dtype=object), ""
-        numbers, note = _column([cell.removesuffix(unit) for cell in plain], point, delimiter)
-        return numbers, " and ".join(filter(None, [note, f"'{unit}' taken off each number"]))
+            return np.array(plain, dtype=object), [], []
+        numbers, done, odd = _column([cell.removesuffix(unit) for cell in plain], point, delimiter)
+        return numbers, [*done, f"'{unit}' taken off each number"], odd
     read = [f"'{by}' between thousands taken out"] * bool(by) + ["decimal commas read as points"] * bool(comma)
-    return numbers, " and ".join([left_out(odd, "number", first)] * bool(odd) + read)
+    return numbers, [" and ".join(read)] * bool(read), odd
 
 
 def _has_comma(cell: str) -> bool:
