@@ -874,14 +874,14 @@ def test_a_day_has_the_zone_behind_it(tmp_path, form):
 def test_rows_of_one_day_or_of_even_steps_tell_day_and_month_apart(tmp_path):
     bag = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02},{k}" for k in range(90)))
     assert set(np.diff(bag.times).tolist()) == {10**9}
-    assert "column 'Time': '09/04/2021 11:00:00' is taken for day, month, year" in " ".join(bag.warnings)
+    assert "column 'Time': its dates are taken for day, month, year" in " ".join(bag.warnings)
     with warnings.catch_warnings(action="error"):  # numpy knows no zones
         zoned = read_csv(tmp_path, "Time,x", (f"09/04/2021 11:{k // 60:02}:{k % 60:02} +01:00,{k}" for k in range(90)))
     assert (bag.times - zoned.times == 3600 * 10**9).all() and len(zoned.warnings) == len(bag.warnings)
     for order, first, second in (("day, month", "09/10/16", "10/10/16"), ("month, day", "10/09/16", "10/10/16")):
         bag = read_csv(tmp_path, "Time,x", (f"{first if k < 24 else second} {k % 24:02},{k}" for k in range(48)))
         assert set(np.diff(bag.times).tolist()) == {3600 * 10**9}
-        assert f"is taken for {order}, year" in " ".join(bag.warnings)
+        assert f"its dates are taken for {order}, year" in " ".join(bag.warnings)
 
 
 WRITTEN = (  # over noon; %I %p as English has it
@@ -964,6 +964,17 @@ def test_cells_that_are_no_number_part_no_note_of_columns_that_are_read_alike(tm
         f"{bag.path}: columns 'a', 'b': decimal commas read as points",
         f"{bag.path}: columns 'a', 'c': 3 cells that are no number (such as 'Bad') left out",
     ]
+
+
+def test_of_many_files_whose_days_may_be_months_one_note_says_how_they_are_read(tmp_path, capsys):
+    for day in range(1, 5):
+        rows = "".join(
+            f"0{day}/04/2021 11:{k // 60:02}:{k % 60:02},{math.sin(k / 9):.4f},{k // 20 % 2}\n" for k in range(90)
+        )
+        (tmp_path / f"{day}.csv").write_text(f"Time,x,valve\n{rows}")
+    files = [str(tmp_path / f"{day}.csv") for day in range(1, 5)]
+    assert main(["init", *files, "--output", str(tmp_path / "s.yaml")]) == 0
+    assert capsys.readouterr().err.count("taken for day, month, year") == 1
 
 
 def test_noon_and_midnight_of_twelve_hours(tmp_path):

@@ -501,7 +501,7 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
     if texts and all(map(_PLAIN.fullmatch, texts)):
         return _parsed(where, texts), ""
     times = np.full(len(cells), NO_TIME, dtype=np.int64)
-    spelt, order = _as_iso(where, [*map(_spelt, texts)], cells)
+    spelt, order = _as_iso(where, [*map(_spelt, texts)])
     plain: dict[int, str] = {}  # by row
     shifts: list[int] = []
     odd: list[int] = []
@@ -556,7 +556,7 @@ def _of_iso(where: str, day: str, clock: str | None, zone: str | None) -> tuple[
     return text, (hours * 60 + minutes) * 60 * 10**9 * (-1 if zone[0] == "-" else 1) - late
 
 
-def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[Sequence[str], str]:
+def _as_iso(where: str, cells: Sequence[str]) -> tuple[Sequence[str], str]:
     """Days such as 13/01/14 as ISO writes them, if one order of day and month alone has every day, or goes forward.
 
     Of two that do, the one by which the steps are even; where all rows are of one day, either gives the same steps.
@@ -582,8 +582,7 @@ def _as_iso(where: str, cells: Sequence[str], given: Sequence[object]) -> tuple[
     if len({tuple(texts) for texts in orders.values()}) == 2:
         even = [order for order, texts in orders.items() if _is_even(texts)]
         taken = even if len(even) == 1 else taken * (len({m.group(1, 2, 3) for m in found}) == 1)
-        first = next(str(cell).strip() for cell in given if str(cell).strip())
-        note = f"'{first[:40]}' is taken for {(taken or even or [''])[0]}"
+        note = f"its dates are taken for {(taken or even or [''])[0]}"
     if not taken:
         which = f"'{found[0][0][:40]}' and the others do not say which is day and which is month"
         raise BagError(f"{where}: {which}; write times such as 2026-11-22T06:28:01.25Z")
