@@ -1059,6 +1059,12 @@ def test_a_table_of_many_columns_takes_seconds(tmp_path):
     assert "temp_4: moves with temp_3" in text and "head: says what temp_8 says already" in text
 
 
+def test_what_follows_what_of_many_long_columns_takes_seconds():
+    X = np.cumsum(np.random.default_rng(3).normal(size=(20_000, 150)), axis=0)
+    with bounded(seconds=20):  # least squares over all rows for each column took more
+        functions(X)
+
+
 def test_motors_that_follow_one_command_alike_are_all_states(tmp_path):
     """Of four wheels one was proposed, and nothing saw the other three fail."""
     rng = np.random.default_rng(3)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,17 +133,19 @@ def functions(X: Array, Y: Array | None = None) -> NDArray[np.bool_]:
     Y = X if Y is None else Y
     found = np.zeros((X.shape[1], Y.shape[1]), dtype=bool)
     known, moving = (np.flatnonzero(np.ptp(Z[1:-1], axis=0) > 0) for Z in (X, Y))
-    values = Y[:, moving]
-    for i, (now, after) in product(known.tolist(), ((0, 0), (1, 0), (0, 1))):
-        a, b = X[now : len(X) - after, i], values[after : len(X) - now]
-        a = (a - a.mean()) / a.std()
-        basis = np.column_stack([np.ones_like(a), a, a**2, a**3])
-        rest = b - basis @ np.linalg.lstsq(basis, b, rcond=None)[0]
-        share = rest.std(axis=0) / b.std(axis=0)
-        for k in np.flatnonzero(share < FOLLOWS).tolist():
-            still = np.diff(b[:, k]).std() < 0.7 * b[:, k].std()
-            white = rest[:, k].std() == 0 or np.corrcoef(rest[1:, k], rest[:-1, k])[0, 1] < WHITE
-            found[i, moving[k]] |= share[k] < 0.02 or (still and white)  # white around what it follows
+    for now, after in ((0, 0), (1, 0), (0, 1)):
+        b = Y[:, moving][after : len(X) - now]
+        b = b - b.mean(axis=0)
+        size, step = (b**2).sum(axis=0), np.diff(b, axis=0).std(axis=0)
+        for i in known.tolist():
+            a = X[now : len(X) - after, i]
+            Q, R = np.linalg.qr(np.vander((a - a.mean()) / a.std(), 4))
+            told = R @ np.linalg.lstsq(R, Q.T @ b, rcond=None)[0]
+            share = np.sqrt(np.maximum(1.0 - (told**2).sum(axis=0) / size, 0.0))
+            for k in np.flatnonzero(share < FOLLOWS).tolist():
+                rest, still = b[:, k] - Q @ told[:, k], step[k] < 0.7 * b[:, k].std()
+                white = rest.std() == 0 or np.corrcoef(rest[1:], rest[:-1])[0, 1] < WHITE
+                found[i, moving[k]] |= share[k] < 0.02 or (still and white)  # white around what it follows
     return found
 
 
