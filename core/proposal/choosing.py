@@ -303,12 +303,12 @@ def _within_loops(
     used = [c for s in controls for c in s.free]
     unmoved = [s for s in states if references and not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
     moved = {c: max(STEERS, most_shown([c], sent)) for c in reached}
-    columns = [c for s in states if references and s.type == TABLE for c in s.free]
-    barely = {c: STEERS * max(1.0, most_shown([c], used)) for c in columns}
+    own = [c for s in states if s.type == TABLE for c in s.free]  # columns, each for itself
     inner = [r for r in references if any(most_shown([c], r.free) > by for c, by in moved.items())]
     outer = [r for r in references if r not in inner and any(_shown(s, r) > SHOWS for s in controls)]
     inner += [r for r in references if r not in outer and any(explained(s, [r]) > STEERS for s in unmoved)]
-    inner += [r for r in references if r not in outer and any(most_shown([c], r.free) > by for c, by in barely.items())]
+    for r in (r for r in references if r not in [*outer, *inner]):
+        inner += [r] * any((F := most_shown([c], r.free)) > STEERS and F > STEERS * most_shown([c], used) for c in own)
     return [*controls, *dict.fromkeys(inner)], states
 
 
