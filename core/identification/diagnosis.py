@@ -201,8 +201,7 @@ def _beyond_knots(model: UncertainLTI, problem: Problem) -> list[str]:
             messages.append(
                 f"{axis.signal} goes from {low:.5g} to {high:.5g}{f' {signal.unit}' if signal.unit else ''} in the "
                 f"recordings, and {beyond.mean():.2%} of the transitions are beyond its knots, {at[0]:.5g} to "
-                f"{at[-1]:.5g}: every verdict there counts as one on an unknown regime; give end knots that enclose "
-                f"what was recorded"
+                f"{at[-1]:.5g}: every verdict there is on an unknown regime; give end knots that enclose them all"
             )
     return messages
 
@@ -290,9 +289,8 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], lat
             found[j] = explained
     least = min(found.values(), default=0.0)
     return [
-        f"the changes of {_controls(found, names)} follow from the states to {least:.0%}: a feedback sets it, "
-        f"so the nominal matrices may mix it with the plant (the bounds hold for the same feedback only); "
-        f"record it with steps of its own"
+        f"the changes of {_controls(found, names)} follow from the states to {least:.0%}: a feedback sets it, so the "
+        f"nominal matrices may mix it with the plant (the bounds hold for it alone); record it with steps of its own"
     ] * bool(found)
 
 
@@ -300,17 +298,14 @@ def _coded(problem: Problem, sums: Moments, signals: Sequence[Signal]) -> list[s
     """Signals in which a number means "no value"."""
     messages = []
     for j, signal in enumerate(signals):
-        if too_small(float(sums.low[j]), float(sums.high[j])):
-            continue
         z, steady, scale = problem.z[j], float(signal.steady), float(signal.scale)
-        if not (found := codes(z)):
+        if too_small(float(sums.low[j]), float(sums.high[j])) or not (found := codes(z)):
             continue
         others = z[~np.isin(z, list(found))] * scale + steady
         messages += [
             f"'{signal.name}' is exactly {code * scale + steady:.9g} in {count} of {problem.N} transitions and "
-            f"{others.min():.4g} to {others.max():.4g} in the others: {_CODE}, or a sensor at its limit, "
-            f"and the envelope is fitted to the jumps there and back; if it stands for none, write "
-            f"`ignore: [{code * scale + steady:.12g}]` in the entry of '{signal.name}'"
+            f"{others.min():.4g} to {others.max():.4g} in the others: {_CODE}, or a limit of the sensor, and bounds "
+            f"are fitted to the jumps; if it stands for none, add `ignore: [{code * scale + steady:.12g}]` to its entry"
             for code, count in found.items()
         ]
     return messages

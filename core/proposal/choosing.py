@@ -461,8 +461,6 @@ def _tells_more(source: Source, faster: Sequence[Source], used: Sequence[Candida
         return False
     own = steps.X[:, n:][:, predicted(steps.X, steps.U, (steps.X + steps.dX)[:, n:]) >= NOISE]
     for j in range(n):
-        if not own.size:
-            break
         own = own[:, ~functions(steps.X[:, [j]], own)[0]]
     return own.size > 0
 
@@ -547,8 +545,7 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
     """
     order = [int(i) for i in np.argsort(-driven, kind="stable")]
     families = [candidate.family for candidate in pool]
-    kept: list[int] = []
-    full: set[int] = set()
+    kept, full = list[int](), set[int]()
 
     def take(strongest: int) -> None:
         family = [j for j in order if families[j] == families[strongest] and j not in kept]
