@@ -581,7 +581,7 @@ def _wide(sums: Moments, mean_width: Array, names: Sequence[str], pure: bool) ->
     near_rest = "; without an additive term noise near rest alone does it (--additive noise)" * pure
     messages = [
         f"the bounds are over {WIDE:.0%} as wide as the state's own range for {listed}, so few faults can show there: "
-        f"what moves it is not among the controls, one step is long for it, or the noise is as large{near_rest}"
+        f"its cause is no control, or acts within a step (`at: arrival`), a step is long, or noise as large{near_rest}"
     ] * bool(wide)
     if still := [name for name, moved in zip(names[n:], span[n:].tolist(), strict=True) if not moved]:
         messages.append(f"{quoted(still)} {CONSTANT}, so what a move would do is unknown")
