@@ -85,9 +85,9 @@ _RUN = re.compile(
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
-_CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles", "distance"}  # parts of a stamp, or the way
+_CLOCK |= {"usec", "nsec", "nanosec", "odometer", "mileage", "miles"}  # parts of a stamp, or what counts the way
 _CLOCK |= {"hours", "runtime", "betriebsstunden", "horas", "second", "minute", "hour"}  # of running, of a day
-_CLOCK |= {"wh", "kwh", "mwh", "mah", "totalizer", "totaliser", "consumed", "cumulative"}  # what adds up
+_ADDED = {"distance", "wh", "kwh", "mwh", "mah", "totalizer", "totaliser", "consumed", "cumulative"}
 _COMPUTER = re.compile(
     r"(^|_)(elapsed|latency|cpu\d*|crc\d*|checksum|rssi|lqi|[hvptg]dop|n(um)?_?sats?|satellites?|accuracy)(_|$)|^dt$"
 )  # what it took for a cycle, how busy it is, how well something is received
@@ -339,9 +339,10 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
         steps = np.concatenate([np.diff(v) for v in apart])
         clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
-    if not clock and source.role != "control":  # counts, or adds up from one recording to the next
-        rises = np.diff(finite)
-        adds = len(apart) > 1 and not wheel and bool((rises >= 0).all() and np.mean(rises > 0) > 0.5)
+    if not clock and source.role != "control":  # counts, or adds up, by its name or from one recording to the next
+        named = not _ADDED.isdisjoint(words_of(candidate.path))
+        rises = np.concatenate([np.diff(v) for v in apart]) if named else np.diff(finite)
+        adds = not wheel and bool((rises >= 0).all()) and (named or (len(apart) > 1 and bool(np.mean(rises > 0) > 0.5)))
         clock = adds or all(map(_counts, candidate.values, source.arrival, repeat(wheel)))
     if clock:
         return "grows as a clock or a counter does"
