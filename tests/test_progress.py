@@ -12,6 +12,7 @@
 import io
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -22,9 +23,11 @@ import pytest
 from engine_bag import SIGNALS, engine_bag
 from processes import on_a_terminal
 
+from uncertain_lti import Transient
 from uncertain_lti.base.files import whole_file
 from uncertain_lti.base.progress import CountedStep, Progress
 from uncertain_lti.cli.main import main
+from uncertain_lti.identification import fit, working_set
 from uncertain_lti.identification.archive import write_cache
 
 CLI = [sys.executable, "-m", "uncertain_lti.cli.main"]
@@ -144,6 +147,19 @@ def test_a_log_gets_a_line_now_and_then_with_the_time_left(monkeypatch):
             now += 0.002
             assert number < 5000
     assert log.getvalue().splitlines()[3:] == ["reading: 1024 of 5000 messages, about 8 s left"]
+
+
+def test_what_is_said_of_a_pass_begins_with_how_far_the_rows_are(monkeypatch):
+    """A log shows one line now and then, and hardly ever that of a row alone."""
+    monkeypatch.setattr(working_set, "_HELD_BYTES", 1)
+    rng, said = np.random.default_rng(0), list[str]()
+    x = np.cumsum(rng.uniform(-1, 1, size=(20_002, 4)), axis=0) * 1e-3
+    run = Transient(0.1 * np.arange(len(x)), x, rng.normal(size=(len(x), 1)))
+    fit([run], "qp", additive="noise", describe_data=False, progress=said.append)
+    begins = next(number for number, text in enumerate(said) if text.startswith("row 3 of 4, "))
+    assert said[:begins] and all(text.startswith("pass ") for text in said[:begins])
+    others = said[begins + 1 :]
+    assert others and all(re.match(r"row 3 of 4, about \d+ s left; pass \d", text) for text in others)
 
 
 def test_a_log_gets_a_line_of_many_short_parts(monkeypatch):

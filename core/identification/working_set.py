@@ -117,6 +117,7 @@ class WorkingSet:
         self.keeps = False  # working sets of rows that are done, which choosing what to discard looks into
         self._together = False  # (10) with full weights: the rows meet in the objective
         self._like: Row | None = None  # the row that held samples last
+        self._told = ""  # how far the rows are, before what is said of a pass
 
     def solve(self, criterion: str) -> Solution:
         """Solve (10), or (11)."""
@@ -398,10 +399,11 @@ class WorkingSet:
         began, done = perf_counter(), 0
         for rows in self._groups(self.rows):
             if done:
-                self._say_left(began, done, len(self.rows))
+                self._told = f"{self._say_left(began, done, len(self.rows))}; "
             self._start(rows)
             self._settle_and_prove(settle, rows)
             done += len(rows)
+        self._told = ""
 
     def _start(self, rows: list[Row]) -> None:
         """Begin with the first samples and those furthest from least squares, or those next to bounds that are near."""
@@ -432,10 +434,11 @@ class WorkingSet:
                 said = perf_counter()
                 self._say_left(began, number, len(rows))
 
-    def _say_left(self, began: float, done: int, total: int) -> None:
+    def _say_left(self, began: float, done: int, total: int) -> str:
         left = (perf_counter() - began) / done * (total - done)
         text = f"row {done + 1} of {total}, about {left:.0f} s left"
         self.progress(CountedStep(text, done + 1, total))
+        return text
 
     @property
     def _in_groups(self) -> bool:
@@ -485,7 +488,8 @@ class WorkingSet:
                 left += int((row.slack() < -row.tolerance).sum())
                 if row.widen_pool():
                     todo.append(row)
-            self.progress(f"pass {self.passes}: {plural(left, 'sample')} outside, working set {self._sizes()}")
+            said = f"pass {self.passes}: {plural(left, 'sample')} outside, working set {self._sizes()}"
+            self.progress(f"{self._told}{said}")  # of which a log shows one now and then
             if not todo:
                 return
             self._each(todo, settle)
