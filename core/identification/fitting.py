@@ -31,8 +31,8 @@ from uncertain_lti.identification.diagnosis import describe, of_sums
 from uncertain_lti.identification.discard import carriers, choose_discards
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.memory import Recording, elements_of, remembered
-from uncertain_lti.identification.optimum import better_run, fit_horizons, optimum
-from uncertain_lti.identification.passes import Judged
+from uncertain_lti.identification.optimum import Optimum, better_run, fit_horizons, optimum
+from uncertain_lti.identification.passes import Judged, Moments
 from uncertain_lti.identification.problem import Problem, Regimes, check_criterion
 from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, signals_of
 from uncertain_lti.identification.row import InfeasibleError
@@ -96,14 +96,7 @@ def fit(
         additive = signals.additive or "none"
     scheduled = scheduled_by(schedule, signals, lambda: assemble(transients, operating_point, None, additive))
     structure = structure or structure_of(signals, scheduled)
-    if structure is not None:
-        n, m = len(signals.states), len(signals.controls)
-        if (structure.n, structure.m) != (n, m):
-            raise FitError(
-                f"structure is for {plural(structure.n, 'state')} and {plural(structure.m, 'control')}, not {n} and {m}"
-            )
-        if method == "cvxpy":
-            raise FitError("method cvxpy takes no structure; use the working-set method")
+    _refuse_unlike(structure, signals, method)
     problem = assemble(
         transients,
         operating_point,
@@ -152,12 +145,11 @@ def fit(
         remember=partial(_memory, problem, transients, fleet) if keeps else None,
         where=where,
     )
+    weighted = weights is not None or transient_weights is not None
     facts = {
         **model.fit_summary,
         "additive": additive,
-        "weights": "ones"
-        if weights is None and transient_weights is None
-        else {1: "per state", 2: "per sample", 3: "full"}[problem.weights.ndim],
+        "weights": {1: "per state", 2: "per sample", 3: "full"}[problem.weights.ndim] if weighted else "ones",
         "count": count,
         "transients": len(transients),
         "segments": sum(t.segments for t in transients),
@@ -195,6 +187,16 @@ def _refuse_wrong(criterion: str, method: str, horizons: Sequence[Any], operatin
     for given, kind in ((operating_point, OperatingPoint), (structure, Structure)):
         if given is not None:
             refuse_other(given, kind, kind.__name__, f"give one, as {kind.__name__}(...) makes it", FitError)
+
+
+def _refuse_unlike(structure: Structure | None, signals: SignalMap, method: str) -> None:
+    n, m = len(signals.states), len(signals.controls)
+    if structure is not None and (structure.n, structure.m) != (n, m):
+        raise FitError(
+            f"structure is for {plural(structure.n, 'state')} and {plural(structure.m, 'control')}, not {n} and {m}"
+        )
+    if structure is not None and method == "cvxpy":
+        raise FitError("method cvxpy takes no structure; use the working-set method")
 
 
 def _point_of(signals: SignalMap, given: OperatingPoint | None) -> OperatingPoint:
@@ -260,22 +262,9 @@ def fit_fleet(
         return_memory()
     with np.errstate(over="ignore", invalid="ignore"):  # of what is refused next
         engine = WorkingSet(fleet, structure, progress, None if near is None else elements_of(near, fleet.columns))
-    sums = engine.sums
-    n, low, high = fleet.n, sums.low, sums.high
-    largest_values = np.maximum(-low, high)
-    for signal, largest in zip(signals.signals, largest_values.tolist(), strict=False):
-        if 0.0 < largest < 1.0 / LARGEST:
-            raise FitError(
-                f"'{signal.name}' never exceeds {largest:.3g} over its scale, less than the arithmetic can carry "
-                f"({1.0 / LARGEST:g}); give it a smaller scale or another unit, or leave it out"
-            )
-    regimes, measure = fleet.columns.regimes, fleet.occupancy(low, high)
-    anywhere = None
-    if structure is not None and regimes is None:
-        measure = measure and measure.among(structure.together)
-        unused = ~np.logical_or.reduce(structure.rows)
-        anywhere = unused.tolist() if unused.any() else None
-    domain = Domain(low[:n], high[:n], low[n:], high[n:], measure, anywhere=anywhere)
+    sums, regimes = engine.sums, fleet.columns.regimes
+    _refuse_tiny(signals, np.maximum(-sums.low, sums.high))
+    domain = _domain(fleet, sums, structure)
     scheduled: dict[str, Any] = {}
     if regimes is not None:
         each = enumerate(zip(sums.visits.tolist(), engine.tied, strict=True))
@@ -300,24 +289,8 @@ def fit_fleet(
     del engine  # with the samples that its rows hold
     if large:
         return_memory()
-    model, judged, solution = found.envelope, found.judged, found.solution
-    facts: dict[str, Any] = {
-        "criterion": criterion,
-        **found.reached(),
-        "transitions": sums.count,
-        **found.widths(model.operating_point.X),
-        "spectral_radius": model.spectral_radius() if dt_median is not None else None,
-        "solver": {
-            "method": method,
-            "names": sorted(solution.solvers),
-            "rounds": solution.rounds,
-            "passes": solution.passes,
-            "working_set": solution.working,
-        },
-        "versions": versions(solution.solvers),
-    }
-    if regimes is not None:
-        facts["blocks"] = _block_facts(model, sums.visits, judged)
+    model, judged = found.envelope, found.judged
+    facts = _facts(found, method, sums)
 
     def said() -> tuple[int, list[str]] | None:
         if not describe_data:
@@ -349,6 +322,47 @@ def fit_fleet(
     if large:
         return_memory()
     return model.replace(fit_summary=facts, residuals=residuals, memory=kept)
+
+
+def _facts(found: Optimum[UncertainLTI], method: str, sums: Moments) -> dict[str, Any]:
+    model, solution = found.envelope, found.solution
+    facts: dict[str, Any] = {
+        "criterion": found.criterion,
+        **found.reached(),
+        "transitions": sums.count,
+        **found.widths(model.operating_point.X),
+        "spectral_radius": None if model.sampling.dt_median is None else model.spectral_radius(),
+        "solver": {
+            "method": method,
+            "names": sorted(solution.solvers),
+            "rounds": solution.rounds,
+            "passes": solution.passes,
+            "working_set": solution.working,
+        },
+        "versions": versions(solution.solvers),
+    }
+    if model.schedule is not None:
+        facts["blocks"] = _block_facts(model, sums.visits, found.judged)
+    return facts
+
+
+def _refuse_tiny(signals: SignalMap, largest_values: Array) -> None:
+    for signal, largest in zip(signals.signals, largest_values.tolist(), strict=False):
+        if 0.0 < largest < 1.0 / LARGEST:
+            raise FitError(
+                f"'{signal.name}' never exceeds {largest:.3g} over its scale, less than the arithmetic can carry "
+                f"({1.0 / LARGEST:g}); give it a smaller scale or another unit, or leave it out"
+            )
+
+
+def _domain(fleet: Fleet, sums: Moments, structure: Structure | None) -> Domain:
+    n, low, high = fleet.n, sums.low, sums.high
+    measure, anywhere = fleet.occupancy(low, high), None
+    if structure is not None and fleet.columns.regimes is None:
+        measure = measure and measure.among(structure.together)
+        unused = ~np.logical_or.reduce(structure.rows)
+        anywhere = unused.tolist() if unused.any() else None
+    return Domain(low[:n], high[:n], low[n:], high[n:], measure, anywhere=anywhere)
 
 
 def structure_of(signals: SignalMap, schedule: Schedule | None) -> Structure | None:
