@@ -162,7 +162,7 @@ def test_a_required_monitor_ends_if_its_model_is_wrong_and_a_prefix_is_a_name(wo
         assert ended.wait() == 2
         assert "not configured" in ended.output and "Traceback" not in ended.output
         assert "as soon as" not in ended.output, "which it will not be there for"
-    odd.says("parameter topic_prefix is '/robot 1'")
+    odd.says("parameter topic_prefix: '/robot 1' is no topic name; write letters, digits, _ and /, as in /robot1")
 
 
 def test_the_files_for_operation_name_what_there_is() -> None:

@@ -499,11 +499,14 @@ def test_a_model_that_cannot_be_is_refused_by_name_and_the_one_at_work_goes_on(b
     timeless = json.loads(text)
     del timeless["sampling"]["time"][CONTROL]
     (tmp_path / "timeless.json").write_text(json.dumps(timeless))
+    (tmp_path / "nameless.json").write_text(text.replace(CONTROL, "/engine//control"))
     nowhere = f"there is no such model file in {Path.cwd()}; give the whole path"
     for wrong, why in (
         (tmp_path / "newer.json", "uncertain-lti/9"),
         (tmp_path / "timeless.json", f"sampling.time says nothing of {CONTROL}; write header or log"),
+        (tmp_path / "nameless.json", "'/engine//control' is no topic name; write letters, digits, _ and /"),
         (tmp_path / "nowhere.json", "there is no such model file"),
+        ("~no-such-user/hand.model.json", nowhere),
         ("hand.model.json", nowhere),
         ("x" * 5000, nowhere),
         (tmp_path / "pipe", "this is a pipe or a device"),
@@ -517,8 +520,9 @@ def test_a_model_that_cannot_be_is_refused_by_name_and_the_one_at_work_goes_on(b
         success, reason = trigger(on.world, "reload")
         assert not success and str(on.path) in reason, reason
         on.plant.send(1, off=2.0)
-    assert on.flagged(14, since=1) == [0, *[1.0] * 12]
+    assert on.flagged(16, since=1) == [0, *[1.0] * 14]
     status = on.world.status()
+    assert status["unexpected_errors"] == 0
     assert (status["model"], status["state"]) == (str(on.path), "active")
     on.process.signal(signal.SIGTERM)
     assert on.process.wait(20.0) == 0
@@ -553,6 +557,8 @@ def test_the_alarm_rule_can_be_set_and_is_checked(bench: StartBench) -> None:
     accepted, reason = on.world.set(violations=4, window=3)
     assert not accepted and "violations is 4 of window 3" in reason
     assert not on.world.set(margin=-1.0)[0]
+    accepted, reason = on.world.set(enable="/machine//mode data == 3")
+    assert not accepted and "parameter enable: '/machine//mode' is no topic name" in reason
     accepted, reason = on.world.set(heartbeat=2.0)
     assert not accepted and "read-only" in reason
     assert on.world.set(violations=2, window=3, margin=2.0) == (True, "")

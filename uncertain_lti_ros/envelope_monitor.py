@@ -33,12 +33,10 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
-from uncertain_lti.monitor.alarm import Condition
 from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.outputs import VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
 from uncertain_lti.signals.field_path import full_name
-from uncertain_lti.signals.signal_map import below
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
@@ -94,7 +92,6 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.reason = ""
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self.inputs: dict[str, MatchedSubscription] = {}
-        self._prefix = ""
         self._enable_problem, self._twin = "", False
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
@@ -151,24 +148,22 @@ class EnvelopeMonitorNode(LifecycleNode):
         """Prepare what the new values require, or refuse them; `_on_have_set` puts it in place."""
         given = {p.name: p.value for p in parameters}
         changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
-        candidate: Session | Rule | None = None
         self._candidate = None
         try:
             self.settings.check_snapshots(given.get("snapshot.on_alarm", False))
             if "model" in changes:
-                candidate = self._make_session(changes["model"], self.settings.rule(changes))
-            elif changes and self.session is not None:
-                candidate = self.settings.rule(changes)
-                self.session.check(candidate)
-            elif "enable" in changes:
-                Condition.parse(changes["enable"])
+                self._candidate = self._make_session(changes["model"], self.settings.rule(changes))
+            elif changes:
+                rule = self.settings.rule(changes)
+                if self.session is not None:
+                    self.session.check(rule)
+                self._candidate = rule
         except UncertainLTIError as error:
             self.get_logger().warning(f"parameters refused: {error}")
             return SetParametersResult(successful=False, reason=str(error))
         except Exception as error:  # a file can be wrong in unexpected ways
             self.note_failure("while parameters were set", error)
             return SetParametersResult(successful=False, reason=f"unexpected: {error!r}")
-        self._candidate = candidate
         return SetParametersResult(successful=True)
 
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
@@ -254,7 +249,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         path, fixed = self.settings["model"], True
         try:
             self.settings.requested_qos()
-            self._prefix = self.settings.topic_prefix()
+            self.settings.topic_prefix()
             fixed = False
             self.intake.session = session = self._make_session(path, self.settings.rule({}))
             fixed = True
@@ -285,7 +280,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._look_at_clock()
         self.subscribe()
         self._event_log.begin(self.session, time.monotonic())
-        resolved = {topic: self.resolve_topic_name(self._there(topic)) for topic in self.session.types}
+        resolved = {topic: self.resolve_topic_name(self.settings.there(topic)) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
         self.get_logger().info(f"active: listening to {', '.join(topics)}")
         self.intake.active = True
@@ -350,11 +345,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         requested = self.settings.requested_qos()
         for topic in [topic for topic in types if topic not in (*self.inputs, *former)]:
             take = partial(self.intake.message, topic)
-            self.inputs[topic] = MatchedSubscription(self, self._there(topic), types[topic], take, requested)
-
-    def _there(self, topic: str) -> str:
-        """Where a topic of the model, or of the enable condition, is heard; before remapping."""
-        return below(self._prefix, topic)
+            self.inputs[topic] = MatchedSubscription(self, self.settings.there(topic), types[topic], take, requested)
 
     def _unsubscribe(self) -> None:
         self.intake.waiting(all_of_them=True)
@@ -423,7 +414,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             return
         topic = session.enable_topic
         publishers_tell = not (session.rule.enable_type or topic in session.model.signals.topics)
-        found = [info.topic_type for info in self.get_publishers_info_by_topic(self._there(topic))]
+        found = [info.topic_type for info in self.get_publishers_info_by_topic(self.settings.there(topic))]
         if not found:
             if session.heard(topic) is None:
                 self._enable_problem = f"nobody publishes {topic}, which parameter enable names"

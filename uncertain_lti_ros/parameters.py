@@ -20,19 +20,18 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from rclpy.exceptions import InvalidTopicNameException
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
-from rclpy.validate_topic_name import validate_topic_name
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.uncertain_lti import UncertainLTI
-from uncertain_lti.monitor.alarm import Arming
+from uncertain_lti.monitor.alarm import Arming, Condition
 from uncertain_lti.monitor.catch_up import WINDOW
 from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.field_path import FieldPath
-from uncertain_lti_ros.process import Declared
+from uncertain_lti.signals.signal_map import below
+from uncertain_lti_ros.process import Declared, resolved_name
 from uncertain_lti_ros.topics import DEPTH, DURABILITY, RELIABILITY, RequestedQos, live_fields, message_class, sendable
 
 _RESTARTS = "Changing it restarts the alarm, unless it is latched."
@@ -172,7 +171,16 @@ class Settings(dict[str, Any]):
 
     def rule(self, changes: dict[str, Any]) -> Rule:
         """The alarm rule that the parameters define."""
-        return Rule(**{name: changes.get(name, self[name]) for name in RULE})
+        rule = Rule(**{name: changes.get(name, self[name]) for name in RULE})
+        if condition := Condition.parse(rule.enable):
+            self.there(condition.topic, "parameter enable: ")
+        return rule
+
+    def there(self, topic: str, of: str = "") -> str:
+        """Where a topic of the model, or of the enable condition, is heard, before remapping; refuses what is none."""
+        name = below(self.topic_prefix(), topic)
+        resolved_name(self._node, name, of=of)
+        return name
 
     def requested_qos(self) -> RequestedQos:
         """The quality of service that the parameters request."""
@@ -187,13 +195,8 @@ class Settings(dict[str, Any]):
     def topic_prefix(self) -> str:
         """What is put before every topic of the model."""
         prefix: str = self["topic_prefix"].rstrip("/")
-        try:
-            if prefix:
-                validate_topic_name(prefix)
-        except InvalidTopicNameException:
-            raise ModelError(
-                f"parameter topic_prefix is {prefix!r}; names consist of letters, digits, _ and /, as in /robot1"
-            ) from None
+        if prefix:
+            resolved_name(self._node, prefix, example="/robot1", of="parameter topic_prefix: ")
         return prefix
 
     def check_snapshots(self, on_alarm: bool) -> None:
@@ -226,11 +229,13 @@ def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | Non
     """Load a model file, and start a session with it."""
     if not path:
         raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
-    file = Path(path).expanduser()  # no shell does that behind :=
+    file = Path(os.path.expanduser(path))  # no shell does that behind :=
     if not (file.is_absolute() or os.path.exists(file)):
         raise ModelError(f"{path}: there is no such model file in {Path.cwd()}; give the whole path")
     model = _load(file)
     types = topic_types(model, path, _type_fields)
+    for topic in types:
+        settings.there(topic, f"{path}: ")
     for names in (model.state_names, model.control_names):
         sendable(names)
 

@@ -38,8 +38,7 @@ from uncertain_lti.cli.command import DONE, Result, complain
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
 from uncertain_lti.signals.field_path import TypeFields
-from uncertain_lti_ros.process import Life, living, seconds, speed
-from uncertain_lti_ros.recorder import resolved_name
+from uncertain_lti_ros.process import Life, living, resolved_name, seconds, speed
 from uncertain_lti_ros.topics import CLOCK, live_fields, message_class
 
 _DEPTH = 1000

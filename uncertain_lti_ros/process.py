@@ -124,6 +124,15 @@ def whole_to_real(given: Parameter, default: object) -> Parameter:
     return given
 
 
+def resolved_name(node: Node, name: str, kind: str = "topic", example: str = "/joint_states", of: str = "") -> str:
+    """The name in full; raises ArgumentError where it is none."""
+    try:
+        return node.resolve_topic_name(name)
+    except (RuntimeError, ValueError):  # RuntimeError: what rcl raises, under names that rclpy does not export
+        why = f"{of}{name!r} is no {kind} name; write letters, digits, _ and /, as in {example}"
+        raise ArgumentError(why) from None
+
+
 def run_node(
     name: str, summary: str, parameters: Sequence[Declared], run: Callable[[list[str]], int], args: Sequence[str] | None
 ) -> int:

@@ -35,7 +35,7 @@ from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.catch_up import LATE, STALL, CatchUp, arrival_of
 from uncertain_lti.monitor.snapshot import BACK_NS
 from uncertain_lti.recordings.mcap_writer import McapWriter
-from uncertain_lti_ros.process import ArgumentError, Life, living, seconds
+from uncertain_lti_ros.process import ArgumentError, Life, living, resolved_name, seconds
 from uncertain_lti_ros.topics import CLOCK, POLL, MatchedSubscription, SimulatedTime, definition
 
 _FLUSH = 2.0  # s; what is older is on the disk, whatever happens to the process
@@ -98,14 +98,6 @@ def run(args: argparse.Namespace) -> Result:
     args.say(f"{output}: {counted} over {file.span:.1f} s{on_the_way}")
     counts = {"messages": file.count, "topics": file.counts, "span_s": file.span, "lost": lost, "late": taken.late}
     return Result(data={"bag": str(output), **counts})
-
-
-def resolved_name(node: Node, name: str, kind: str = "topic", example: str = "/joint_states") -> str:
-    """The name in full; raises ArgumentError where it is none."""
-    try:
-        return node.resolve_topic_name(name)
-    except (RuntimeError, ValueError):  # RuntimeError: what rcl raises, under names that rclpy does not export
-        raise ArgumentError(f"{name!r} is no {kind} name; write letters, digits, _ and /, as in {example}") from None
 
 
 def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable[[str], None]) -> dict[str, str]:

@@ -40,8 +40,7 @@ from uncertain_lti.cli.command import Result
 from uncertain_lti.monitor.outputs import NODE
 from uncertain_lti.monitor.snapshot import BACK_NS
 from uncertain_lti.reports.pages import Plotted, interactive_page, packed_data, plotted_live
-from uncertain_lti_ros.process import living, seconds
-from uncertain_lti_ros.recorder import resolved_name
+from uncertain_lti_ros.process import living, resolved_name, seconds
 from uncertain_lti_ros.topics import stamp_ns
 
 _EVERY = 1000  # ms between two looks of the page
