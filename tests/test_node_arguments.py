@@ -169,6 +169,14 @@ def test_a_process_ends_with_the_sentence_too(tmp_path: Path, node: str) -> None
     assert f"parameter {name} is " in refusal(process(tmp_path, code, "--ros-args", "-p", f"{name}:=[a]"), node)
 
 
+def test_a_node_whose_streams_are_closed_starts_and_ends_as_others_do(tmp_path: Path) -> None:
+    """As where a daemon has closed them: the executor asks for stderr. Without a model there is status 2."""
+    inner = "import sys; from uncertain_lti_ros.nodes import envelope_monitor; sys.exit(envelope_monitor())"
+    ros = ["--ros-args", "-p", "required:=true"]
+    code = f"import os, sys; os.closerange(1, 3); os.execv(sys.executable, [sys.executable, '-c', {inner!r}, *{ros}])"
+    assert process(tmp_path, code).returncode == 2
+
+
 def test_where_no_log_can_be_written_another_folder_is_asked_for(start: Start) -> None:
     """As in a container that is read only, or where HOME is not set."""
     assert refusal(start(ROS_LOG_DIR="/dev/null/log")).endswith("; set ROS_LOG_DIR to a folder that can be written")

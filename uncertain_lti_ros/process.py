@@ -370,6 +370,10 @@ def living(make_node: Any, args: list[str] | None = None) -> Iterator[Life]:
     domain = os.environ.get("ROS_DOMAIN_ID", "")
     if domain.isdecimal() and int(domain) > _LAST_DOMAIN:  # Fast DDS would end the process with status 1
         raise ArgumentError(f"ROS_DOMAIN_ID is {domain}; choose one from 0 to {_LAST_DOMAIN}, whose ports exist")
+    while (lent := os.open(os.devnull, os.O_RDWR)) <= 2:  # closed streams, whose place no file of rclpy may take
+        pass
+    os.close(lent)
+    sys.stderr = sys.stderr or open(2, "w", closefd=False)  # the events executor asks for it
     args = list(args or [])
     stop: list[int] = []
     node: Node | None = None
