@@ -518,6 +518,12 @@ def test_a_snapshot_holds_what_was_in_force_and_a_flapping_alarm_takes_one(bench
     time.sleep(1.2)
     plant.send(3, off=2.0)
     until(lambda: len(list(folder.glob("*.mcap"))) == 2, "another after a while without")
+    assert trigger(on.world, "reload")[0]
+    plant.send(5)
+    on.flags.count(320 + 8 * 4 + 8)
+    assert trigger(on.world, "snapshot")[0]
+    *_, found = until(lambda: len(files := sorted(folder.glob("*.mcap"))) == 3 and files, "one of the model read again")
+    assert [v.judged for v in offline(on.path, found)] == [False, *[True] * 4], "the control of before counts on"
 
 
 def test_a_model_that_is_swapped_costs_no_snapshot_of_an_alarm(bench: StartBench, tmp_path: Path) -> None:

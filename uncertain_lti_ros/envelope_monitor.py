@@ -199,7 +199,8 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None and self.active:
             self.intake.waiting(all_of_them=True)
             session.go_on_from(self.session)
-        self.snapshots.clear(self.session)
+        taken_over = {topic for topic in session.types if topic == session.enable_topic or session.sampler.kept(topic)}
+        self.snapshots.clear(self.session, taken_over - {session.sampler.clock})
         self.intake.session = session
         self.outputs.prepare(session)
         if self.active:

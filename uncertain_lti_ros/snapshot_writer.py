@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 from rclpy.node import Node
 
@@ -57,11 +58,11 @@ class Snapshots:
             self._album.close()
         self._album = self.recent = self._due = None
 
-    def clear(self, session: Session | None) -> None:
-        """Write what is due, and forget all messages: another model reads the next ones."""
+    def clear(self, session: Session | None, but: Iterable[str]) -> None:
+        """Write what is due, and forget all but the last messages of some topics: another model reads the next ones."""
         self.write_due(session, math.inf)
         if self.recent is not None:
-            self.recent.clear()
+            self.recent.clear(but)
 
     def add(self, entry: Entry, raised: bool) -> None:
         """Keep one more message; call it while `recent` is not None."""

@@ -15,7 +15,7 @@ import os
 import re
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -67,13 +67,12 @@ class Recent:
         """Keep one more; of what came before its clock went back the last values alone."""
         entries = self._entries
         if entries and entry.arrival_ns < entries[-1].arrival_ns - BACK_NS:  # log times of a file never do
-            last, at_ns = {old.topic: old for old in self.entries()}, max(0, entry.arrival_ns - BACK_NS)
-            self.clear()
-            self._before = {topic: replace(old, arrival_ns=at_ns, verdicts=()) for topic, old in last.items()}
+            at_ns = max(0, entry.arrival_ns - BACK_NS)
+            self.clear({old.topic for old in self.entries()})
+            self._before = {topic: replace(old, arrival_ns=at_ns) for topic, old in self._before.items()}
         entries.append(entry)
         self._bytes += len(entry.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in entry.verdicts)
-        oldest = entry.now - self._seconds
-        while entries and (entries[0].now < oldest or self._bytes > self._limit):
+        while entries and (entries[0].now < entry.now - self._seconds or self._bytes > self._limit):
             gone = entries.popleft()
             self._before[gone.topic] = gone
             self._bytes -= len(gone.data) + _OVERHEAD + sum(_PER_STATE * v.n for v in gone.verdicts)
@@ -82,10 +81,10 @@ class Recent:
         """All, in order of arrival."""
         return [*sorted(self._before.values(), key=lambda entry: entry.now), *self._entries]
 
-    def clear(self) -> None:
-        """Forget all."""
+    def clear(self, but: Iterable[str] = ()) -> None:
+        """Forget all but the last messages of some topics."""
+        self._before = {old.topic: replace(old, verdicts=()) for old in self.entries() if old.topic in but}
         self._entries.clear()
-        self._before.clear()
         self._bytes = 0
 
 
