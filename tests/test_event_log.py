@@ -375,7 +375,7 @@ def test_a_report_names_the_mode_that_the_model_does_not_list() -> None:
         rig.take(STATE, joint_state(rig.t_ns, rig.x))
         rig.wait(STEP)
     said = rig.session.report(rig.now, TIMEOUT)[0].message
-    assert "1 samples without a verdict: p = 4 is not among the modes of the model, 1, 2" in said
+    assert "1 sample without a verdict: p = 4 is not among the modes of the model, 1, 2" in said
 
 
 def test_an_enable_condition_without_a_number_is_told_from_one_that_is_silent() -> None:
@@ -526,7 +526,7 @@ def test_a_recording_that_is_played_again_is_told_once_at_each_pass_and_nothing_
         rig.send(50)
         assert rig.lines == [f"time steps back on {STATE}: a new segment begins"]
         report = rig.session.report(rig.now, TIMEOUT)[0]
-        assert report.message == "1 samples without a verdict: time stepped back"
+        assert report.message == "1 sample without a verdict: time stepped back"
         assert report.values["late messages"] == report.values["dropped"] == "0"
     for rivals in ("several publishers", ""):
         rig.session.reasons.rivals = rivals

@@ -115,7 +115,7 @@ PARAMETERS = (
     ),
     Declared(
         "largest_message", 16.0,
-        "Messages of more than this, MiB, are counted as unreadable and not looked into.", low=0.001, high=1024.0,
+        "Messages of more MiB are counted as unreadable. It takes effect with the next model.", low=0.001, high=1024.0,
     ),
     Declared(
         "snapshot.folder", "",

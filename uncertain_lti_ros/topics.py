@@ -517,7 +517,7 @@ class Diagnostics:
                 problems.append(f"{subscription.topic}: nothing received in {waited:.0f} s, and there is {heard}")
             lost, late = self._reported.get(topic, (0, 0))
             if subscription.lost > lost:
-                of = f"{subscription.lost - lost} messages lost"
+                of = f"{plural(subscription.lost - lost, 'message')} lost"
                 problems.append(f"{subscription.topic}: {of} on the way, or as the queue was full (qos.depth)")
             if subscription.late > late:
                 problems.append(f"{subscription.topic}: {subscription.late - late} deadlines missed by its publishers")

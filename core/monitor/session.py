@@ -143,15 +143,15 @@ class Session(Stream):
                 if status is Status.MISSING:
                     names = shortlist([signal.name for signal in lacking], SHOWN)
                     why = f"{why} ({names})" if names else TOO_LARGE
-                complaints.append(f"{count} samples without a verdict: {why}")
+                complaints.append(f"{plural(count, 'sample')} without a verdict: {why}")
         complaints += self.absent(lacking)
         complaints += self.ceased(now, timeout).values()
         if dropped := Counter({status.value: n for status, n in period.statuses.items() if status.dropped}):
             which = ", ".join(f"{kind} {n}" for kind, n in dropped.items())
             coarse = self.coarse_clock(period.statuses[Status.EQUAL])
-            complaints.append(f"{dropped.total()} messages dropped ({which}){coarse}")
+            complaints.append(f"{plural(dropped.total(), 'message')} dropped ({which}){coarse}")
         if came_late:
-            complaints.append(f"{came_late} messages came too late")
+            complaints.append(f"{plural(came_late, 'message')} came too late")
         if period.unreadable:
             complaints += [f"{topic}: a message {why}" for topic, why in self.why_unreadable.items()]
         if period.future:
@@ -543,7 +543,7 @@ class Failures:
 
     def problems(self) -> list[str]:
         """What went wrong since the last report."""
-        return [f"{self.count} unexpected errors, the last {self._last}"] * (self.count > self._reported)
+        return [f"{plural(self.count, 'unexpected error')}, the last {self._last}"] * (self.count > self._reported)
 
     def reported(self) -> None:
         """The errors so far are in a report."""
