@@ -577,6 +577,7 @@ def test_without_a_folder_there_are_no_snapshots(bench: StartBench, tmp_path: Pa
     (tmp_path / "file").write_text("")
     for name, options, why in (
         ("second", {"snapshot.folder": str(tmp_path / "file")}, "cannot be written to"),
+        ("homeless", {"snapshot.folder": "~no-such-user/a"}, "cannot be written to: it is in the home of nobody here"),
         ("third", {"snapshot.on_alarm": True}, f"not configured: {said}"),
     ):
         process = on.world.run_node("envelope_monitor", {"model": str(on.path), **options}, "-r", f"__node:={name}")

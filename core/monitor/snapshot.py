@@ -155,7 +155,6 @@ class Album:
     """
 
     def __init__(self, folder: str, node_name: str, keep: int, limit: int) -> None:
-        self._folder = Path(folder).expanduser()
         stem = re.sub(r"\W+", "_", node_name.strip("/"), flags=re.ASCII)
         self._stem, self._keep, self._limit = stem, keep, limit
         self._pattern = re.compile(rf"{re.escape(stem)}-\d{{8}}T\d{{6}}\.\d{{6}}Z\.mcap", re.ASCII)
@@ -163,15 +162,15 @@ class Album:
         self.written = 0
         self.last = self.problem = ""
         try:
+            self._folder = Path(folder).expanduser()
             self._folder.mkdir(parents=True, exist_ok=True)
             if not os.access(self._folder, os.W_OK | os.X_OK):
                 raise PermissionError(13, "Permission denied")
             for path in self._folder.glob(f".{stem}-*.mcap-*.tmp"):
                 path.unlink()  # of a process that was killed
-        except OSError as error:
-            raise ModelError(
-                f"snapshot.folder {folder}: cannot be written to: {error.strerror}; choose another folder"
-            ) from None
+        except (OSError, RuntimeError) as error:  # RuntimeError: of whom ~ is the home, nobody knows
+            why = getattr(error, "strerror", "it is in the home of nobody here")
+            raise ModelError(f"snapshot.folder {folder}: cannot be written to: {why}; choose another folder") from None
 
     @property
     def busy(self) -> bool:
