@@ -268,6 +268,17 @@ def test_the_same_as_message_by_message(tops, seed, count, layout, variety, litt
     assert_same(folder, signal_map(wanted))
 
 
+def test_bytes_behind_a_message_count_alike_whatever_is_wanted_of_it(tmp_path):
+    """Room that rclpy leaves behind an empty sequence was counted once for fields that nobody wants, and together."""
+    top = Type(
+        "t/msg/T", (Field("a", "float64", 0), Field("b", "float64", 2), Field("c", "float64"), Field("d", "int64"))
+    )
+    sent = [Message("/t", k, b"\0\1\0\0" + bytes(40 + k)) for k in range(30)]
+    path = write([Topic("/t", top.name, schema=top.schema())], sent, Layout()).save(tmp_path / "a.mcap")
+    read = [assert_same(path, signal_map({"/t": wanted})) for wanted in (["b[0]"], ["c"], ["b[1]", "c", "d"])]
+    assert len({str((*found[0][:3], found[1])) for found in read}) == 1
+
+
 def test_a_function_added_to_the_table_is_read_and_offered(tmp_path, monkeypatch):
     """One entry in the table is all that a further function of a quaternion takes."""
 

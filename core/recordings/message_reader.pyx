@@ -87,47 +87,48 @@ class UnreadableError(Exception):
 cdef class _Node:
     """A field of a type: what it is, and what is wanted of it.
 
-    `array`: -1 for a single value, 0 for a sequence, n for n elements; `fields`: of a message; `element`: of an array
-    of messages that nobody wants; `slot`: where a single number goes; `indexed, named`: wanted elements by position or
-    by name, each with its slot or node; `every`: where the place of an array goes that is wanted as a whole;
-    `name_at`: which field of a message holds the names; `ahead`: it is behind what it names; `asks`: for such outside.
+    `array`: -1 for one value, 0 for a sequence, n for n; `put`: fields it holds; `fields`: of a message; `element`: of
+    an array of messages that nobody wants; `slot`: where a single number goes; `indexed, named`: wanted elements by
+    position or by name, each with its slot or node; `every`: where the place of a whole array goes; `name_at`: which
+    field of a message holds the names; `ahead`: it is behind what it names; `asks`: for such outside.
     """
 
     cdef int kind, code
-    cdef Py_ssize_t size, array, slot, every, name_at
+    cdef Py_ssize_t size, array, put, slot, every, name_at
     cdef bint ahead, asks
     cdef list fields, indexed, named
     cdef _Node element
 
     def __cinit__(self):
         self.array = self.slot = self.every = self.name_at = -1
+        self.put = 1
         self.fields, self.indexed, self.named = [], [], []
 
 
 def _together(_Node one, _Node other):
     """Two stretches of numbers of one size that nobody wants, one behind the other, as one; None if they are not."""
     cdef _Node both = _Node()
-    both.kind, both.array = NUMBER, 0
+    both.kind, both.array, both.put = NUMBER, 0, 0
     for node in (one, other):
         found = _numbers_alone(node)
         if found is None or both.size not in (0, found[0]) or both.array + found[1] > MOST:
             return None
-        both.size, both.array = found[0], both.array + found[1]
+        both.size, both.array, both.put = found[0], both.array + found[1], both.put + found[2]
     return both
 
 
 def _numbers_alone(_Node node):
-    """Size and number of what a field is if it is nothing but numbers that nobody wants; else None."""
+    """Size, number and fields of what is nothing but numbers that nobody wants; else None."""
     if not node.array or node.slot >= 0 or node.indexed or node.named or node.every >= 0:
         return None
     count = node.array if node.array > 0 else 1
     if node.kind == NUMBER:
-        return node.size, count
+        return node.size, count, node.put
     if node.kind != MESSAGE:
         return None
     inside = (node.element if node.array > 0 else node).fields
     found = _numbers_alone(inside[0]) if len(inside) == 1 else None
-    return found and (found[0], found[1] * count)
+    return found and (found[0], found[1] * count, found[2] * count)
 
 
 cdef class Plan:
@@ -354,7 +355,7 @@ cdef class Plan:
             if self.at > self.size:
                 return False
         if node.size == 8 and (not count or self.reserved):
-            self.reserved += RESERVED
+            self.reserved += RESERVED * node.put
         if node.kind == TRUTH:
             for i in range(start, self.at if count else start):
                 self.untrue |= self.data[i] > 1
