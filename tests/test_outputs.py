@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
+from uncertain_lti.base.errors import ModelError
 from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Domain
 from uncertain_lti.model.horizon import Horizon
@@ -116,6 +117,20 @@ def test_one_message_and_many_records_have_the_same_bytes(make: Callable[[], Unc
     flags = [encode["flags"](verdict)[0] for verdict in verdicts]
     velocities = [np.frombuffer(f[marks.velocity : marks.velocity + 8 * model.n], "<f8") for f in flags]
     np.testing.assert_array_equal(velocities, np.repeat([[0.0], [1.0], [np.nan]], model.n, axis=1))
+
+
+@pytest.mark.parametrize("velocities", [False, True])
+def test_the_middleware_reads_whatever_the_states_are_called(velocities: bool) -> None:
+    pytest.importorskip("rclpy")
+    from rclpy.serialization import deserialize_message
+    from sensor_msgs.msg import JointState
+
+    for names in (*(["x" * length] for length in range(10)), ["größe", "油门", "a b"], ["a"] * 5):
+        numbers = [0.0] * len(names)
+        same = JointState(name=names, position=numbers, velocity=numbers * velocities)
+        assert deserialize_message(NamedVector(names, velocities).template, JointState) == same
+    with pytest.raises(ModelError, match="cannot be sent as text"):
+        NamedVector(["a\0"])
 
 
 def test_the_numbers_of_horizons_are_named_by_state_and_steps() -> None:

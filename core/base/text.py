@@ -37,8 +37,10 @@ def _shortened(text: str, limit: int) -> str:
 
 
 def plural(count: object, word: str) -> str:
-    """A count and its noun: 1 state, 2 states, 0 states; 1 pass, 2 passes."""
-    return f"{count} {word}" if count == 1 else f"{count} {_several(word)}"
+    """A count and its noun: 1 state, 2 states, 0 states; 1 entry, 2 entries; 1 day, 2 days."""
+    if count == 1:
+        return f"{count} {word}"
+    return f"{count} {word[:-1]}ies" if word[-1] == "y" and word[-2] not in "aeiou" else f"{count} {word}s"
 
 
 def times(count: int) -> str:
@@ -69,12 +71,6 @@ def meant(word: object, known: Iterable[str], most: int = 3) -> str:
     names = {name.lower(): name for name in sorted(known)}
     near = difflib.get_close_matches(str(word).lower(), names, n=most, cutoff=0.65 if most == 1 else 0.7)
     return f" (is {' or '.join(names[n] for n in near)} meant?)" if near else ""
-
-
-def _several(word: str) -> str:
-    if word.endswith(("s", "x", "ch", "sh")):
-        return f"{word}es"
-    return f"{word[:-1]}ies" if word.endswith("y") and word[-2:-1] not in "aeiou" else f"{word}s"
 
 
 MOST = 12

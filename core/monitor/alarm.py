@@ -202,8 +202,6 @@ class Alarm:
 
     def raised(self) -> tuple[tuple[int, int], ...]:
         """Rules that raise the alarm, and the state that each points to if it looks at all together, else -1."""
-        if not self.alarm:
-            return ()
         return tuple((i, getattr(part, "blamed", -1)) for i, part in enumerate(self._parts) if part.alarm)
 
     def reasons(

@@ -47,9 +47,6 @@ _OK = Status.OK  # looking up one of an enumeration is slow
 _FUTURE_NS = to_ns(FUTURE)
 _NOTHING: tuple[Verdict, ...] = ()
 
-MakeReader = Callable[[str, Sequence[FieldPath]], MessageReader]
-"""Type name and paths -> reader."""
-
 
 @dataclass
 class Period:
@@ -147,7 +144,7 @@ class Stream:
         rule: Rule,
         types: Mapping[str, str],
         type_fields: TypeFields,
-        make_reader: MakeReader,
+        make_reader: Callable[[str, Sequence[FieldPath]], MessageReader],
         now: float,
         arming: Arming | None = None,
         catch_up: float = WINDOW,

@@ -282,7 +282,7 @@ def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[s
     texts = [cells for cells, whole in zip(columns, wholes, strict=True) if "," in whole]
     point = ""  # what parts decimals, if a cell tells
     for cell in (cell.strip() for cells in texts for cell in cells if "," in cell):
-        if _has_comma(cell):
+        if _WITH_COMMA.match(cell) and not _GROUPED.match(cell):  # in front of decimals for certain
             point = ","
             break
         if (match := _GROUPED.match(cell)) and match["by"] == "," and _tells(match):
@@ -341,11 +341,6 @@ def _column(cells: list[str], point: str, delimiter: str) -> tuple[Column, list[
         return numbers, [*done, f"'{unit}' taken off each number"], odd
     read = [f"'{by}' between thousands taken out"] * bool(by) + ["decimal commas read as points"] * bool(comma)
     return numbers, [" and ".join(read)] * bool(read), odd
-
-
-def _has_comma(cell: str) -> bool:
-    """Whether its comma is in front of decimals for certain."""
-    return bool(_WITH_COMMA.match(cell)) and not _GROUPED.match(cell)
 
 
 def _tells(grouped: re.Match[str]) -> bool:

@@ -137,8 +137,8 @@ def _forward_steps(instants: NDArray[np.int64], min_step_ns: int) -> NDArray[np.
     return np.array(longer, dtype=np.int64)
 
 
-def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> int | None:
-    """Period of a clock that samples evenly, whatever its stamps do, over all recordings.
+def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int) -> int:
+    """Period of a clock that samples evenly, whatever its stamps do, over all recordings, of which one moves forward.
 
     The median of the time that 100 samples take (fewer of short recordings), divided by their number: a stamp that is
     late, or a sample that is lost, changes few of these.
@@ -146,10 +146,7 @@ def period_ns(instants: Sequence[NDArray[np.int64]], min_step_ns: int = 0) -> in
     `instants` (messages,): of each recording, ns.
     """
     steps = [_forward_steps(i, min_step_ns) for i in instants]
-    longest = max((len(s) for s in steps), default=0)
-    if not longest:
-        return None
-    over = max(1, min(100, longest // 4))
+    over = max(1, min(100, max(map(len, steps)) // 4))
     times = [np.concatenate([np.zeros(1, np.int64), np.cumsum(s)]) for s in steps]
     return max(1, round(float(np.median(np.concatenate([t[over:] - t[:-over] for t in times]))) / over))
 
@@ -225,6 +222,6 @@ def resolve(
     if max_gap is None:
         max_gap = longest_step(instants[clock], min_step_ns, bool(signals.recalled))
     if constant == "constant":
-        constant = (period_ns(instants[clock], min_step_ns) or step) * 1e-9
+        constant = period_ns(instants[clock], min_step_ns) * 1e-9
     sources: dict[str, TimeSource] = {t: "header" if time[t] == "header" else "log" for t in signals.topics}
     return replace(signals, clock=clock, max_gap=max_gap, step=constant, time=sources)
