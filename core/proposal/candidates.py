@@ -517,10 +517,6 @@ def _is_code(candidate: Candidate) -> bool:
     return 0 < len(values) <= _LABELS and bool((values == np.rint(values)).all())
 
 
-def _may_switch(candidate: Candidate) -> bool:
-    return not candidate.flickers and not READ.search(candidate.path.lower())
-
-
 def take_switches(sources: Sequence[Source]) -> list[Source]:
     """Columns of tables that are switched, which leave the measurements and may be controls; codes are no states."""
     found, driven = [], any(s.role == "control" and s.free for s in sources)
@@ -530,7 +526,8 @@ def take_switches(sources: Sequence[Source]) -> list[Source]:
         codes = [c for c in table.free if _is_code(c)]
         for candidate in codes * driven:  # else it may be the only control
             candidate.reason, candidate.ready = _NO_AMOUNTS, "control"
-        if turned := codes * (not driven) + [c for c in table.candidates if c.reason == TWO_VALUES and _may_switch(c)]:
+        two = [c for c in table.candidates if c.reason == TWO_VALUES and not READ.search(c.path.lower())]
+        if turned := codes * (not driven) + [c for c in two if not c.flickers]:
             found.append(table.parted(turned, "switch"))
         for candidate in turned:
             candidate.reason = ""

@@ -150,8 +150,6 @@ def fit(
         are given and nothing is left out.
     """
     transients = listed_transients(transients)
-    if not transients:
-        raise FitError("no transients; give at least one recording")
     fitting.common_signals(transients)
     if criterion is not None:
         check_criterion(criterion)

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.errors import BagError, SignalError
+from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
 from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Recording, TopicFacts, TopicInfo
@@ -165,15 +165,8 @@ class Table(Recording):
         columns, quaternions = self._of(topic)
         fields = {name: _field_type(column) for name, column in columns.items()}
         fields |= {base: FieldType("message", _QUATERNION) for base in quaternions}
-
-        def of(type_name: str) -> Mapping[str, FieldType]:
-            if type_name == _QUATERNION:
-                return dict.fromkeys("xyzw", FieldType("number", "float64"))
-            if type_name != TABLE:
-                raise SignalError(f"{type_name}: a table has no such type; check the type")
-            return fields
-
-        return of
+        number = FieldType("number", "float64")
+        return lambda type_name: dict.fromkeys("xyzw", number) if type_name == _QUATERNION else fields
 
     def messages(self, topics: Iterable[str]) -> Iterator[tuple[str, int, Any]]:
         """Rows, one after the other."""
@@ -241,10 +234,7 @@ class Table(Recording):
             if path.function is None:
                 return columns["xyzw".index(str(steps[1][1]))]
             return list(map(path.function.of_parts, *(column.tolist() for column in columns)))
-        if str(steps[0][1]) not in self._fields[topic] and len(self.times):
-            there = shortlist(list(self._fields[topic]), 50)
-            raise BagError(f"{self.path}: there is no column '{steps[0][1]}'; columns there: {there}")
-        column = self.columns_by_field.get(str(steps[0][1]), np.empty(len(self.times)))[rows]
+        column = self.columns_by_field[str(steps[0][1])][rows]
         if path.function is None and len(steps) == 1:
             return column
         if path.function is None and len(steps) == 2 and steps[1][0] == "index":
