@@ -133,17 +133,19 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
 @pytest.mark.parametrize(("held", "many"), [(working_set._HELD_BYTES, programmes.MANY), (1, 1)])
 def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypatch):
-    """Beyond the first subsample, where full passes have to correct it; rows proven together, or in groups.
+    """Beyond the first subsample, where full passes have to correct it; rows proven together, or in groups of two.
 
-    With many unknowns an interior point begins.
+    With many unknowns an interior point begins, and a pass finds the transitions that are far from least squares.
     """
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
+    monkeypatch.setattr(working_set, "_FURTHEST", 400)
+    monkeypatch.setattr(working_set, "_MANY", many)
     monkeypatch.setattr(programmes, "MANY", many)
     monkeypatch.setattr(programmes, "VERY_MANY", many)
     monkeypatch.setattr(working_set, "_HELD_BYTES", held)
-    transient = drawn(small_plant(8), 3000, 8, noise=1e-3)
+    transient = drawn(small_plant(8, n=3), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")
-    problem = assemble([transient], OperatingPoint.identity(2, 1), None, "noise")
+    problem = assemble([transient], OperatingPoint.identity(3, 1), None, "noise")
     _, _, expected = solve_as_written(problem, criterion, "CLARABEL" if criterion == "qp" else "HIGHS")
     assert np.atleast_1d(objective(model)) == pytest.approx(expected, rel=1e-6)
     assert model.fit_summary["optimality_gap"] < 1e-6 and count_outside(model, [transient]) == 0
