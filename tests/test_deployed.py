@@ -180,6 +180,7 @@ def test_from_a_time_on_the_condition_is_the_last_that_was_heard(values):
         (["--rules", "empty.json"], "empty.json: no rules of an alarm; give a model file"),
         (["--rules", "far.json"], "far.json: does not fit the model: "),
         (["--rules", "turned.json"], "turned.json: its thresholds are of the states "),
+        (["--from", "nan"], "from is nan; give seconds after the first sample"),
         (["--rules", "odd.json"], "odd.json: field 'alarm.rules[0].kind' is 'median'"),
     ],
 )

@@ -441,6 +441,8 @@ def control(entry: str) -> str:
         (X + "schedule: [{signal: torque, knots: 3}]", "torque"),
         (X + "schedule: [{signal: x, knots: 0}]", "knots"),
         (X + "schedule: [{signal: x}]", "knots"),
+        (X + "schedule: [{signal: 3, knots: 2}]", "'signal' is 3; write the name of a signal"),
+        (X + "table: {words: {fan: low}}", "words of fan is 'low'; write a list of words in quotes"),
         (X + "schedule: [{signal: x, knots: [1, a]}]", r"knots\[1\]"),
         (X + "schedule: [{signal: x, knots: [false, true]}]", r"knots\[0\]"),
         (X + "schedule: {signal: x}", "list"),
