@@ -65,6 +65,12 @@ def signals_of(names, states, table=""):
     return "\n".join(lines) + "\n"
 
 
+@pytest.fixture
+def pa():
+    pytest.importorskip("pyarrow.parquet", reason="pyarrow, of the extra tables, is not installed")
+    return pytest.importorskip("pyarrow")
+
+
 def read_csv(folder, head, rows, encoding="utf-8"):
     """The recording that a table is."""
     (folder / "a.csv").write_text("\n".join([head, *rows]), encoding=encoding)
@@ -119,13 +125,12 @@ def test_the_same_bits_as_in_mcap(tables, shipped, names, kind, tmp_path):
     assert len(read) > 1000 and given_by(read) == expected_of(shipped)
 
 
-def test_parquet_and_feather(shipped, names, tmp_path):
-    pa = pytest.importorskip("pyarrow", reason="pyarrow, of the extra tables, is not installed")
-    from pyarrow import feather, parquet
+def test_parquet_and_feather(pa, shipped, names, tmp_path):
+    from pyarrow import feather
 
     columns = {"when": shipped.t_ns.astype("datetime64[ns]"), **dict(zip(names, rows_of(shipped).T, strict=True))}
     table = pa.table({name: pa.array(column) for name, column in columns.items()})
-    parquet.write_table(table, tmp_path / "run.parquet")
+    pa.parquet.write_table(table, tmp_path / "run.parquet")
     feather.write_feather(table, tmp_path / "run.feather")
     (tmp_path / "s.yaml").write_text(signals_of(names, len(shipped.signals.states)))
     for suffix in (".parquet", ".feather"):
@@ -135,11 +140,8 @@ def test_parquet_and_feather(shipped, names, tmp_path):
         refuses(BagError, f"run{suffix}: is damaged or no {suffix} file", open_recording, tmp_path / f"run{suffix}")
 
 
-def test_lists_of_a_parquet_are_matrices_where_all_rows_have_as_many(tmp_path):
+def test_lists_of_a_parquet_are_matrices_where_all_rows_have_as_many(pa, tmp_path):
     """The joints of an arm, as LeRobot writes them; a list that differs in length, or holds text, is told."""
-    pa = pytest.importorskip("pyarrow", reason="pyarrow, of the extra tables, is not installed")
-    from pyarrow import parquet
-
     joints = np.arange(60.0).reshape(20, 3)
     columns = {"timestamp": pa.array(np.arange(20) / 30, pa.float32())}
     for name, kind in (("state", pa.list_(pa.float32(), 3)), ("action", pa.list_(pa.int64())), ("words", None)):
@@ -147,7 +149,7 @@ def test_lists_of_a_parquet_are_matrices_where_all_rows_have_as_many(tmp_path):
     columns["words"] = pa.array([["a", "b"]] * 20)
     columns["uneven"] = pa.array([[1.0]] * 19 + [[1.0, 2.0]])
     columns["gap"] = pa.array([[1.0]] * 19 + [None])
-    parquet.write_table(pa.table(columns), tmp_path / "episode.parquet")
+    pa.parquet.write_table(pa.table(columns), tmp_path / "episode.parquet")
     table = Table(tmp_path / "episode.parquet")
     fields = table.columns_by_field
     assert set(fields) == {"state", "action"} and all((fields[name] == joints).all() for name in fields)
@@ -764,15 +766,12 @@ def test_instants_beyond_ns_in_arrays_are_refused(tmp_path):
     refuses(BagError, "after 2261", Table, tmp_path / "a.npz")
 
 
-def test_nanoseconds_with_a_gap_stay_exact(tmp_path):
-    pa = pytest.importorskip("pyarrow")
-    from pyarrow import parquet
-
+def test_nanoseconds_with_a_gap_stay_exact(pa, tmp_path):
     begin = 1_700_000_000_000_000_001
     times = pa.array([begin, None, begin + 7], pa.int64())
     columns = {"time": times, "x": [1.0, 2.0, 3.0], "mode": ["a", "b", "c"]}
-    parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
-    parquet.write_table(pa.table(columns | {"time": pa.array([None] * 3, pa.string())}), tmp_path / "b.parquet")
+    pa.parquet.write_table(pa.table(columns), tmp_path / "a.parquet")
+    pa.parquet.write_table(pa.table(columns | {"time": pa.array([None] * 3, pa.string())}), tmp_path / "b.parquet")
     refuses(BagError, r"b\.parquet: column 'time': holds no time in any row", Table, tmp_path / "b.parquet")
     table = Table(tmp_path / "a.parquet")
     assert table.times.tolist() == [begin, begin + 7] and table.type_fields("/table")("table")["mode"].kind == "string"
@@ -787,37 +786,28 @@ def test_equal_names_do_not_take_for_ever(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["duration[us]", "time64[us]", "time32[ms]"])
-def test_times_of_arrow_that_are_no_instants_are_read(tmp_path, kind):
-    pa = pytest.importorskip("pyarrow")
-    from pyarrow import parquet
-
+def test_times_of_arrow_that_are_no_instants_are_read(pa, tmp_path, kind):
     unit = 10**3 if "ms" in kind else 10**6
     steps = pa.array([k * unit // 50 for k in range(9)], pa.int32() if "ms" in kind else pa.int64())
     path = tmp_path / "a.parquet"
     types = {"duration[us]": pa.duration("us"), "time64[us]": pa.time64("us"), "time32[ms]": pa.time32("ms")}
-    parquet.write_table(pa.table({"time": steps.cast(types[kind]), "x": np.arange(9.0)}), path)
+    pa.parquet.write_table(pa.table({"time": steps.cast(types[kind]), "x": np.arange(9.0)}), path)
     (tmp_path / "s.yaml").write_text("states: [{name: x, topic: /table, field: x}]")
     (t,) = read_transients(path, tmp_path / "s.yaml")
     assert np.diff(t.t_ns).tolist() == [20_000_000] * 8
 
 
-def test_a_small_parquet_that_expands_is_refused(tmp_path):
-    pa = pytest.importorskip("pyarrow")
-    from pyarrow import parquet
-
+def test_a_small_parquet_that_expands_is_refused(pa, tmp_path):
     column = pa.array(np.zeros(10_000_000))
     path = tmp_path / "a.parquet"
-    parquet.write_table(pa.table({f"c{i}": column for i in range(15)}), path)
+    pa.parquet.write_table(pa.table({f"c{i}": column for i in range(15)}), path)
     assert path.stat().st_size < 1_000_000
     refuses(BagError, "more than is read of a file of its size", Table, path)
 
 
-def test_rows_that_a_damaged_parquet_does_not_list_are_not_lost_in_silence(tmp_path):
-    pa = pytest.importorskip("pyarrow")
-    from pyarrow import parquet
-
+def test_rows_that_a_damaged_parquet_does_not_list_are_not_lost_in_silence(pa, tmp_path):
     path = tmp_path / "a.parquet"
-    parquet.write_table(pa.table({name: np.arange(200.0) for name in ("time", "x")}), path)
+    pa.parquet.write_table(pa.table({name: np.arange(200.0) for name in ("time", "x")}), path)
     data, rows, fewer = path.read_bytes(), b"\x90\x03", b"\x90\x02"  # 200 and 136, as the footer writes them
     refused = 0
     for at in (i for i in range(len(data)) if data.startswith(rows, i)):
@@ -1223,16 +1213,15 @@ def test_a_blank_before_a_quote_or_behind_the_last_delimiter_changes_nothing(tmp
     assert [*table.columns] == ["time", "x", "mode", "y"] and not table.notes
 
 
-def test_a_parquet_without_rows_or_with_a_name_twice(tmp_path):
-    pa, parquet = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+def test_a_parquet_without_rows_or_with_a_name_twice(pa, tmp_path):
     of_50 = [
         pa.array(range(50), pa.float64()),
         pa.array([k % 7 for k in range(50)]),
         pa.array([k % 5 for k in range(50)]),
     ]
-    parquet.write_table(table := pa.Table.from_arrays(of_50, names=["time", "x", "x"]), tmp_path / "a.parquet")
+    pa.parquet.write_table(table := pa.Table.from_arrays(of_50, names=["time", "x", "x"]), tmp_path / "a.parquet")
     assert read_table(tmp_path / "a.parquet").columns["x 2"].tolist()[:6] == [0, 1, 2, 3, 4, 0]
-    parquet.write_table(table.slice(0, 0), tmp_path / "b.parquet")
+    pa.parquet.write_table(table.slice(0, 0), tmp_path / "b.parquet")
     with pytest.raises(BagError, match="has columns and no row; record or copy it again"):
         read_table(tmp_path / "b.parquet")
 
