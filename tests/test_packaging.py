@@ -252,11 +252,17 @@ def test_the_changelog_of_a_release_is_what_catkin_reads(package):
     assert len(section.children) == len(re.findall(r"^- ", text, re.MULTILINE))
 
 
-def test_a_launch_ends_with_the_node_that_it_requires(monkeypatch):
-    """With status 1 after a fault, in order otherwise. `launch` itself comes with ROS 2 alone."""
+@pytest.fixture
+def launched(monkeypatch):
+    """What the launch file defines; `launch` itself comes with ROS 2 alone."""
     for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
         monkeypatch.setitem(sys.modules, name, MagicMock())
-    ended = runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))["ended"]
+    return runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))
+
+
+def test_a_launch_ends_with_the_node_that_it_requires(launched):
+    """With status 1 after a fault, in order otherwise."""
+    ended = launched["ended"]
 
     def end(status, shutting_down=False):
         event = SimpleNamespace(process_name="envelope_monitor-1", returncode=status)
@@ -268,10 +274,7 @@ def test_a_launch_ends_with_the_node_that_it_requires(monkeypatch):
     assert end(0, shutting_down=True) is end(-2, shutting_down=True) is None, "Ctrl-C ends it already"
 
 
-def test_a_launch_argument_that_is_no_number_is_named(monkeypatch):
-    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
-        monkeypatch.setitem(sys.modules, name, MagicMock())
-    launched = runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))
+def test_a_launch_argument_that_is_no_number_is_named(launched):
     given = {name: default for name, (default, _) in launched["ARGUMENTS"].items()} | {"respawn_delay": "abc"}
     launched["start"].__globals__["LaunchConfiguration"] = lambda name: MagicMock(perform=lambda _: given[name])
     with pytest.raises(ValueError, match="^respawn_delay:=abc is no number; give seconds$"):
@@ -282,11 +285,8 @@ def test_a_launch_argument_that_is_no_number_is_named(monkeypatch):
     ("pushed", "namespace", "inputs"),
     [("", "robot1", "/robot1"), ("/robot7", "", "/robot7"), ("fleet", "r8/", "/fleet/r8"), ("fleet", "/r8", "/r8")],
 )
-def test_a_launched_monitor_follows_the_launch_files_around_its_own(monkeypatch, pushed, namespace, inputs):
+def test_a_launched_monitor_follows_the_launch_files_around_its_own(launched, pushed, namespace, inputs):
     """Its inputs its namespace, also what PushRosNamespace puts before it, and /clock SetParameter or the file."""
-    for name in ("launch", "launch.actions", "launch.substitutions", "launch_ros", "launch_ros.actions"):
-        monkeypatch.setitem(sys.modules, name, MagicMock())
-    launched = runpy.run_path(str(ROOT / "launch/envelope_monitor.launch.py"))
     given = {name: default for name, (default, _) in launched["ARGUMENTS"].items()}
     given |= {"namespace": namespace, "topic_prefix": "namespace"}
     launched["start"].__globals__["LaunchConfiguration"] = lambda name: MagicMock(perform=lambda _: given[name])
