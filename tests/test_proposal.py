@@ -40,7 +40,14 @@ from uncertain_lti.proposal.candidates import (
     role_of_column,
     steps_of,
 )
-from uncertain_lti.proposal.choosing import _may_move_with, _moves_with, assign_roles, choose, drop_idle_controls
+from uncertain_lti.proposal.choosing import (
+    _may_move_with,
+    _moves_with,
+    assign_roles,
+    choose,
+    drop_functions,
+    drop_idle_controls,
+)
 from uncertain_lti.proposal.init import LONGEST_ARRAY, propose
 from uncertain_lti.proposal.members import all_of_them
 from uncertain_lti.proposal.signals_file import _left_out, memory_lines, name_signals, set_operating_point, signals_file
@@ -1222,6 +1229,16 @@ def test_what_is_computed_from_several_signals_of_another_topic_is_no_state(tmp_
     assert ({c.topic for c in proposal.states} == {"/joint_states"}) == (noise == 0.0), proposal.text
     told = "/speed data: says what /joint_states says already, several of its signals together"
     assert (told in proposal.text) == (noise == 0.0)
+
+
+def test_of_a_state_and_its_square_the_state_stays_though_the_controls_show_more_in_the_square():
+    rng = np.random.default_rng(0)
+    u, x = rng.normal(size=400), np.cumsum(rng.normal(size=400))
+    X = np.column_stack([(x - x.mean()) ** 2, x - x.mean()])
+    topic = Source("/a", FLOAT64, "state", False, None)
+    square, state = pool = [Candidate(topic, path, [column]) for path, column in zip("qx", X.T, strict=True)]
+    steps = Steps(X, u[:, None], np.column_stack([u, 0.1 * u + rng.normal(size=400)]))
+    assert drop_functions(steps, pool) == [state] and square.reason == "says what x says already"
 
 
 def test_what_no_name_or_type_tells_is_offered_where_the_controls_show_in_it(tmp_path):
