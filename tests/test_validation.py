@@ -437,18 +437,19 @@ def test_fit_prints_and_stores_what_leaving_out_gives(folder):
     assert stored["kind"] == "transients" and stored["parts"] == 6 and len(stored["false_alarms"]) == 2
 
 
-def test_a_model_finds_its_recordings_beside_it(tmp_path, monkeypatch, cli):
+@pytest.mark.parametrize("name", ["run.mcap", "run[1].mcap"])
+def test_a_model_finds_its_recordings_beside_it(name, tmp_path, monkeypatch, cli):
     """As `fit` was run in their folder, and `validate` from another one."""
-    engine_bag(tmp_path / "run.mcap", 200)
+    engine_bag(tmp_path / name, 200)
     (tmp_path / "signals.yaml").write_text(SIGNALS)
     monkeypatch.chdir(tmp_path)
-    cli("fit", "run.mcap", "--signals", "signals.yaml", "--output", "m.model.json", "--criterion", "lp")
+    cli("fit", name, "--signals", "signals.yaml", "--output", "m.model.json", "--criterion", "lp")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert "left out one block at a time (10 blocks" in cli("validate", "../m.model.json", "--blocks", "10").out
-    (tmp_path / "run.mcap").unlink()
+    (tmp_path / name).unlink()
     said = cli("validate", "../m.model.json", status=2).err  # whoever names no recording has no path to check
-    assert "m.model.json: run.mcap, to which it was fitted, is not there; name its recordings after it" in said
+    assert f"m.model.json: {name}, to which it was fitted, is not there; name its recordings after it" in said
 
 
 def test_groups_of_a_fit_are_those_of_its_validation(folder, cli):

@@ -209,8 +209,11 @@ def _files(transients: Iterable[Transient]) -> list[dict[str, str]]:
 def _found(file: str, model: str) -> str:
     """A recording as the model's file names it, or beside that file."""
     beside = os.path.join(os.path.dirname(model), file)
-    there, also = (os.path.exists(path.partition("[")[0]) for path in (file, beside))
-    return beside if also and not there else file
+    return beside if _is_there(beside) and not _is_there(file) else file
+
+
+def _is_there(recording: str) -> bool:
+    return os.path.exists(recording) or os.path.exists(recording.rpartition("[")[0])  # or one run in a table
 
 
 def _with_sources(model: UncertainLTI, sources: Iterable[dict[str, Any]], group: str | None = None) -> UncertainLTI:
@@ -305,8 +308,10 @@ def validate(options: argparse.Namespace) -> Result:
     bags = options.bags or list(dict.fromkeys(_found(s["file"], options.model) for s in sources))
     if not bags:
         raise BagError(f"{options.model}: does not say which recordings it was fitted to; name them")
-    if not options.bags and not os.path.exists((first := bags[0]).partition("[")[0]):
-        raise BagError(f"{options.model}: {first}, to which it was fitted, is not there; name its recordings after it")
+    if not options.bags and not _is_there(bags[0]):
+        raise BagError(
+            f"{options.model}: {bags[0]}, to which it was fitted, is not there; name its recordings after it"
+        )
     if options.output is not None:
         own = os.path.exists(options.output) and os.path.samefile(options.output, options.model)
         model_target(options.output, options.force or own, bags)
