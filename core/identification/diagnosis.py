@@ -400,18 +400,18 @@ def jittering(model: UncertainLTI, problem: Problem, names: Sequence[str]) -> li
 
 def _held(problem: Problem, signals: Sequence[Signal]) -> dict[str, list[int]]:
     """States that repeat their last value between samples of a slower topic, those of one remedy together."""
-    alone, found = len({signal.topic for signal in signals}) == 1, {}
+    found, alone = dict[str, list[int]](), len({signal.topic for signal in signals}) == 1
     slow = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
     every = range(problem.n if len(successive(problem)) >= 0.5 * problem.N else 0)
+    rows = {i: held for i in every if (held := held_for(problem.z[i], problem.x_next[i]))}
     for judged, remedy in ((False, slow), (True, "take `judged: true` away")):
-        if of := [i for i in every if signals[i].judged == judged and held_for(problem.z[i], problem.x_next[i])]:
-            rows = sorted({held_for(problem.z[i], problem.x_next[i]) for i in of})
+        if of := [i for i in rows if signals[i].judged == judged]:
+            about = " to ".join(map(str, sorted({min(rows[i] for i in of), max(rows[i] for i in of)})))
             share = min(np.mean(problem.z[i] == problem.x_next[i]) for i in of)
-            each, least = ("each of ", "at least ") if len(of) > 1 else ("", "")
             found[
-                f"{each}{quoted([signals[i].name for i in of])} repeats its last value in {least}{share:.0%} of the "
-                f"steps and is new about every {' to '.join(map(str, sorted({rows[0], rows[-1]})))} samples: its topic "
-                f"or its sensor is slower than the clock, and its row is fitted to jumps; {remedy}"
+                f"{'each of ' * (len(of) > 1)}{quoted([signals[i].name for i in of])} repeats its last value in "
+                f"{'at least ' * (len(of) > 1)}{share:.0%} of the steps and is new about every {about} samples: its "
+                f"topic or its sensor is slower than the clock, and its row is fitted to jumps; {remedy}"
             ] = of
     return found
 

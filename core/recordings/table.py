@@ -319,7 +319,7 @@ def _times_of_rows(
     """Rows that count, their times, evenly where rows of the same time flow, and what there is to say of such rows."""
     again = np.append(False, np.diff(times) == 0)
     if not (equal := np.count_nonzero(again)) > 0.1 * len(times):
-        return again | True, times, []
+        return np.ones_like(again), times, []
     late = np.flatnonzero(again)
     both = ((column[late], column[late - 1]) for column in columns.values())
     if not any(((a != b) & ((a == a) | (b == b))).any() for a, b in both):  # a missing number repeats one
@@ -335,7 +335,7 @@ def _times_of_rows(
         each += "write a file for each; else "
         even, taken = times, f"only the first of such rows counts: {each * (number > 1)}"
     same = f"{equal} of {len(times)} rows have the time of a row before in column '{time}', and {taken}"
-    return again | True, even, [f"{same}write times with more decimals, or take another, `--table time=COLUMN`"]
+    return np.ones_like(again), even, [f"{same}write times with more decimals, or take another, `--table time=COLUMN`"]
 
 
 def _numbers(columns: Mapping[str, Column]) -> list[Column]:

@@ -302,8 +302,8 @@ def _columns(names: Sequence[str], columns: Sequence[Column], wholes: Sequence[s
         for note in done:
             noted.setdefault(note, []).append(name)
         odd |= {name: left} if left else {}
-    if every := sum(odd.values(), list[str]()):
-        noted[left_out(len(every), "number", every[0])] = [*odd]
+    if odd:
+        noted[left_out(sum(map(len, odd.values())), "number", next(iter(odd.values()))[0])] = [*odd]
     words = ((note, shortlist([repr(name) for name in of], 6), "s" * (len(of) > 1)) for note, of in noted.items())
     return RawTable(found, [f"column{several} {of}: {note}" for note, of, several in words])
 
