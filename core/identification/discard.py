@@ -21,7 +21,6 @@ from uncertain_lti.base.progress import CountedStep
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.problem import Problem
 from uncertain_lti.identification.programmes import Programmes
-from uncertain_lti.identification.row import Row
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
 
@@ -135,35 +134,35 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
         yield index, total[index]
         stale = set()
         for row, row_gains in zip(engine.rows, gains, strict=True):
-            engine.programmes[row.i].drop(index)
+            row.drop(index)
             if index in row_gains:
-                _solve(engine, engine.programmes[row.i], criterion)
+                _solve(engine, row, criterion)
                 stale.add(row.i)
 
 
-def _value(row: Row, criterion: str, weights: Array | None) -> float:
+def _value(row: Programmes, criterion: str, weights: Array | None) -> float:
     if criterion == "lp":
         return (row.limit or 0.0) * row.limit_unit
     d = row.d[row.free_psi] / (row.unit_psi * row.scale)
     weight = 1.0 if weights is None else float(weights[row.i])
-    return weight * row.largest * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.linear @ d)
+    return weight * row.largest * row.scale**2 * float(d @ row.gram @ d + 2.0 * row.gradient @ d)
 
 
-def _gains(engine: WorkingSet, row: Row) -> dict[int, float]:
+def _gains(engine: WorkingSet, row: Programmes) -> dict[int, float]:
     """Fall of the row's part of (10) without each of the samples that carry it."""
     if not row.unknown:
         return {}
     value = _value(row, "qp", engine.fleet.weights)
     gains = {}
-    for index in row.samples.index[engine.programmes[row.i].carrying(_ACTIVE)].tolist():
-        own = engine.programmes[row.i].trial()
-        own.drop(index)
-        _solve(engine, own, "qp")
-        gains[index] = value - _value(own.row, "qp", engine.fleet.weights)
+    for index in row.samples.index[row.carrying(_ACTIVE)].tolist():
+        trial = row.trial()
+        trial.drop(index)
+        _solve(engine, trial, "qp")
+        gains[index] = value - _value(trial, "qp", engine.fleet.weights)
     return gains
 
 
-def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
+def _linear_gains(engine: WorkingSet, row: Programmes) -> dict[int, float]:
     """Fall of δ of (11) in the same way, by one programme whose rows are released in turn.
 
     δ falls only without a sample that has a price (a dual variable) in the optimum: without another one the same
@@ -171,13 +170,13 @@ def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
     """
     if not row.unknown:
         return {}
-    own = engine.programmes[row.i].trial()
-    trial, simplex = own.row, own.minimax()
+    trial = row.trial()
+    simplex = trial.minimax()
     owner, least = np.full(len(trial.asked), -1), np.full(len(trial.asked), -np.inf)
 
     def add(pool: Index) -> None:
         nonlocal owner, least
-        rows, h = own.rows(pool)
+        rows, h = trial.rows(pool)
         simplex.add(rows, h)
         owner, least = np.concatenate([owner, np.tile(pool, len(h) // len(pool))]), np.concatenate([least, h])
 
@@ -207,7 +206,7 @@ def _linear_gains(engine: WorkingSet, row: Row) -> dict[int, float]:
     return gains
 
 
-def _solve(engine: WorkingSet, own: Programmes, criterion: str) -> None:
+def _solve(engine: WorkingSet, row: Programmes, criterion: str) -> None:
     if criterion == "lp":
-        own.row.limit = None
-    engine._settle(own, Programmes.quadratic if criterion == "qp" else Programmes.linear)
+        row.limit = None
+    engine._settle(row, Programmes.quadratic if criterion == "qp" else Programmes.linear)

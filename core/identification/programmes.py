@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -68,21 +69,18 @@ GOOD = 1e-7
 """Relative distance from the optimum, repair included, above which a row is solved again, in refined coordinates."""
 
 
-class Programmes:
-    """What solvers start from for a row, and its programmes; answers go to the row by its own methods.
+class Programmes(Row):
+    """A row with its programmes, and what their solvers start from; takes the arguments of `Row`."""
 
-    `row`: whose samples and scaled unknowns they are; `like`: programmes of a row that is nearly the same.
-    """
-
-    def __init__(self, row: Row, like: Programmes | None = None) -> None:
-        self.row = row
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
         self._unit = 1.0  # of the δ that the nominal elements alone decide, in units of the row's limit
         self.allowed = 0.0  # δ that the ties may have, in the same units
         self.exact = False  # (11) by the simplex method
         self.least = 0.0  # δ of (11) that it or `nominal` found, in the same units as the limit
         self._face: Face | None = None
-        self.attempt: tuple[float, float] = _ATTEMPTS[0] if like is None else like.attempt
-        self._last: dict[str, Answer] = {} if like is None else dict(like._last)  # to the last programme of a kind
+        self.attempt: tuple[float, float] = _ATTEMPTS[0]
+        self._last: dict[str, Answer] = {}  # to the last programme of a kind
         self._start_simplex_afresh()
 
     def _start_simplex_afresh(self) -> None:
@@ -91,37 +89,40 @@ class Programmes:
 
     def refine(self) -> None:
         """Go over to refined coordinates of the row, in which solvers start afresh."""
-        self.row.refine()
+        super().refine()
         self.attempt, self._last = _ATTEMPTS[0], {}
         self._start_simplex_afresh()
 
     def release(self, whole: bool = False) -> None:
         """Hold the working set alone; unless the whole of it, what the last programmes rest on and the nearest."""
-        row, slack, pool = self.row, self.row.slack(), self.row.pool
+        slack, pool = self.slack(), self.pool
         kept, active = np.full(len(pool), whole), {kind: self._sides(kind) for kind in self._last}
-        kept[np.argsort(slack[pool])[: row.r + row.q]] = True
+        kept[np.argsort(slack[pool])[: self.r + self.q]] = True
         for sides in active.values():
             if sides is not None:
                 kept[: sides.shape[1]] |= sides.any(axis=0)
         more = np.setdiff1d(np.flatnonzero(slack < 0.0), pool)  # outside by rounding
-        row.pool = np.concatenate([pool[kept], more])
-        row.hold(row.samples[np.sort(row.pool)])
+        self.pool = np.concatenate([pool[kept], more])
+        self.hold(self.samples[np.sort(self.pool)])
         for kind, last in self._last.items():
             if last.active is not None and (sides := active[kind]) is not None:
                 some = sides[:, kept[: sides.shape[1]]]
-                some = np.pad(some, ((0, 0), (0, len(row.pool) - some.shape[1]))).ravel()
-                start, asked = last.active[: len(last.xi)], last.active[len(last.active) - len(row.asked) :]
+                some = np.pad(some, ((0, 0), (0, len(self.pool) - some.shape[1]))).ravel()
+                start, asked = last.active[: len(last.xi)], last.active[len(last.active) - len(self.asked) :]
                 self._last[kind] = replace(last, active=np.concatenate([start, some, asked]))
         self._start_simplex_afresh()
 
     def drop(self, index: int) -> None:
         """Take a transition out of what the row holds."""
-        self.row.drop(index)
+        super().drop(index)
         self._start_simplex_afresh()
 
-    def trial(self) -> Programmes:
-        """Those of a copy of the row, which can be solved on its own."""
-        return Programmes(self.row.trial(), self)
+    def trial(self) -> Self:
+        """A row that can be solved on its own, from where the last programmes of this one ended."""
+        trial = super().trial()
+        trial._last = dict(self._last)
+        trial._start_simplex_afresh()
+        return trial
 
     def _solve(
         self,
@@ -137,18 +138,17 @@ class Programmes:
 
         objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
         """
-        row = self.row
-        feasible = FEASIBLE if row.refined else ROUGH
+        feasible = FEASIBLE if self.refined else ROUGH
         last, known, start = self._last.get(kind), self._sides(kind), None
-        if last is not None and last.active is not None and known is not None and len(row.pool):
-            known = known[:, : len(row.pool)]  # the pool grows, but for discards
-            start = np.zeros(len(lower) + len(h) + len(row.asked), dtype=np.int32)
+        if last is not None and last.active is not None and known is not None and len(self.pool):
+            known = known[:, : len(self.pool)]  # the pool grows, but for discards
+            start = np.zeros(len(lower) + len(h) + len(self.asked), dtype=np.int32)
             start[: len(lower)] = last.active[: len(lower)]
             there = start[len(lower) : len(lower) + len(h)].reshape(known.shape[0], -1)
             there[:, : known.shape[1]] = known
         begin = np.zeros(len(lower)) if last is None else last.xi
-        if last is None and row.basis is None:
-            begin[: row.r] = row.scaled()[0]
+        if last is None and self.basis is None:
+            begin[: self.r] = self.scaled()[0]
         limits = *self._with_asked(G, h), lower, upper
         inside = len(lower) >= MANY and (kind != "regularised" or last is None)  # that moves on with its tie-break
         accurate = len(lower) >= VERY_MANY and kind == "quadratic"
@@ -172,7 +172,7 @@ class Programmes:
         last = self._last.get(kind)
         if last is None or last.active is None:
             return None
-        return last.active[len(last.xi) : len(last.active) - len(self.row.asked)].reshape(_ROWS[kind], -1)
+        return last.active[len(last.xi) : len(last.active) - len(self.asked)].reshape(_ROWS[kind], -1)
 
     def carrying(self, slack: float) -> Index:
         """Samples whose absence may lower the optimum of (10): with multipliers, or next to the edge if none are known.
@@ -180,9 +180,9 @@ class Programmes:
         Without another one the same multipliers prove the same optimum.
         """
         sides = self._sides("quadratic")
-        if sides is None or sides.shape[1] != len(self.row.pool):
-            return np.flatnonzero(self.row.slack() < slack)
-        return np.asarray(self.row.pool[(sides != 0).any(axis=0)])
+        if sides is None or sides.shape[1] != len(self.pool):
+            return np.flatnonzero(self.slack() < slack)
+        return np.asarray(self.pool[(sides != 0).any(axis=0)])
 
     def _active_sets(self, kind: str, count: int) -> list[Sense | None]:
         """What to make multipliers of: what was active in the last programme of a kind and size, then the slack."""
@@ -191,79 +191,77 @@ class Programmes:
 
     def quadratic(self) -> str:
         """Solve (10) on the working set; of many unknowns, with what is next to join it."""
-        row = self.row
-        if row.r + row.q >= VERY_MANY:
-            row.widen_pool((row.r + row.q) // 2, np.inf)
+        if self.r + self.q >= VERY_MANY:
+            self.widen_pool((self.r + self.q) // 2, np.inf)
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
-            return row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
+            return self.hessian(self.gram, self.gradient, factor * TIE_BREAK, ridge)
 
-        limits = *row.containment(row.pool), row.lower, row.upper
+        limits = *self.containment(self.pool), self.lower, self.upper
         answer, solver = self._solve("quadratic", objective, *limits, any_solver=True)
-        row.store(answer)
+        self.store(answer)
         return solver
 
     def regularised(self) -> str:
         """Solve (11) with a little of the squared widths on the working set."""
-        row = self.row
-        size = row.r + row.q
+        size = self.r + self.q
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
-            H, f = row.hessian(row.plain, row.plain_linear, factor * BOUNDED_TIE_BREAK, ridge)
+            H, f = self.hessian(self.plain, self.plain_gradient, factor * BOUNDED_TIE_BREAK, ridge)
             whole = REGULARISATION * np.eye(size + 1)
             whole[:size, :size] = REGULARISATION * H
             return whole, np.append(REGULARISATION * f, 1.0)
 
-        limits = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
-        answer, solver = self._solve("regularised", objective, *self.rows(row.pool), *limits)
-        row.store_limited(answer)
+        limits = np.append(self.lower, 0.0), np.append(self.upper, np.inf)
+        answer, solver = self._solve("regularised", objective, *self.rows(self.pool), *limits)
+        self.store_limited(answer)
         return solver
 
     def nominal(self) -> str:
         """Solve (11) on the working set for the nominal elements alone, with half-widths of one size (`box`)."""
-        row, box = self.row, self.box
+        box = self.box
         assert box is not None
         if "nominal" not in self._last:
             self._set_unit()
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
             weight = factor * REGULARISATION * BOUNDED_TIE_BREAK
-            H = REGULARISATION * np.eye(row.r + 1)
-            H[:-1, :-1] = weight * (row.centre + ridge * np.eye(row.r))
-            return H, np.append(-weight * row.target, 1.0)
+            H = REGULARISATION * np.eye(self.r + 1)
+            H[:-1, :-1] = weight * (self.centre + ridge * np.eye(self.r))
+            return H, np.append(-weight * self.target, 1.0)
 
-        limits = np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf)
-        answer, solver = self._solve("nominal", objective, *self._distances(row.pool), *limits)
+        limits = np.append(self.lower[: self.r], 0.0), np.append(self.upper[: self.r], np.inf)
+        answer, solver = self._solve("nominal", objective, *self._distances(self.pool), *limits)
         delta, self._face = answer[-1] * self._unit, None
-        row.store_limited(np.concatenate([answer[:-1], box * delta, [delta]]))
+        self.store_limited(np.concatenate([answer[:-1], box * delta, [delta]]))
         return solver
 
     def _set_unit(self) -> None:
-        self._unit = float(np.median(self.row.width[self.row.pool] if len(self.row.pool) else self.row.width))
+        self._unit = float(np.median(self.width[self.pool] if len(self.pool) else self.width))
 
     def linear(self) -> str:
         """Solve (11) on the working set, by the simplex method."""
-        row, box = self.row, self.box
+        box = self.box
         if box is not None and self._simplex is None:
             self._set_unit()
-        G, h = self.rows(row.pool) if box is None else self._distances(row.pool)
+        G, h = self.rows(self.pool) if box is None else self._distances(self.pool)
         kinds = 3 if box is None else 2
         number = self._numbers(kinds)
         if self._simplex is None:  # of each sample the side that it is on, and its width
             self._simplex = self.minimax(nominal_alone=box is not None)
-            theta, d = row.scaled()
-            away = row.plain_phi[row.pool] @ theta - row.y[row.pool]
-            half = row.psi[row.pool] @ d + row.half[row.pool]
+            theta, d = self.scaled()
+            away = self.plain_phi[self.pool] @ theta - self.y[self.pool]
+            half = self.psi[self.pool] @ d + self.half[self.pool]
             outside = np.concatenate([away + half, half - away]) < 0.0
             width = outside.reshape(2, -1).any(axis=0)
             wanted = np.concatenate([outside, width]) if box is None else outside
         else:
             wanted = G @ self._simplex.solution() - h < -TOLERANCE
             idle = self._simplex.idle(_HELD * (G.shape[1] - 1))
-            idle = idle[idle >= len(row.asked)]  # those come first, and stay
+            idle = idle[idle >= len(self.asked)]  # those come first, and stay
             if len(idle):
                 self._simplex.drop(idle)
-                self._known = np.delete(self._known, idle - len(row.asked))
+                self._known = np.delete(self._known, idle - len(self.asked))
         others = ~np.isin(number, self._known)  # rows that the simplex method does not have
         while True:  # of a sample few have more than one row that matters
             wanted &= others
@@ -279,7 +277,7 @@ class Programmes:
             delta = answer[-1] * self._unit
             answer = np.concatenate([answer[:-1], box * delta, [delta]])
         self.least, self._face = float(answer[-1]), None
-        row.store_limited(answer)
+        self.store_limited(answer)
         return "HiGHS simplex"
 
     @property
@@ -291,22 +289,21 @@ class Programmes:
         only unknowns of δ, and what other half-widths are among its optima is left to the ties. None where the
         structure or the recordings have no such half-widths.
         """
-        row = self.row
-        sums, columns = row.sums, row.columns
-        least_known = row.fixed_d.any() or (row.lower[row.r :] > 0.0).any()
-        if least_known or sums.gram is not None or sums.coupled is not None or not len(row.samples):
+        sums, columns = self.sums, self.columns
+        least_known = self.fixed_d.any() or (self.lower[self.r :] > 0.0).any()
+        if least_known or sums.gram is not None or sums.coupled is not None or not len(self.samples):
             return None
         for k, term in enumerate(columns.half, start=len(sums.low)):
-            wanted, found = np.zeros((columns.count, len(row.d) // columns.count)), np.zeros(len(row.d))
+            wanted, found = np.zeros((columns.count, len(self.d) // columns.count)), np.zeros(len(self.d))
             wanted[:, k] = 1.0
-            unknown = wanted.ravel()[row.free_psi]
-            row.psi_columns.put(found, unknown)
-            there = row.size_unit > 0.0  # the others are 0 in every sample
+            unknown = wanted.ravel()[self.free_psi]
+            self.psi_columns.put(found, unknown)
+            there = self.size_unit > 0.0  # the others are 0 in every sample
             constant = not term.times_dt or sums.dt_min == sums.dt_max
             all_of_it = np.array_equal(found[there], wanted.ravel()[there])
-            if constant and all_of_it and np.isinf(row.upper[row.r :][unknown > 0.0]).all():
-                box = unknown / (row.unit_psi * row.scale)
-                return np.asarray(box / (row.width[0] * float(row.psi[0] @ box)))
+            if constant and all_of_it and np.isinf(self.upper[self.r :][unknown > 0.0]).all():
+                box = unknown / (self.unit_psi * self.scale)
+                return np.asarray(box / (self.width[0] * float(self.psi[0] @ box)))
         return None
 
     def _distances(self, pool: Index) -> tuple[Array, Array]:
@@ -314,32 +311,30 @@ class Programmes:
 
         δ is in units of order one, whatever the weights are.
         """
-        row = self.row
-        width = row.width[pool] / self._unit
+        width = self.width[pool] / self._unit
         unit = np.minimum(1.0, 1.0 / width)
-        phi, y = row.along(pool) * (width * unit)[:, None], row.y[pool] * width * unit
+        phi, y = self.along(pool) * (width * unit)[:, None], self.y[pool] * width * unit
         sides = np.hstack([phi, unit[:, None]]), np.hstack([-phi, unit[:, None]])
         return np.vstack(sides), np.concatenate([y, -y])
 
     def least_width(self) -> float:
         """A lower bound of δ, in units of scale, by multipliers; -inf where there are none."""
-        row, bound = self.row, -np.inf
-        assert row.limit is not None
-        G, h = self._with_asked(*self.rows(row.pool))
-        xi, cost = np.append(np.concatenate(row.scaled()), row.limit), np.append(np.zeros(row.r + row.q), 1.0)
-        low, high = np.append(row.lower, 0.0), np.append(row.upper, np.inf)
+        bound = -np.inf
+        assert self.limit is not None
+        G, h = self._with_asked(*self.rows(self.pool))
+        xi, cost = np.append(np.concatenate(self.scaled()), self.limit), np.append(np.zeros(self.r + self.q), 1.0)
+        low, high = np.append(self.lower, 0.0), np.append(self.upper, np.inf)
         for active in self._active_sets("regularised", len(xi) + len(h)):
             bound = max(bound, linear_bound(cost, G, h, low, high, xi, active)[0])
-            if row.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
+            if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
                 break
         return bound
 
     def minimax(self, nominal_alone: bool = False) -> Simplex:
         """Minimise δ, the last unknown, after all others or the nominal elements alone."""
-        row = self.row
-        size = row.r if nominal_alone else row.r + row.q
+        size = self.r if nominal_alone else self.r + self.q
         cost = np.append(np.zeros(size), 1.0)
-        simplex = Simplex(cost, np.append(row.lower[:size], 0.0), np.append(row.upper[:size], np.inf))
+        simplex = Simplex(cost, np.append(self.lower[:size], 0.0), np.append(self.upper[:size], np.inf))
         simplex.add(*self._with_asked(np.empty((0, len(cost))), np.empty(0)))
         return simplex
 
@@ -349,28 +344,27 @@ class Programmes:
         The programme that is solved adds the tie-break and the ridge to the squared widths; both are bounded. inf
         where the columns are so collinear that the ridge is not.
         """
-        row = self.row
-        if not row.unknown:
+        if not self.unknown:
             return 0.0
-        theta, d = row.scaled()
+        theta, d = self.scaled()
         factor, ridge = self.attempt
-        if row.basis is not None:
-            theta = np.linalg.lstsq(row.basis, theta, rcond=None)[0].astype(np.float64)
-        H, f = row.hessian(row.gram, row.linear, factor * TIE_BREAK, ridge)
+        if self.basis is not None:
+            theta = np.linalg.lstsq(self.basis, theta, rcond=None)[0].astype(np.float64)
+        H, f = self.hessian(self.gram, self.gradient, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        programme = Programme(H, f, *self._with_asked(*row.containment(row.pool)), row.lower, row.upper)
-        objective, value = float(0.5 * xi @ H @ xi + f @ xi), max(row.value(d), row.least_value())
+        programme = Programme(H, f, *self._with_asked(*self.containment(self.pool)), self.lower, self.upper)
+        objective, value = float(0.5 * xi @ H @ xi + f @ xi), max(self.value(d), self.least_value())
         above = np.inf
         for active in self._active_sets("quadratic", len(f) + len(programme.h)):
             above = min(above, objective - dual_bound(programme, xi, active))
             if above <= GOOD * value:
                 break
-        weight = factor * TIE_BREAK * float(np.diagonal(row.gram).min(initial=1.0))
-        spread = max(float(d @ row.plain @ d), 0.0)
+        weight = factor * TIE_BREAK * float(np.diagonal(self.gram).min(initial=1.0))
+        spread = max(float(d @ self.plain @ d), 0.0)
         smallest = self._least_effect()
-        largest = (row.rms_step / row.scale + np.sqrt(spread) + float(np.abs(row.half).max(initial=0.0))) ** 2
+        largest = (self.rms_step / self.scale + np.sqrt(spread) + float(np.abs(self.half).max(initial=0.0))) ** 2
         lifted = 0.5 * weight * ridge * 4.0 * largest / smallest if smallest > 1e-13 else np.inf
-        ties = factor * TIE_BREAK * (1.0 if row.sums.gram is None else float(len(d)))
+        ties = factor * TIE_BREAK * (1.0 if self.sums.gram is None else float(len(d)))
         return float(max(above, 0.0) + lifted) / value + ties
 
     def _least_effect(self) -> float:
@@ -379,14 +373,13 @@ class Programmes:
         A state or control that schedules the model moves with the drift of all knots: some elements can change
         together without moving any sample, and of those no one needs to be large.
         """
-        row = self.row
-        free = np.isinf(row.lower[: row.r]) & np.isinf(row.upper[: row.r])
-        values, directions = np.linalg.eigh(row.centre)
+        free = np.isinf(self.lower[: self.r]) & np.isinf(self.upper[: self.r])
+        values, directions = np.linalg.eigh(self.centre)
         for value, direction in zip(values.tolist(), directions.T, strict=True):
             if value > 1e-13 or not free[np.abs(direction) > COLLINEAR].all():
                 return float(value)
-            along = direction if row.basis is None else row.basis @ direction
-            if np.abs(row.plain_phi @ along).max(initial=0.0) > COLLINEAR:
+            along = direction if self.basis is None else self.basis @ direction
+            if np.abs(self.plain_phi @ along).max(initial=0.0) > COLLINEAR:
                 return float(value)
         return 1.0
 
@@ -396,40 +389,38 @@ class Programmes:
         If another row is wider by many orders of magnitude, what it weighs here is as many times steeper than the
         row's own part. Either this row follows it, and is solved in its units, or the row is as narrow as can be.
         """
-        row = self.row
         try:
             return self.quadratic()
         except FitError:
-            steep = float(np.abs(row.linear).max(initial=0.0))
+            steep = float(np.abs(self.gradient).max(initial=0.0))
             if steep <= 1.0:
                 raise
-        G, h = self._with_asked(*row.containment(row.pool))
-        if -row.linear.min() >= row.linear.max():
-            H, f = row.hessian(row.gram, row.linear, TIE_BREAK)
-            answer = solve_qp(Programme(H, f / steep, G, h / steep, row.lower / steep, row.upper / steep))
-            row.store(answer.xi * steep)
+        G, h = self._with_asked(*self.containment(self.pool))
+        if -self.gradient.min() >= self.gradient.max():
+            H, f = self.hessian(self.gram, self.gradient, TIE_BREAK)
+            answer = solve_qp(Programme(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep))
+            self.store(answer.xi * steep)
             return answer.solver
-        simplex = Simplex(np.concatenate([np.zeros(row.r), row.linear / steep]), row.lower, row.upper)
+        simplex = Simplex(np.concatenate([np.zeros(self.r), self.gradient / steep]), self.lower, self.upper)
         simplex.add(G, h)
-        row.store(simplex.solve())
+        self.store(simplex.solve())
         return "HiGHS simplex"
 
     def collinear(self) -> bool:
         """Tell whether columns are so alike that the simplex method's tolerance is none on the envelope."""
-        return self.row.r > 0 and not self.row.refined and self._least_effect() < 1e-8
+        return self.r > 0 and not self.refined and self._least_effect() < 1e-8
 
     def least_linear(self, cost: Array, most: Array | None = None) -> float:
         """Minimise costᵀ d over scaled half-widths that contain the working set.
 
         `cost` (q,): of the free half-widths; `most` (q,): they are no larger than this.
         """
-        row = self.row
-        upper = row.upper.copy()
+        upper = self.upper.copy()
         if most is not None:
-            upper[row.r :] = np.minimum(upper[row.r :], most)
-        simplex = Simplex(np.concatenate([np.zeros(row.r), cost]), row.lower, upper)
-        simplex.add(*self._with_asked(*row.containment(row.pool)))
-        return float(cost @ simplex.solve()[row.r :])
+            upper[self.r :] = np.minimum(upper[self.r :], most)
+        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, upper)
+        simplex.add(*self._with_asked(*self.containment(self.pool)))
+        return float(cost @ simplex.solve()[self.r :])
 
     def linear_gap(self) -> float:
         """As `duality_gap`, by the simplex method.
@@ -437,9 +428,8 @@ class Programmes:
         (10) is convex, so its optimum is no less than its linearisation here at any elements that contain
         the working set. It needs neither multipliers nor a Hessian that can be inverted.
         """
-        row = self.row
-        _, d = row.scaled()
-        slope = row.gram @ d + row.linear
+        _, d = self.scaled()
+        slope = self.gram @ d + self.gradient
         largest = float(np.abs(slope).max(initial=0.0))
         if largest == 0.0:
             return 0.0
@@ -447,16 +437,15 @@ class Programmes:
             least = self.least_linear(slope / largest) * largest
         except FitError:
             return np.inf
-        return max(float(slope @ d) - least, 0.0) / max(row.value(d), row.least_value())
+        return max(float(slope @ d) - least, 0.0) / max(self.value(d), self.least_value())
 
     def rows(self, pool: Index) -> tuple[Array, Array]:
         """G [ξ δ] >= h: (8), (9) and the limit on the width for samples of the pool."""
-        row = self.row
-        G, h = row.containment(pool)
-        width = row.width[pool]
+        G, h = self.containment(pool)
+        width = self.width[pool]
         unit = np.minimum(1.0, 1.0 / width)[:, None]  # δ - width x (ψ d + half) >= 0, scaled to order one
-        rows = np.hstack([np.zeros((len(pool), row.r)), -width[:, None] * row.psi[pool], np.ones((len(pool), 1))])
-        limits = np.concatenate([h, width * row.half[pool] * unit[:, 0]])
+        rows = np.hstack([np.zeros((len(pool), self.r)), -width[:, None] * self.psi[pool], np.ones((len(pool), 1))])
+        limits = np.concatenate([h, width * self.half[pool] * unit[:, 0]])
         return np.vstack([np.hstack([G, np.zeros((len(G), 1))]), rows * unit]), limits
 
     def bounded(self) -> str:
@@ -464,18 +453,18 @@ class Programmes:
 
         What has a price is met with equality in every optimum, so it stays as it is.
         """
-        row, face = self.row, self.face()
-        G, h = self.rows(row.pool)
+        face = self.face()
+        G, h = self.rows(self.pool)
         rows, limits = self._with_asked(G[:, :-1], h - G[:, -1] * self.allowed)
-        more = len(row.pool) - face.samples.shape[1]  # the pool grew since
+        more = len(self.pool) - face.samples.shape[1]  # the pool grew since
         tight = np.concatenate([face.bounds, np.pad(face.samples, ((0, 0), (0, more))).ravel(), face.asked])
-        H, f = row.hessian(row.plain, row.plain_linear, BOUNDED_TIE_BREAK)
+        H, f = self.hessian(self.plain, self.plain_gradient, BOUNDED_TIE_BREAK)
         limits = np.minimum(limits - rows @ face.xi, 0.0)  # the optimum satisfies them, but for rounding
-        programme = Programme(H, f + H @ face.xi, rows, limits, row.lower - face.xi, row.upper - face.xi)
+        programme = Programme(H, f + H @ face.xi, rows, limits, self.lower - face.xi, self.upper - face.xi)
         self.attempt, step, solver = _ATTEMPTS[0], np.zeros(len(face.xi)), ""
         with suppress(FitError):  # or the ties stay as they are
             step, solver = solve_on_face(programme, tight)
-        row.store_limited(np.append(face.xi + step, self.allowed))
+        self.store_limited(np.append(face.xi + step, self.allowed))
         return solver or ("HiGHS simplex" if self.exact else self._last["nominal"].solver)
 
     def face(self) -> Face:
@@ -484,32 +473,32 @@ class Programmes:
         Raises FitError where no multipliers prove that it was one.
         """
         if self._face is None:
-            row, box, count = self.row, self.box, len(self.row.pool)
+            box, count = self.box, len(self.pool)
             kinds = 3 if box is None else 2
             xi, prices = self._priced(kinds) if self.exact else self._proven()
             size = len(xi) - 1
             tight = np.abs(prices) > _POSITIVE * np.abs(prices).max(initial=0.0)
-            bounds, samples, asked = np.split(tight, [size, len(tight) - len(row.asked)])
+            bounds, samples, asked = np.split(tight, [size, len(tight) - len(self.asked)])
             samples = samples.reshape(kinds, count)
             if box is not None:  # a sample that is as far off as it may be is as wide as it may be
                 xi = np.concatenate([xi[:-1], box * (xi[-1] * self._unit), xi[-1:]])
-                bounds, samples = np.pad(bounds, (0, row.q)), np.vstack([samples, samples.any(axis=0)])
+                bounds, samples = np.pad(bounds, (0, self.q)), np.vstack([samples, samples.any(axis=0)])
             self._face = Face(xi[:-1], bounds, samples, asked)
         return self._face
 
     def _priced(self, kinds: int) -> tuple[Array, Array]:
         """[ξ δ] of the simplex method, and its prices of [bounds of ξ; rows of the pool; what is asked]."""
         assert self._simplex is not None
-        duals, number, asked = self._simplex.duals(), self._numbers(kinds), len(self.row.asked)
+        duals, number, asked = self._simplex.duals(), self._numbers(kinds), len(self.asked)
         order, prices = np.argsort(number), np.zeros(len(number))
         prices[order[np.searchsorted(number, self._known, sorter=order)]] = duals[asked:]
         return self._simplex.solution(), np.concatenate([self._simplex.reduced_costs()[:-1], prices, duals[:asked]])
 
     def _proven(self) -> tuple[Array, Array]:
         """The same of `nominal`, by the multipliers that prove its δ, which becomes `least`."""
-        row, xi = self.row, self._last["nominal"].xi
-        G, h = self._with_asked(*self._distances(row.pool))
-        limits = np.append(row.lower[: row.r], 0.0), np.append(row.upper[: row.r], np.inf)
+        xi = self._last["nominal"].xi
+        G, h = self._with_asked(*self._distances(self.pool))
+        limits = np.append(self.lower[: self.r], 0.0), np.append(self.upper[: self.r], np.inf)
         for active in self._active_sets("nominal", len(xi) + len(h)):
             bound, prices = linear_bound(np.eye(len(xi))[-1], G, h, *limits, xi, active)
             if xi[-1] <= (1.0 + WIDTH_SLACK) * bound:
@@ -519,7 +508,7 @@ class Programmes:
 
     def _numbers(self, kinds: int) -> Index:
         """A number for each row of the samples of the pool, by which the simplex method's are known."""
-        index = self.row.samples.index[self.row.pool]
+        index = self.samples.index[self.pool]
         return np.asarray(kinds * np.tile(index, kinds) + np.repeat(np.arange(kinds), len(index)))
 
     def polish(self) -> None:
@@ -527,56 +516,53 @@ class Programmes:
 
         Beside the squared widths it weighs so little that their rounding shows in the elements.
         """
-        row = self.row
-        if row.r == 0:
+        if self.r == 0:
             return
-        phi, psi = row.along(row.pool), row.psi[row.pool]
-        half = psi @ (row.d[row.free_psi] / (row.unit_psi * row.scale)) + row.half[row.pool]
-        y = row.y[row.pool]
+        phi, psi = self.along(self.pool), self.psi[self.pool]
+        half = psi @ (self.d[self.free_psi] / (self.unit_psi * self.scale)) + self.half[self.pool]
+        y = self.y[self.pool]
         try:
             inside = self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half]))
-            H, limits = row.centre + self.attempt[1] * np.eye(row.r), (row.lower[: row.r], row.upper[: row.r])
-            programme = Programme(H, -row.target, *inside, *limits)
-            feasible = FEASIBLE if row.refined else ROUGH
-            if row.r < MANY:
+            H, limits = self.centre + self.attempt[1] * np.eye(self.r), (self.lower[: self.r], self.upper[: self.r])
+            programme = Programme(H, -self.target, *inside, *limits)
+            feasible = FEASIBLE if self.refined else ROUGH
+            if self.r < MANY:
                 answer = solve_qp(programme, any_solver=False, feasible=feasible)
             else:
-                begin = row.scaled()[0] if row.basis is None else np.zeros(row.r)
+                begin = self.scaled()[0] if self.basis is None else np.zeros(self.r)
                 answer = solve_near(programme, begin, feasible=feasible, like=programme[:2])
         except FitError:  # the half-widths leave no room at all
             return
-        row.store_theta(answer.xi)
+        self.store_theta(answer.xi)
 
     def contradiction(self) -> tuple[int, float, int] | None:
         """A sample that no elements within the structure can contain, alone or with others."""
-        row = self.row
 
         def least(pool: Index) -> tuple[Array, Array, Array]:
             simplex = self.minimax()
-            G, h = row.containment(pool)
+            G, h = self.containment(pool)
             simplex.add(np.hstack([G, np.ones((len(G), 1))]), h)
             answer = simplex.solve()
-            prices = np.abs(simplex.duals()[len(row.asked) :]).reshape(2, -1).sum(axis=0)
+            prices = np.abs(simplex.duals()[len(self.asked) :]).reshape(2, -1).sum(axis=0)
             return answer, (h - G @ answer[:-1]).reshape(2, -1).max(axis=0), prices
 
-        answer, short, prices = least(row.pool)
+        answer, short, prices = least(self.pool)
         if answer[-1] <= 1e-9:
             return None
         against = np.flatnonzero(prices > 1e-9 * prices.max(initial=0.0))  # they prove that there is no answer
         worst = int(against[np.argmax(short[against])]) if len(against) else int(np.argmax(short))
         distance, together = float(answer[-1]), len(against) - 1
         for position in against[np.argsort(-short[against])]:
-            alone = float(least(row.pool[[position]])[0][-1])
+            alone = float(least(self.pool[[position]])[0][-1])
             if alone > 1e-9:
                 worst, distance, together = int(position), alone, 0
                 break
-        sample = int(row.pool[worst])
-        return int(row.samples.index[sample]), distance * float(row.sizes(sample)) * row.scale, max(together, 0)
+        sample = int(self.pool[worst])
+        return int(self.samples.index[sample]), distance * float(self.sizes(sample)) * self.scale, max(together, 0)
 
     def _with_asked(self, G: Array, h: Array) -> tuple[Array, Array]:
         """Rows G ξ >= h, and what the structure asks of θ if that is no bound of an unknown."""
-        row = self.row
-        if not len(row.asked):
+        if not len(self.asked):
             return G, h
-        rows = np.hstack([row.asked, np.zeros((len(row.asked), G.shape[1] - row.r))])
-        return np.vstack([G, rows]), np.concatenate([h, row.asked_limits])
+        rows = np.hstack([self.asked, np.zeros((len(self.asked), G.shape[1] - self.r))])
+        return np.vstack([G, rows]), np.concatenate([h, self.asked_limits])

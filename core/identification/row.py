@@ -14,6 +14,7 @@ from __future__ import annotations
 import copy
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -180,8 +181,8 @@ class Row:
         target = sums.target[:, i] - sums.centre @ self.fixed_theta
         self.target = self.phi_columns.take(target) * self.unit_phi / (sums.count * self.scale)
         plain = self._gram(sums.plain_gram, sums.count)
-        self.plain, self.plain_linear, _ = plain
-        self.gram, self.linear, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
+        self.plain, self.plain_gradient, _ = plain
+        self.gram, self.gradient, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
         self.basis: Array | None = None  # scaled θ = basis η, in refined coordinates
         self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: constraints of the structure on θ there
         self.asked_limits: Array = np.empty(0)
@@ -392,7 +393,7 @@ class Row:
         each = [np.argsort(slack)[:count] for slack in self.slacks() if slack is not None]
         return np.asarray(self.samples.index[np.column_stack(each).ravel()])
 
-    def trial(self) -> Row:
+    def trial(self) -> Self:
         """A row that can be solved on its own, sharing what is only read."""
         trial = copy.copy(self)
         trial.theta, trial.d = self.theta.copy(), self.d.copy()
@@ -454,7 +455,7 @@ class Row:
         H[self.r :, self.r :] = gram + 1e-13 * np.diag(diagonal)
         return H, np.concatenate([-weight * self.target, linear])
 
-    def among(self, coupled: Array, widths: list[Array]) -> None:
+    def join_others(self, coupled: Array, widths: list[Array]) -> None:
         """Take the row's part of (10) with full weights, given the other rows, as its own.
 
         `coupled` (n q, n q): of `Moments`; `widths` (q,): half-widths of all rows.
@@ -467,14 +468,14 @@ class Row:
         gram = self.psi_columns.square(coupled[mine, mine]) * np.outer(unit, unit)
         self.largest = float(np.diagonal(gram).max(initial=0.0)) or 1.0
         self.gram = gram / self.largest
-        self.linear = self.psi_columns.take(coupled[mine] @ fixed) * unit / self.largest
+        self.gradient = self.psi_columns.take(coupled[mine] @ fixed) * unit / self.largest
 
     def value(self, d: Array) -> float:
         """Return half the mean of the squared half-widths of all samples, in scaled units.
 
         `d` (q,): scaled half-widths.
         """
-        return max(float(0.5 * d @ self.gram @ d + self.linear @ d) + self.known, 0.0)
+        return max(float(0.5 * d @ self.gram @ d + self.gradient @ d) + self.known, 0.0)
 
     def least_value(self) -> float:
         """Return the `value` of an envelope so narrow that it is rounding."""
@@ -511,5 +512,5 @@ class Row:
         """Estimate what lifting the half-widths over the violation that is left adds to the optimum of (10)."""
         _, d = self.scaled()
         outside = self.outside()
-        slope = float((self.gram @ d + self.linear).sum())
+        slope = float((self.gram @ d + self.gradient).sum())
         return outside * slope / max(self.value(d), self.least_value()) if outside > 0.0 else 0.0

@@ -27,7 +27,7 @@ from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Candidate, Judged, Samples
 from uncertain_lti.identification.programmes import GOOD, WIDTH_SLACK, Programmes
 from uncertain_lti.identification.regimes import tied_blocks
-from uncertain_lti.identification.row import JOIN, LEAST, InfeasibleError, Row
+from uncertain_lti.identification.row import JOIN, LEAST, InfeasibleError
 from uncertain_lti.identification.structure import Structure, narrowed
 
 _FURTHER = 2.5
@@ -38,7 +38,7 @@ _FURTHEST, _MANY = 4_000, 100
 """Transitions that join them, those furthest from least squares, about: nearly all that decide are among them. With
 as many unknowns a row its programmes take longer than the pass that finds them."""
 MAX_ROUNDS, FEW_ROUNDS = 200, 60
-Settle = Callable[[Row], None]
+Settle = Callable[[Programmes], None]
 _HELD_BYTES = 180_000_000
 """Memory for the samples of the rows that are proven together, about."""
 _NEAREST = 4_000
@@ -104,10 +104,9 @@ class WorkingSet:
             bounds = narrowed(bounds, shared)
         self.half_limits = bounds[2:]  # least and largest half-widths that the structure allows, (q, n) each
         self.rows = [
-            Row(i, self.sums, columns, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
+            Programmes(i, self.sums, columns, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
             for i in range(fleet.n)
         ]
-        self.programmes = [Programmes(row) for row in self.rows]
         self.solvers: set[str] = set()
         self.passes = 1
         self._row_rounds = np.zeros(fleet.n, dtype=np.intp)  # each row has its own thread
@@ -116,7 +115,7 @@ class WorkingSet:
         self._nearest_of: dict[int, Index] = {}  # of rows that were released
         self.keeps = False  # working sets of rows that are done, which choosing what to discard looks into
         self._together = False  # (10) with full weights: the rows meet in the objective
-        self._like: Row | None = None  # the row that held samples last
+        self._like: Programmes | None = None  # the row that held samples last
         self._told = ""  # how far the rows are, before what is said of a pass
 
     def solve(self, criterion: str) -> Solution:
@@ -154,12 +153,12 @@ class WorkingSet:
         if self.sums.coupled is not None:
             return self._coupled_quadratic()
         self._solve(self._settle_quadratic)
-        gaps = np.array(on_cores(Programmes.duality_gap, [(own,) for own in self.programmes]))
+        gaps = np.array(on_cores(Programmes.duality_gap, [(row,) for row in self.rows]))
         again = [row for row in self.rows if row.unknown and not gaps[row.i] + row.lifted_loss() <= GOOD]
         for row, answer, value in self._again(again, self._settle_quadratic, self._lifted):
-            gaps[row.i] = self.programmes[row.i].duality_gap()
+            gaps[row.i] = row.duality_gap()
             if not gaps[row.i] + row.lifted_loss() <= GOOD:
-                gaps[row.i] = min(gaps[row.i], self.programmes[row.i].linear_gap())
+                gaps[row.i] = min(gaps[row.i], row.linear_gap())
             now = self._lifted(row) if row.outside() <= max(1e-6, row.tolerance) else np.inf
             if value <= now * (1.0 + GOOD):  # nothing gained: the elements stay
                 gaps[row.i] = max(gaps[row.i] + value / max(now, 1e-300) - 1.0, 0.0) if now < np.inf else np.inf
@@ -167,15 +166,15 @@ class WorkingSet:
         return replace(self._solution(), gap=float(gaps.max(initial=0.0)))
 
     def _again(
-        self, rows: list[Row], settle: Settle, value: Callable[[Row], float]
-    ) -> list[tuple[Row, tuple[Array, Array, float], float]]:
+        self, rows: list[Programmes], settle: Settle, value: Callable[[Programmes], float]
+    ) -> list[tuple[Programmes, tuple[Array, Array, float], float]]:
         """Solve rows once more, in refined coordinates; what a solver cannot improve stays as it was.
 
         Returns each row with its answer of before, and the value that this had.
         """
         before = [(row, row.answer(), value(row)) for row in rows]
 
-        def improve(row: Row) -> None:
+        def improve(row: Programmes) -> None:
             theta, d, limit = row.theta.copy(), row.d.copy(), row.limit
             try:
                 settle(row)
@@ -187,26 +186,26 @@ class WorkingSet:
             self._settle_and_prove(improve, group)
         return before
 
-    def _refine(self, row: Row) -> None:
+    def _refine(self, row: Programmes) -> None:
         """Refine a row with the first samples at hand, which it may have released."""
         if not self.whole:
             self._hold(row, self._first[row.i])
-        self.programmes[row.i].refine()
+        row.refine()
 
-    def _settle_quadratic(self, row: Row) -> None:
+    def _settle_quadratic(self, row: Programmes) -> None:
         self._settle_or_refine(row, Programmes.quadratic, polish=True)
 
-    def _settle_or_refine(self, row: Row, solve: Callable[[Programmes], str], polish: bool = False) -> None:
+    def _settle_or_refine(self, row: Programmes, solve: Callable[[Programmes], str], polish: bool = False) -> None:
         """Settle a row, in refined coordinates if it does not settle in those of its steps."""
         if not row.refined:
             try:
-                self._settle(self.programmes[row.i], solve, polish)
+                self._settle(row, solve, polish)
                 return
             except FitError:
-                self.programmes[row.i].refine()
-        self._settle(self.programmes[row.i], solve, polish)
+                row.refine()
+        self._settle(row, solve, polish)
 
-    def _lifted(self, row: Row) -> float:
+    def _lifted(self, row: Programmes) -> float:
         """Part of the row in the objective of (10), with the half-widths lifted over what is violated."""
         _, d = row.scaled()
         scaled = row.value(d + row.outside())
@@ -219,14 +218,14 @@ class WorkingSet:
             self._solve(self._settle_in_turn)
             gap = self.coupled_gap()
         if not gap <= GOOD:
-            for own in self.programmes:
-                if not own.row.refined:
-                    own.refine()
+            for row in self.rows:
+                if not row.refined:
+                    row.refine()
             self._settle_and_prove(self._settle_in_turn, self.rows)
             gap = self.coupled_gap()
         return replace(self._solution(), gap=gap)
 
-    def _settle_in_turn(self, _: Row) -> None:
+    def _settle_in_turn(self, _: Programmes) -> None:
         """(10) with full weights by one row at a time, the others as they are.
 
         The rows meet in the objective alone, which is convex and smooth, so going round them descends to the optimum
@@ -237,8 +236,8 @@ class WorkingSet:
         for _number in range(MAX_ROUNDS):
             for row in self.rows:
                 if row.unknown:
-                    row.among(self.sums.coupled, [other.d for other in self.rows])
-                self._settle(self.programmes[row.i], Programmes.among, polish=True)
+                    row.join_others(self.sums.coupled, [other.d for other in self.rows])
+                self._settle(row, Programmes.among, polish=True)
             flat = np.concatenate([row.d for row in self.rows])
             value = float(flat @ self.sums.coupled @ flat)
             if value >= before * (1.0 - 1e-11):
@@ -260,8 +259,7 @@ class WorkingSet:
         least = sum(row.least_value() * row.scale**2 * weight for row, weight in zip(self.rows, weights, strict=True))
         value = max(0.5 * float(flat @ slopes.ravel()), least, 1e-300)
         above = 0.0
-        for own, slope, diagonal in zip(self.programmes, slopes, diagonals, strict=True):
-            row = own.row
+        for row, slope, diagonal in zip(self.rows, slopes, diagonals, strict=True):
             if not row.unknown:
                 continue
             slope = row.psi_columns.take(slope) * row.unit_psi * row.scale
@@ -272,7 +270,7 @@ class WorkingSet:
                 continue
             try:
                 most = self._at_most(row, diagonal) if falls else None
-                above += float(slope @ d) - own.least_linear(slope / largest, most) * largest
+                above += float(slope @ d) - row.least_linear(slope / largest, most) * largest
             except FitError:
                 return np.inf
         return float(max(above, 0.0) / value)
@@ -282,7 +280,7 @@ class WorkingSet:
         """Of any full weight."""
         return max(self.fleet.least_eigenvalue(), 1e-300)
 
-    def _at_most(self, row: Row, diagonal: Array) -> Array:
+    def _at_most(self, row: Programmes, diagonal: Array) -> Array:
         """Largest scaled half-widths that the optimum of (10) with full weights can have, (q,) of the free ones.
 
         Σ w' W w over the samples is at least λ Σ w_ii w_i², with λ the least eigenvalue of any W whose diagonal is
@@ -302,61 +300,59 @@ class WorkingSet:
         """Solve (11), then least sum of squared widths among its optima, then the centre."""
         deltas = np.zeros(self.fleet.n)
 
-        def settle(row: Row) -> None:
-            own = self.programmes[row.i]
-            boxed = row.unknown and own.box is not None
-            own.exact |= not boxed and row.columns.count > 1  # of many blocks the weight is seldom small enough
-            if not own.exact:
+        def settle(row: Programmes) -> None:
+            boxed = row.unknown and row.box is not None
+            row.exact |= not boxed and row.columns.count > 1  # of many blocks the weight is seldom small enough
+            if not row.exact:
                 try:
                     if boxed:
-                        self._settle(own, Programmes.nominal)
-                        own.face()  # or it was no optimum
+                        self._settle(row, Programmes.nominal)
+                        row.face()  # or it was no optimum
                     else:
-                        self._settle(own, Programmes.regularised, polish=True)
+                        self._settle(row, Programmes.regularised, polish=True)
                 except FitError:
-                    own.exact = True
-            if own.exact:
+                    row.exact = True
+            if row.exact:
                 row.limit = None if row.limit is None else float(deltas[row.i]) / row.limit_unit
                 self._settle_or_refine(row, Programmes.linear)
             if row.limit is None:  # nothing unknown: the structure fixes the widths
                 row.limit = float((row.width * row.half).max(initial=0.0))
             deltas[row.i] = row.limit * row.limit_unit
-            own.allowed = row.limit = row.limit * (1.0 + WIDTH_SLACK)  # room for the ties
-            if own.exact or boxed:
-                self._settle(own, Programmes.bounded, polish=True)
+            row.allowed = row.limit = row.limit * (1.0 + WIDTH_SLACK)  # room for the ties
+            if row.exact or boxed:
+                self._settle(row, Programmes.bounded, polish=True)
 
         self._solve(settle)
         unknown = [row for row in self.rows if row.unknown]
         bounds = deltas.copy()
         bounds[[row.i for row in unknown]] = on_cores(self._least_width, [(row,) for row in unknown])
         above = deltas > (1.0 + WIDTH_SLACK) * bounds + 1e-13 * np.array([row.scale for row in self.rows])
-        again = [row for row in unknown if above[row.i] and not self.programmes[row.i].exact]
+        again = [row for row in unknown if above[row.i] and not row.exact]
         for row in again:  # the weight relative to δ was too large for these
-            self.programmes[row.i].exact = True
+            row.exact = True
         for group in self._groups(again):
             self._settle_and_prove(settle, group)
         bounds[[row.i for row in again]] = [self._least_width(row) for row in again]
-        again = [row for row in unknown if self.programmes[row.i].collinear() or not self._above(row, bounds) <= GOOD]
+        again = [row for row in unknown if row.collinear() or not self._above(row, bounds) <= GOOD]
         again = [row for row in again if not row.refined]
         for row in again:
-            self.programmes[row.i].exact = True
+            row.exact = True
         for row, answer, width in self._again(again, settle, self._largest_width):
             bounds[row.i] = self._least_width(row)
             if width <= self._largest_width(row) * (1.0 + GOOD):  # nothing gained: the elements stay
                 row.keep(answer)
         return self._solution(np.minimum(deltas, bounds))
 
-    def _least_width(self, row: Row) -> float:
+    def _least_width(self, row: Programmes) -> float:
         """A lower bound of δ."""
-        own = self.programmes[row.i]
-        return (own.least if own.exact or own.box is not None else own.least_width()) * row.limit_unit
+        return (row.least if row.exact or row.box is not None else row.least_width()) * row.limit_unit
 
-    def _above(self, row: Row, bounds: Array) -> float:
+    def _above(self, row: Programmes, bounds: Array) -> float:
         """How far the largest width of a row will be above its bound at most, relative."""
         least = LEAST * row.rms_step * float(row.samples.root_weight.max(initial=0.0))
         return (self._largest_width(row) - float(bounds[row.i])) / max(float(bounds[row.i]), least, 1e-300)
 
-    def _largest_width(self, row: Row) -> float:
+    def _largest_width(self, row: Programmes) -> float:
         """√w x width of a row at most, with the half-widths lifted over what is left outside."""
         _, d = row.scaled()
         inside, _ = row.slacks()
@@ -379,7 +375,7 @@ class WorkingSet:
 
     def _solution(self, delta: Array | None = None) -> Solution:
         for row in self.rows:  # a solver may stop close to what cannot be
-            if row.outside() > 1e-8 and (found := self.programmes[row.i].contradiction()):
+            if row.outside() > 1e-8 and (found := row.contradiction()):
                 raise InfeasibleError(row.i, *found)
         return Solution(
             np.column_stack([row.theta for row in self.rows]),
@@ -405,7 +401,7 @@ class WorkingSet:
             done += len(rows)
         self._told = ""
 
-    def _start(self, rows: list[Row]) -> None:
+    def _start(self, rows: list[Programmes]) -> None:
         """Begin with the first samples and those furthest from least squares, or those next to bounds that are near."""
         many = max(row.r + row.q for row in rows) >= _MANY
         near = self._near if many else None
@@ -423,7 +419,7 @@ class WorkingSet:
         for row in rows:
             row.widen_pool(4 * (row.r + row.q), None if near is None else np.inf)
 
-    def _each(self, rows: list[Row], settle: Settle) -> None:
+    def _each(self, rows: list[Programmes], settle: Settle) -> None:
         """Settle rows on all cores, though PIQP holds the lock; with full weights, all at once."""
         if self._together:
             settle(rows[0])
@@ -445,7 +441,7 @@ class WorkingSet:
         """The samples of all rows do not fit in memory together; `_solve` then tells how far the rows are."""
         return len(self._groups(self.rows)) > 1
 
-    def _groups(self, rows: list[Row]) -> list[list[Row]]:
+    def _groups(self, rows: list[Programmes]) -> list[list[Programmes]]:
         """Rows whose samples fit in memory together; with full weights, all."""
         if self._together or self.whole:
             return [rows]
@@ -455,7 +451,7 @@ class WorkingSet:
         size += size % 2  # as many for either of two cores
         return [rows[k : k + size] for k in range(0, len(rows), size)]
 
-    def _settle_and_prove(self, settle: Settle, rows: list[Row]) -> None:
+    def _settle_and_prove(self, settle: Settle, rows: list[Programmes]) -> None:
         """Settle rows on what they hold, and, if there are more samples than that, hold the solution against all."""
         self._each(rows, settle)
         if not self.whole:
@@ -463,10 +459,10 @@ class WorkingSet:
             if self._in_groups:
                 for row in rows:
                     self._nearest_of[row.i] = row.nearest(_NEAREST)
-                    self.programmes[row.i].release(self.keeps)
+                    row.release(self.keeps)
                 return_memory()
 
-    def _prove(self, settle: Settle, rows: list[Row]) -> None:
+    def _prove(self, settle: Settle, rows: list[Programmes]) -> None:
         """Hold the solution against all samples, and solve again, until it contains them all."""
         looked_for = 2 * SUBSAMPLE // 5 + self.fleet.N // 2500
         share, most = looked_for / self.fleet.N, 3 * looked_for // 2
@@ -501,7 +497,7 @@ class WorkingSet:
             rows = self.rows if self._together else again
         raise FitError(f"the working set did not settle in {MAX_ROUNDS} passes; scale the signals to order one")
 
-    def _candidate(self, reach: Array, room: Array, most: int, rows: list[Row]) -> Candidate:
+    def _candidate(self, reach: Array, room: Array, most: int, rows: list[Programmes]) -> Candidate:
         limits = [row.limit * row.limit_unit for row in rows if row.limit is not None]
         limit = np.array(limits) if len(limits) == len(rows) else None
         which = np.array([row.i for row in rows], dtype=np.intp)
@@ -517,7 +513,7 @@ class WorkingSet:
             which,
         )
 
-    def _moved(self, row: Row, theta: Array, d: Array, limit: float | None, scale: float) -> float:
+    def _moved(self, row: Programmes, theta: Array, d: Array, limit: float | None, scale: float) -> float:
         """Largest change of any sample's slack, in scaled units, since theta, d and the limit."""
         if row.scale != scale:
             return np.inf
@@ -542,7 +538,7 @@ class WorkingSet:
             per_column[:, k] += change[:, j] * most * inverse[:, k]
         return float(per_column.max(initial=0.0)) / row.scale * (1.0 + 1e-9)
 
-    def _hold(self, row: Row, samples: Samples) -> None:
+    def _hold(self, row: Programmes, samples: Samples) -> None:
         row.hold(samples, self._like)
         self._like = row
 
@@ -552,35 +548,34 @@ class WorkingSet:
 
     # --- held samples ---
 
-    def _settle(self, own: Programmes, solve: Callable[[Programmes], str], polish: bool = False) -> None:
-        row = own.row
+    def _settle(self, row: Programmes, solve: Callable[[Programmes], str], polish: bool = False) -> None:
+        if not row.unknown:
+            self._row_rounds[row.i] += 1
+            self._check_known(row)
+            return
         for number in range(MAX_ROUNDS if row.refined else FEW_ROUNDS):
-            if row.unknown:
-                self._guarded(own, solve)
+            self._solve_or_contradict(row, solve)
             self._row_rounds[row.i] += 1
             # most rows settle in 15 rounds; where rounding makes nearly every sample active, all of them may join
             most = None if number < 40 else max(JOIN, 2 * (row.r + row.q)) * 2 ** min(number - 40, 20)
-            if row.unknown and row.widen_pool(most):
+            if row.widen_pool(most):
                 continue
-            if polish and row.unknown:
-                own.polish()
-            if not polish or not row.unknown or not row.widen_pool(most):
-                break
-        else:
-            raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; {_REMEDY}")
-        if not row.unknown:
-            self._known_row(row)
+            if not polish:
+                return
+            row.polish()
+            if not row.widen_pool(most):
+                return
+        raise FitError(f"row {row.i}: no working set after {MAX_ROUNDS} rounds; {_REMEDY}")
 
-    def _guarded(self, own: Programmes, solve: Callable[[Programmes], str]) -> None:
+    def _solve_or_contradict(self, row: Programmes, solve: Callable[[Programmes], str]) -> None:
         try:
-            self.solvers.add(solve(own))
+            self.solvers.add(solve(row))
         except FitError:
-            found = own.contradiction()
-            if found is None:
-                raise
-            raise InfeasibleError(own.row.i, *found) from None
+            if found := row.contradiction():
+                raise InfeasibleError(row.i, *found) from None
+            raise
 
-    def _known_row(self, row: Row) -> None:
+    def _check_known(self, row: Programmes) -> None:
         """A row that the structure fixes altogether must contain every sample but for rounding."""
         slack = row.slack() if row.limit is None else row.half - np.abs(row.y)
         worst = int(np.argmin(slack)) if len(slack) else 0
