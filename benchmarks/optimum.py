@@ -181,7 +181,8 @@ class Row:
 def rows(problem: Problem, structure: Structure | None) -> list[Row]:
     """The rows of (8) and (9)."""
     n, p, columns = problem.n, problem.p, problem.columns
-    bounds = [np.tile(b, (columns.count, 1)) for b in (structure or Structure(n, p - n)).stacked(columns.names)]
+    of_block, _ = (structure or Structure(n, p - n)).unknowns(columns.names)
+    bounds = [np.tile(b, (columns.count, 1)) for b in of_block]
     dt = problem.dt[:, None]
     phi, psi = problem.phi() * dt, problem.psi() * dt
     made = []

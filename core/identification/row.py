@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Self
@@ -124,7 +125,7 @@ class Row:
     Elements that the structure fixes, and columns that are 0 in every sample, are no unknowns.
 
     `i`: which row of the model; `sums`: of all data; `columns`: terms that are unknown; `bounds`: of
-    `Structure.stacked`; `shared` (r,): of each nominal element and each half-width the first that it shares its value
+    `Structure.unknowns`; `shared` (r,): of each nominal element and each half-width the first that it shares its value
     with; default none but itself.
     """
 
@@ -133,8 +134,8 @@ class Row:
         i: int,
         sums: Moments,
         columns: Columns,
-        bounds: tuple[Array, Array, Array, Array],
-        shared: tuple[Index, Index] | None = None,
+        bounds: Sequence[Array],
+        shared: Sequence[Index] | None = None,
     ) -> None:
         self.i = i
         self.sums, self.columns = sums, columns
@@ -163,8 +164,9 @@ class Row:
         fixed_phi, fixed_psi = theta_low == theta_high, d_low == d_high
         self.theta = np.where(fixed_phi, theta_low, np.clip(0.0, theta_low, theta_high))
         self.d = np.where(fixed_psi, d_low, np.where(dead_psi, d_low, 0.0))
-        self.phi_columns = Chosen.of(~dead_phi & ~fixed_phi, self._shared and self._shared[0])
-        self.psi_columns = Chosen.of(~dead_psi & ~fixed_psi, self._shared and self._shared[1])
+        shared_phi, shared_psi = (None, None) if self._shared is None else self._shared
+        self.phi_columns = Chosen.of(~dead_phi & ~fixed_phi, shared_phi)
+        self.psi_columns = Chosen.of(~dead_psi & ~fixed_psi, shared_psi)
         self.free_phi, self.free_psi = self.phi_columns.first, self.psi_columns.first
         with np.errstate(divide="ignore"):
             unit_phi, unit_psi = 1.0 / phi_scale, 1.0 / psi_scale

@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from uncertain_lti.base.arrays import Array, numbers
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import finite_data, plural
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.terms import ADDITIVE, HALF_WIDTHS, NOMINAL, SHAPES, TERMS
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -90,11 +90,9 @@ class Structure:
             if np.shape(values) != one_block[name] or np.asarray(values).dtype != np.bool_:
                 raise FitError(f"structure: shared {name} must be true or false for each element, {one_block[name]}")
             self.shared[name] = np.array(values)
-        self.lower: dict[str, Array] = {}
-        self.upper: dict[str, Array] = {}
-        for name, shape in self._shapes.items():
-            self.lower[name] = np.full(shape, 0.0 if name in HALF_WIDTHS else -math.inf)
-            self.upper[name] = np.full(shape, math.inf)
+        least = {name: 0.0 if name in HALF_WIDTHS else -math.inf for name in one_block}
+        self.lower: dict[str, Array] = {name: np.full(shape, least[name]) for name, shape in self._shapes.items()}
+        self.upper: dict[str, Array] = {name: np.full(shape, math.inf) for name, shape in self._shapes.items()}
         for given, targets in ((lower, (self.lower,)), (upper, (self.upper,)), (fixed, (self.lower, self.upper))):
             for name, values in (given or {}).items():
                 for target in targets:
@@ -138,6 +136,11 @@ class Structure:
             said += int(np.count_nonzero(~unbounded))
         no_more = self.blocks is None and said == 2 * self.n * np.count_nonzero(~used)
         return used if no_more else np.zeros_like(used)
+
+    @property
+    def _shares(self) -> bool:
+        """Some element is the same in all blocks."""
+        return any(array.any() for array in self.shared.values())
 
     def _known(self, name: str) -> None:
         if name not in self._shapes:
@@ -208,17 +211,11 @@ class Structure:
 
     def to_dict(self) -> dict[str, Any]:
         """`lower`, `upper` and `shared` for the model file; null for no bound."""
-
-        def plain(values: Any) -> Any:
-            return [plain(v) for v in values] if isinstance(values, list) else values if math.isfinite(values) else None
-
-        sides = {"lower": self.lower, "upper": self.upper}
-        data: dict[str, Any] = {
-            side: {name: plain(array.tolist()) for name, array in arrays.items()} for side, arrays in sides.items()
-        }
-        if any(array.any() for array in self.shared.values()):
-            data["shared"] = {name: array.tolist() for name, array in self.shared.items()}
-        return data
+        data: dict[str, Any] = {"lower": self.lower, "upper": self.upper}
+        if self._shares:
+            data["shared"] = self.shared
+        found: dict[str, Any] = finite_data(data)
+        return found
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any], n: int, m: int) -> Structure:
@@ -234,10 +231,14 @@ class Structure:
             raise FitError("structure: the model file does not hold it as it was written; fit again") from None
         return cls(n, m, **sides, blocks=blocks)
 
-    def stacked(self, names: Collection[str], tied: Sequence[int] = (0,)) -> tuple[Array, Array, Array, Array]:
-        """Lower and upper bounds of theta (r, n), and of d (q, n), in the order of the unknowns.
+    def unknowns(
+        self, names: Collection[str], tied: Sequence[int] = (0,)
+    ) -> tuple[list[Array], list[NDArray[np.intp]] | None]:
+        """Bounds of the unknowns in their order, and which of them are one; None if each is its own.
 
         `names`: arrays of the additive terms that the fit has; `tied`: of each block the one whose elements it has.
+        Bounds are the least and the greatest theta, (r, n) each, and the least and the greatest d, (q, n). Those that
+        are one: of each theta, and of each d, the position of the first of them.
         """
         additive = [name for which in ("nominal", "half") for term in ADDITIVE if (name := getattr(term, which))]
         for name in additive:
@@ -246,13 +247,20 @@ class Structure:
                 raise FitError(f"structure: {name} is not 0, and the fit has no such term; choose another additive")
         if self.blocks not in (None, len(tied)):
             raise FitError(f"structure is for {plural(self.blocks, 'block')}, and the fit has {len(tied)}")
-
-        def sides(which: str) -> Iterator[Array]:
-            for side in (self.lower, self.upper):
-                yield np.vstack([row for r in tied for row in self._columns(side, which, names, r)])
-
-        (theta_low, theta_high), (d_low, d_high) = sides("nominal"), sides("half")
-        return theta_low, theta_high, d_low, d_high
+        shares = any(r != block for r, block in enumerate(tied)) or (self._shares and len(tied) > 1)
+        bounds, first = list[Array](), list[NDArray[np.intp]]()
+        for which in ("nominal", "half"):
+            low, high = (
+                np.vstack([row for r in tied for row in self._columns(side, which, names, r)])
+                for side in (self.lower, self.upper)
+            )
+            if shares:
+                same = np.vstack(self._columns(self.shared, which, names, None))
+                place = np.arange(len(same))[:, None]
+                first.append(np.vstack([np.where(same, place, r * len(same) + place) for r in tied]))
+                low, high = _narrowed(low, high, first[-1])
+            bounds += [low, high]
+        return bounds, first if shares else None
 
     def _columns(
         self, arrays: Mapping[str, NDArray[Any]], which: str, names: Collection[str], block: int | None
@@ -264,42 +272,20 @@ class Structure:
             if (name := getattr(term, which)) and (term.required or name in names)
         ]
 
-    def shared_elements(
-        self, names: Collection[str], tied: Sequence[int]
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]] | None:
-        """Of each nominal element and each half-width the position of the one that it is; None if none is shared.
 
-        `names`, `tied`: as of `stacked`.
-        """
-        own = all(r == block for r, block in enumerate(tied))
-        if own and (len(tied) == 1 or not any(array.any() for array in self.shared.values())):
-            return None
-        found = []
-        for which in ("nominal", "half"):
-            same = np.vstack(self._columns(self.shared, which, names, None))
-            place = np.arange(len(same))[:, None]
-            found.append(np.vstack([np.where(same, place, r * len(same) + place) for r in tied]))
-        return found[0], found[1]
-
-
-def narrowed(
-    bounds: tuple[Array, Array, Array, Array], shared: tuple[NDArray[np.intp], NDArray[np.intp]]
-) -> tuple[Array, Array, Array, Array]:
-    """Bounds that hold for every element that is one with others."""
-    sides = []
-    for low, high, same in zip(bounds[::2], bounds[1::2], shared, strict=True):
-        rows = np.arange(low.shape[1])
-        most, least = np.full(low.shape, -math.inf), np.full(high.shape, math.inf)
-        np.maximum.at(most, (same, rows), low)
-        np.minimum.at(least, (same, rows), high)
-        low, high = most[same, rows], least[same, rows]
-        if (low > high).any():
-            raise FitError(
-                "structure: an element that is the same at several knots has other bounds at each of them, which no "
-                "number meets; give it one rule for all knots"
-            )
-        sides += [low, high]
-    return sides[0], sides[1], sides[2], sides[3]
+def _narrowed(low: Array, high: Array, first: NDArray[np.intp]) -> tuple[Array, Array]:
+    """Bounds that hold for every element that is one with others; `first`: as of `Structure.unknowns`."""
+    rows = np.arange(low.shape[1])
+    most, least = np.full(low.shape, -math.inf), np.full(high.shape, math.inf)
+    np.maximum.at(most, (first, rows), low)
+    np.minimum.at(least, (first, rows), high)
+    low, high = most[first, rows], least[first, rows]
+    if (low > high).any():
+        raise FitError(
+            "structure: an element that is the same at several knots has other bounds at each of them, which no "
+            "number meets; give it one rule for all knots"
+        )
+    return low, high
 
 
 def _blocks(knot: Any, schedule: Schedule | None, where: str) -> Sequence[tuple[int, ...]]:

@@ -28,7 +28,7 @@ from uncertain_lti.identification.passes import Candidate, Judged, Samples
 from uncertain_lti.identification.programmes import GOOD, WIDTH_SLACK, Programmes
 from uncertain_lti.identification.regimes import tied_blocks
 from uncertain_lti.identification.row import JOIN, LEAST, InfeasibleError
-from uncertain_lti.identification.structure import Structure, narrowed
+from uncertain_lti.identification.structure import Structure
 
 _FURTHER = 2.5
 """After the first pass, samples are held whose slack is up to this many times as large: few are left there."""
@@ -97,14 +97,11 @@ class WorkingSet:
         structure = structure or Structure(fleet.n, fleet.p - fleet.n)
         columns = fleet.columns
         self.tied = tied_blocks(self.sums, columns, fleet.p)
-        bounds = structure.stacked(columns.names, self.tied)
-        shared = structure.shared_elements(columns.names, self.tied)
+        bounds, shared = structure.unknowns(columns.names, self.tied)
         self.shared = shared
-        if shared is not None:
-            bounds = narrowed(bounds, shared)
         self.half_limits = bounds[2:]  # least and largest half-widths that the structure allows, (q, n) each
         self.rows = [
-            Programmes(i, self.sums, columns, bounds, None if shared is None else (shared[0][:, i], shared[1][:, i]))
+            Programmes(i, self.sums, columns, bounds, None if shared is None else [first[:, i] for first in shared])
             for i in range(fleet.n)
         ]
         self.solvers: set[str] = set()
@@ -129,11 +126,9 @@ class WorkingSet:
         if self.sums.coupled is not None:
             flat = d.T.ravel()
             return np.array([4.0 * flat @ self.sums.coupled @ flat])
-        parts, sums, weights = [], self.sums, self.fleet.weights
-        for i, half in enumerate(d.T):
-            each = sums.plain_gram * (1.0 if weights is None else weights[i]) if sums.gram is None else sums.gram[i]
-            parts.append(4.0 * half @ each @ half)
-        return np.array([sum(parts)])
+        weights = np.ones(self.fleet.n) if self.fleet.weights is None else self.fleet.weights
+        grams = (self.sums.plain_gram * weight for weight in weights) if self.sums.gram is None else self.sums.gram
+        return np.array([sum(4.0 * half @ gram @ half for half, gram in zip(d.T, grams, strict=True))])
 
     def above(self, criterion: str, objective: Array, reference: Array, judged: Judged) -> float:
         """How far above its reference at most, relative; an envelope that is rounding has no distance."""
