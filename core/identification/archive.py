@@ -36,17 +36,7 @@ from uncertain_lti.model.repeats import Found, repeats_in
 from uncertain_lti.model.schedule import Schedule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.recordings.formats import group_recordings, open_recording
-from uncertain_lti.sampling.reading import (
-    Stream,
-    Times,
-    copy_of,
-    load_signals,
-    read_stream,
-    resolved_by,
-    sample,
-    times_of,
-    types_of,
-)
+from uncertain_lti.sampling import reading
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import SignalMap
 from uncertain_lti.signals.values import Additive
@@ -141,7 +131,7 @@ def fit_archive(
         raise FitError("an archive is fitted from a cache or on a cluster; give one of them")
     if not isinstance(signals, SignalMap):
         paths = list(paths)
-        signals = load_signals(signals, paths)
+        signals = reading.load_signals(signals, paths)
     schedule = asked_by(signals) if schedule is None else schedule
     on = signals_of(schedule, [s.name for s in signals.signals])
     messages = unused([s.name for s in signals.scheduling], on)
@@ -151,7 +141,7 @@ def fit_archive(
     bags = group_recordings(list(paths), indexed=True, layout=signals.table)
     if not bags:
         raise BagError("no recording is named; give at least one file or folder")
-    signals = signals.with_types(types_of(bags, signals))
+    signals = signals.with_types(reading.types_of(bags, signals))
     recordings: list[Recording] = [(os.fspath(bag.path), tuple(map(str, bag.parts))) for bag in bags]
     del bags
 
@@ -170,7 +160,7 @@ def fit_archive(
 
     looked = visit("looking at", survey, signals)
     _refuse_copies(recordings, [mark for _, mark in looked])
-    signals = resolved_by([times for times, _ in looked], signals)
+    signals = reading.resolved_by([times for times, _ in looked], signals)
     del looked
     additive = additive or signals.additive or "none"
     scheduled = scheduled_by(schedule, signals)
@@ -245,28 +235,28 @@ def refuse_auto(signals: SignalMap) -> None:
             )
 
 
-def _stream(recording: Recording, signals: SignalMap) -> Stream:
-    return read_stream(open_recording(*recording, indexed=True, layout=signals.table), signals)
+def _stream(recording: Recording, signals: SignalMap) -> reading.Stream:
+    return reading.read_stream(open_recording(*recording, indexed=True, layout=signals.table), signals)
 
 
 def _sampled(recording: Recording, signals: SignalMap) -> Transient:
-    return sample(_stream(recording, signals), signals)[0]
+    return reading.sample(_stream(recording, signals), signals)[0]
 
 
-def survey(recording: Recording, signals: SignalMap) -> tuple[Times, bytes]:
+def survey(recording: Recording, signals: SignalMap) -> tuple[reading.Times, bytes]:
     """First look at one recording, and a mark that its copies have: of times and values of all messages."""
     stream, mark = _stream(recording, signals), sha256()
     times = stream.stamp if (stream.stamp > 0).any() else stream.arrival
     for array in (stream.topic, times, *stream.values):
         mark.update(np.ascontiguousarray(array).data)
-    return times_of(stream, signals), mark.digest()
+    return reading.times_of(stream, signals), mark.digest()
 
 
 def _refuse_copies(recordings: Sequence[Recording], marks: Sequence[bytes]) -> None:
     named: dict[bytes, str] = {}
     for (name, _), mark in zip(recordings, marks, strict=True):
         if (twin := named.setdefault(mark, name)) is not name:
-            raise copy_of(name, twin)
+            raise reading.copy_of(name, twin)
 
 
 def load(recording: Recording, signals: SignalMap, columns: Columns) -> Problem:

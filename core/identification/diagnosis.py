@@ -22,25 +22,11 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, runs
 from uncertain_lti.base.text import moment, plural, quoted, shortlist
-from uncertain_lti.identification import regimes
-from uncertain_lti.identification.discard import Carriers
-from uncertain_lti.identification.evidence import (
-    DETERMINED,
-    FASTEST,
-    NOISE,
-    autocorrelation,
-    far_from_steady,
-    held_for,
-    lagged_states,
-    late_controls,
-    lost,
-    predicted,
-    successive,
-    unexplained,
-)
+from uncertain_lti.identification import evidence, regimes
+from uncertain_lti.identification.discard import MUCH, Carriers
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
-from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.problem import Problem, row_of
 from uncertain_lti.identification.structure import EVERY, Rows, rows_of
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -129,8 +115,8 @@ def describe(
     regimes_said = _tied(model, scheduled, sums) + _beyond_knots(model, scheduled)
     sums = sums.one_block()
     rank, messages = _rank(problem, sums, names, rows := rows_of(model))
-    part, past = _stretches(problem), lagged_states(signals, model.n)
-    if far := far_from_steady(part, signals):  # every level moves with every other then
+    part, past = _stretches(problem), evidence.lagged_states(signals, model.n)
+    if far := evidence.far_from_steady(part, signals):  # every level moves with every other then
         messages = [text for text in messages if "move together" not in text]
     apart = not (messages or far)
     coded = [*_coded(problem, sums, signals), *_wrapped(problem, signals, transients)]
@@ -159,7 +145,7 @@ def of_sums(model: UncertainLTI, fleet: Fleet | Problem, sums: Moments, mean_wid
     signals = (*model.signals.states, *model.signals.controls)
     names, tied, sums = [s.name for s in signals], _tied(model, fleet, sums), sums.one_block()
     rank, messages = _rank(fleet, sums, names, rows := rows_of(model))
-    messages += [*tied, *_collinear(fleet, sums, names, lagged_states(signals, model.n), rows)]
+    messages += [*tied, *_collinear(fleet, sums, names, evidence.lagged_states(signals, model.n), rows)]
     return rank, messages + _wide(sums, mean_width, names, not fleet.columns.names)
 
 
@@ -193,7 +179,7 @@ def _beyond_knots(model: UncertainLTI, problem: Problem) -> list[str]:
     messages = []
     knots = model.schedule.recorded_values(model.signals.signals)
     for axis, at, row in zip(model.schedule.axes, knots, model.scheduling_positions, strict=True):
-        values = regimes.values_of(problem, row)
+        values = row_of(problem.z, problem.s, row)
         beyond = (values < axis.knots[0]) | (values > axis.knots[-1]) if axis.knots else np.zeros(1, dtype=bool)
         if beyond.any():
             signal = model.signals.signals[row]
@@ -246,11 +232,12 @@ def _weak(
     problem: Problem, sums: Moments, signals: Sequence[Signal], past: Collection[int], lacking: Collection[int]
 ) -> list[str]:
     """Controls whose effect is lost in the noise, unless another sample of the same field has it."""
-    every, names, of = lost(problem, sums, past), [s.name for s in signals], [(s.topic, s.inner) for s in signals]
+    every, of = evidence.lost(problem, sums, past), [(s.topic, s.inner) for s in signals]
+    names = [s.name for s in signals]
     seen = {of[j] for j in range(problem.n, len(of)) if j not in every}
     found = {j: effect for j, effect in every.items() if effect[0] not in lacking and of[j] not in seen}
     state, certainty = max(found.values(), key=itemgetter(1), default=(0, 0.0))
-    larger = max(2.0, DETERMINED / max(0.4, min((least for _, least in found.values()), default=1.0)))
+    larger = max(2.0, evidence.DETERMINED / max(0.4, min((least for _, least in found.values()), default=1.0)))
     return [
         f"{_controls(found, names)} moves too little to be distinguished from the noise: the strongest effect, on "
         f"'{names[state]}', is {certainty:.2g} times its standard error; record it with larger or more steps "
@@ -270,7 +257,7 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], lat
     u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} if a feedback sets u_k; an input that a person steps
     at will is not. What the columns `later` had of u_k, at the end of the step before, is no explanation.
     """
-    follows = successive(problem)
+    follows = evidence.successive(problem)
     if len(follows) <= 4 * problem.p:
         return []
     before, now = problem.z.T[follows], problem.z.T[follows + 1]
@@ -284,7 +271,7 @@ def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], lat
         size = float(change @ change)
         if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
             continue
-        left, _ = unexplained(gram, (basis.T @ change)[:, None], np.array([size]))
+        left, _ = evidence.unexplained(gram, (basis.T @ change)[:, None], np.array([size]))
         if (explained := 1.0 - float(left[0]) / size) > FED_BACK:
             found[j] = explained
     least = min(found.values(), default=0.0)
@@ -402,8 +389,8 @@ def _held(problem: Problem, signals: Sequence[Signal]) -> dict[str, list[int]]:
     """States that repeat their last value between samples of a slower topic, those of one remedy together."""
     found, alone = dict[str, list[int]](), len({signal.topic for signal in signals}) == 1
     slow = f"{'' if alone else 'make its topic the clock, '}list it as a control, or leave it out"
-    every = range(problem.n if len(successive(problem)) >= 0.5 * problem.N else 0)
-    rows = {i: held for i in every if (held := held_for(problem.z[i], problem.x_next[i]))}
+    every = range(problem.n if len(evidence.successive(problem)) >= 0.5 * problem.N else 0)
+    rows = {i: held for i in every if (held := evidence.held_for(problem.z[i], problem.x_next[i]))}
     for judged, remedy in ((False, slow), (True, "take `judged: true` away")):
         if of := [i for i in rows if signals[i].judged == judged]:
             about = " to ".join(map(str, sorted({min(rows[i] for i in of), max(rows[i] for i in of)})))
@@ -444,7 +431,7 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
 def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int]) -> list[str]:
     """Controls that explain the states better when taken some samples earlier."""
     found: dict[tuple[int, int], dict[int, float]] = {}
-    for j, (best, share) in late_controls(problem, past).items():
+    for j, (best, share) in evidence.late_controls(problem, past).items():
         if share >= 0.005:  # of many states, of which few follow it, less may be sure
             found.setdefault((best, signals[problem.n + j].delay + best), {})[problem.n + j] = share
     return [
@@ -457,7 +444,7 @@ def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int])
 
 def _missing(problem: Problem, signals: Sequence[Signal]) -> dict[int, str]:
     """States whose next sample depends on more than the signals at one instant."""
-    known = autocorrelation(problem)
+    known = evidence.autocorrelation(problem)
     messages = {}
     for i, signal in enumerate(signals[: problem.n]):
         if known is None or not known.follows(i):
@@ -494,7 +481,7 @@ def _carried(
     if few is None:
         return []
     indices = sorted(few.transitions)
-    wide = sorted((i for i in range(problem.n) if few.carry(i)), key=lambda i: -few.factor[i])
+    wide = sorted(np.flatnonzero(few.factor >= MUCH).tolist(), key=lambda i: -few.factor[i])
     listed = ", ".join(f"'{names[i]}' {few.factor[i]:.3g} times" for i in wide[:4])
     listed += f" and of {plural(len(wide) - 4, 'other state')}" if len(wide) > 4 else ""
     cure = "leave that stretch out of the recording"
@@ -521,14 +508,14 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
 def _noise_like(problem: Problem) -> dict[int, float]:
     """States whose next sample cannot be predicted from those before, and the share of its variance that can."""
     n = problem.n
-    share = predicted(problem.z.T[:, :n], problem.z.T[:, n:], problem.x_next.T)
+    share = evidence.predicted(problem.z.T[:, :n], problem.z.T[:, n:], problem.x_next.T)
     moving = np.ptp(problem.z.T[:, :n], axis=0) > 0
-    return {i: max(0.0, float(share[i])) for i in np.flatnonzero(moving & (share < NOISE)).tolist()}
+    return {i: max(0.0, float(share[i])) for i in np.flatnonzero(moving & (share < evidence.NOISE)).tolist()}
 
 
 def _noisy(noise: dict[int, float], names: Sequence[str], dt: Array) -> list[str]:
     """States that are mostly noise, in one message."""
-    slow = float(np.median(dt)) * FASTEST >= 1.0
+    slow = float(np.median(dt)) * evidence.FASTEST >= 1.0
     more = "how it moves needs faster rows" if slow else "leave it out where that says nothing, or record it at work"
     listed, most = shortlist([f"'{names[i]}'" for i in noise], 12), max(noise.values(), default=0.0)
     return [

@@ -184,7 +184,7 @@ def predicted(X: Array, U: Array, after: Array) -> Array:
     """
     columns = np.hstack([X, U, after])
     columns = columns - columns.mean(axis=0)
-    columns /= np.maximum(np.abs(columns).max(axis=0, initial=0.0), 1e-300)
+    columns /= size_of(columns)
     known, targets = columns[:, : X.shape[1] + U.shape[1]], columns[:, X.shape[1] + U.shape[1] :]
     total = np.einsum("ki,ki->i", targets, targets)
     left, rank = unexplained(known.T @ known, known.T @ targets, total)
@@ -247,7 +247,7 @@ def autocorrelation(problem: Problem) -> Autocorrelation | None:
 
 def _curves(z: Array) -> Array:
     """Squares, magnitudes and (of few signals) products of two, (K, curves)."""
-    z = z / np.maximum(np.abs(z).max(axis=0), 1e-300)
+    z = z / size_of(z)
     p = z.shape[1]
     if p > _MOST_PRODUCTS:
         return np.hstack([z**2, np.abs(z)])
@@ -258,7 +258,7 @@ def _curves(z: Array) -> Array:
 def _correlation(problem: Problem, now: NDArray[np.intp]) -> Array:
     """Autocorrelation at one and two samples, (n, 2); `now`: transitions that continue the one before."""
     basis = np.column_stack([problem.z.T, np.ones(problem.N)]) * problem.dt[:, None]
-    basis = basis / np.maximum(np.abs(basis).max(axis=0), 1e-300)
+    basis = basis / size_of(basis)
     step = problem.x_next.T - problem.z.T[:, : problem.n]
     residual = step - basis @ np.linalg.lstsq(basis, step, rcond=None)[0]
     spread = np.median(np.abs(residual), axis=0) / 0.6745
@@ -347,7 +347,7 @@ def _lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[in
         return np.asarray(np.log(np.maximum(left, 1e-300)).sum(axis=-1))
 
     found = {}
-    undelayed = [*range(n + m), n + m]
+    undelayed = list(range(n + m + 1))
     for position, j in enumerate(movers):
         first = n + m + 1 + position * longest
         later = [[first + lag if c == n + j else c for c in undelayed] for lag in range(longest)]

@@ -297,14 +297,13 @@ def fit_fleet(
             return None
         if describe_on is None:
             rank, messages = of_sums(model, fleet, sums, found.mean_width)
-            return rank, messages + distance_in_words(found.gap)
-        whole = describe_on.N == sums.count and method == "working-set"
-        few = None
-        if seek_carriers and whole:
-            with suppress(FitError, InfeasibleError):  # a fit that is done does not end for what is said of it
-                few = carriers(describe_on, structure)
-        gone = discarded if criterion == "qp" else None
-        rank, messages = describe(model, describe_on, sums, found.mean_width, transients, few, gone)
+        else:
+            few = None
+            if seek_carriers and describe_on.N == sums.count and method == "working-set":
+                with suppress(FitError, InfeasibleError):  # a fit that is done does not end for what is said of it
+                    few = carriers(describe_on, structure)
+            gone = discarded if criterion == "qp" else None
+            rank, messages = describe(model, describe_on, sums, found.mean_width, transients, few, gone)
         return rank, messages + distance_in_words(found.gap)
 
     memory = (lambda: None) if remember is None else partial(remember, model.replace(fit_summary=facts), nearest)

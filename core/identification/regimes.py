@@ -211,8 +211,8 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
     """
     stride = max(1, -(-problem.N // LOOKED_AT))
     some = problem.subset(slice(None, None, stride)) if stride > 1 else problem
-    values = values_of(some, row)
-    least, most = (float(f(values_of(problem, row))) for f in (np.min, np.max))
+    values = row_of(some.z, some.s, row)
+    least, most = (float(f(row_of(problem.z, problem.s, row))) for f in (np.min, np.max))
     if not least < most:
         raise FitError(
             f"schedule: '{name}' is constant in every transition, so it can have no {count} knots; record it moving, "
@@ -236,14 +236,6 @@ def _split(problem: Problem, row: int, count: int, name: str) -> tuple[float, ..
     return tuple(knots)
 
 
-def values_of(problem: Problem, row: int) -> Array:
-    """A row of [x; u; s].
-
-    Returns (N,): normalised.
-    """
-    return row_of(problem.z, problem.s, row)
-
-
 def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tuple[int, float]:
     """How many blocks would lack data, and the sum over the states of the logarithm of the largest residual.
 
@@ -254,7 +246,7 @@ def _left(problem: Problem, row: int, knots: Sequence[float], each: int) -> tupl
     phi = columns.phi(problem.z, problem.s) * problem.dt
     step = problem.x_next - problem.z[: problem.n]
     gram = phi @ phi.T
-    main = regimes.schedule.main_block(values_of(problem, row)[None])
+    main = regimes.schedule.main_block(row_of(problem.z, problem.s, row)[None])
     visits = each * np.bincount(main, minlength=len(knots))
     lacks = [bool(reason) for reason in lacking(gram, visits, columns, problem.p)]
     unit = 1.0 / np.sqrt(np.maximum(np.diagonal(gram), 1e-300))

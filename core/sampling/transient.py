@@ -25,16 +25,8 @@ from numpy.typing import ArrayLike, NDArray
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import TransientError, each_of, refuse_other
 from uncertain_lti.base.text import html_table, meant, named, number, plural
+from uncertain_lti.sampling import samples
 from uncertain_lti.sampling.clock import Counters, Status, longest_step, passed, to_ns
-from uncertain_lti.sampling.samples import (
-    csv_columns,
-    frame_columns,
-    listed,
-    matrix,
-    names_of,
-    nanoseconds,
-    segments_of,
-)
 from uncertain_lti.signals.signal import AT, At
 from uncertain_lti.signals.signal_map import ARRIVAL, Signal, SignalMap
 
@@ -174,15 +166,17 @@ class Transient:
         self.name = name
         refuse_other(signals, (SignalMap, type(None)), f"{name}: signals", "load_signals reads a file", TransientError)
         self.signals = signals
-        t_ns = nanoseconds(t, name, recorded=signals is not None)
-        self.x = matrix(x, len(t_ns), "x", name)
-        self.u = matrix(u, len(t_ns), "u", name)
-        self.s = np.empty((len(t_ns), 0)) if s is None else matrix(s, len(t_ns), "s", name)
+        t_ns = samples.nanoseconds(t, name, recorded=signals is not None)
+        self.x = samples.matrix(x, len(t_ns), "x", name)
+        self.u = samples.matrix(u, len(t_ns), "u", name)
+        self.s = np.empty((len(t_ns), 0)) if s is None else samples.matrix(s, len(t_ns), "s", name)
         if self.x.shape[1] == 0:
             raise TransientError(f"{name}: x has no column; give at least one state")
-        self.state_names = names_of(state_names, signals.states if signals else None, "x", self.x, name)
-        self.control_names = names_of(control_names, signals.controls if signals else None, "u", self.u, name)
-        self.scheduling_names = names_of(scheduling_names, signals.scheduling if signals else None, "s", self.s, name)
+        self.state_names = samples.names_of(state_names, signals.states if signals else None, "x", self.x, name)
+        self.control_names = samples.names_of(control_names, signals.controls if signals else None, "u", self.u, name)
+        self.scheduling_names = samples.names_of(
+            scheduling_names, signals.scheduling if signals else None, "s", self.s, name
+        )
         self.ends: tuple[At, ...] = ("departure",) * self.u.shape[1]
         if signals:
             self.ends = tuple(c.at for c in signals.controls)
@@ -207,7 +201,7 @@ class Transient:
         if max_gap is None:
             max_gap = longest_step([t_ns], min_step_ns)
         self.max_gap, self.min_step = float(max_gap), float(min_step)
-        kept, self.segment = segments_of(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
+        kept, self.segment = samples.segments_of(t_ns, to_ns(self.max_gap), min_step_ns, self.counters)
         self.t_ns = t_ns
         if len(kept) < len(t_ns):
             self.t_ns, self.x, self.u, self.s = t_ns[kept], self.x[kept], self.u[kept], self.s[kept]
@@ -375,8 +369,8 @@ class Transient:
     def __repr__(self) -> str:
         span, usable = passed(self.t_ns), plural(int(self.usable.sum()), "usable transition")
         signals = f"{plural(self.x.shape[1], 'state')}, {plural(self.u.shape[1], 'control')}"
-        samples = f"{plural(len(self), 'sample')} over {span:g} s"
-        return f"Transient({self.name!r}: {samples}, {signals}, {usable} in {plural(self.segments, 'segment')})"
+        recorded = f"{plural(len(self), 'sample')} over {span:g} s"
+        return f"Transient({self.name!r}: {recorded}, {signals}, {usable} in {plural(self.segments, 'segment')})"
 
     def _repr_html_(self) -> str:
         """Range, largest step and missing samples of each signal."""
@@ -448,8 +442,8 @@ class Transient:
             A column is missing or not numeric.
         """
         name = options.setdefault("name", "data frame")
-        states, controls = listed(states, "states", name), listed(controls, "controls", name)
-        t, z = frame_columns(frame, time, [*states, *controls], name)
+        states, controls = samples.listed(states, "states", name), samples.listed(controls, "controls", name)
+        t, z = samples.frame_columns(frame, time, [*states, *controls], name)
         x, u = z[:, : len(states)], z[:, len(states) :]
         return cls(t, x, u, state_names=states, control_names=controls, **options)
 
@@ -494,8 +488,8 @@ class Transient:
             The file is missing, a column is missing, or a cell is not a number; names the line.
         """
         name = options.setdefault("name", os.fspath(path))
-        states, controls = listed(states, "states", name), listed(controls, "controls", name)
-        z = csv_columns(path, [time, *states, *controls], delimiter, name)
+        states, controls = samples.listed(states, "states", name), samples.listed(controls, "controls", name)
+        z = samples.csv_columns(path, [time, *states, *controls], delimiter, name)
         t, x, u = z[:, 0], z[:, 1 : 1 + len(states)], z[:, 1 + len(states) :]
         return cls(t, x, u, state_names=states, control_names=controls, **options)
 
