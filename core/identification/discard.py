@@ -38,15 +38,12 @@ LARGEST, MOST_ELEMENTS, LONGEST_ROW = 200_000, 300, 32
 class Carriers:
     """Few transitions that carry the width of the envelope.
 
-    `transitions`: positions in the problem; `factor` (n,): mean width of each state with them, over that without.
+    `transitions`: positions in the problem; `factor` (n,): mean width of each state with them, over that without: of
+    MUCH or more they carry it.
     """
 
     transitions: tuple[int, ...]
     factor: Array
-
-    def carry(self, state: int) -> bool:
-        """Whether they make the envelope of this state much wider."""
-        return bool(self.factor[state] >= MUCH)
 
 
 def choose_discards(
@@ -123,7 +120,7 @@ def _greedy(engine: WorkingSet, criterion: str) -> Iterator[tuple[int, float]]:
     stale, find = set(range(len(engine.rows))), _gains if criterion == "qp" else _linear_gains
     while True:
         for i in stale:
-            gains[i] = find(engine, engine.rows[i])
+            gains[i] = find(engine, engine.rows[i]) if engine.rows[i].unknown else {}
         total: dict[int, float] = {}
         for i, row_gains in enumerate(gains):
             for index, gain in row_gains.items():
@@ -150,8 +147,6 @@ def _value(row: Programmes, criterion: str, weights: Array | None) -> float:
 
 def _gains(engine: WorkingSet, row: Programmes) -> dict[int, float]:
     """Fall of the row's part of (10) without each of the samples that carry it."""
-    if not row.unknown:
-        return {}
     value = _value(row, "qp", engine.fleet.weights)
     gains = {}
     for index in row.samples.index[row.carrying(_ACTIVE)].tolist():
@@ -168,8 +163,6 @@ def _linear_gains(engine: WorkingSet, row: Programmes) -> dict[int, float]:
     δ falls only without a sample that has a price (a dual variable) in the optimum: without another one the same
     prices prove the same δ. The simplex method goes on from the optimum before, so each takes a few pivots.
     """
-    if not row.unknown:
-        return {}
     trial = row.trial()
     simplex = trial.minimax()
     owner, least = np.full(len(trial.asked), -1), np.full(len(trial.asked), -np.inf)

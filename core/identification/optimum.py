@@ -85,11 +85,9 @@ def repair(
     for k, term in enumerate(columns.half, start=p):
         if term in columns.nominal:
             nominal[:, k] = elements[:, p + columns.nominal.index(term)]
+        if not term.times_dt and sizes is not None:
+            own[:, k] = sizes
     own[:, np.arange(n), np.arange(n)] = 1.0 / sums.dt_min
-    if sizes is not None:
-        for k, term in enumerate(columns.half, start=p):
-            if not term.times_dt:
-                own[:, k] = sizes
     base = np.clip(lifted, low, high)
     rounding = nominal.reshape(d.shape) + base + own.reshape(d.shape)
     for i in np.flatnonzero((fixed & (rounding > 0)).any(axis=0)):  # the others carry what these cannot

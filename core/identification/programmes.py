@@ -395,15 +395,13 @@ class Programmes(Row):
             steep = float(np.abs(self.gradient).max(initial=0.0))
             if steep <= 1.0:
                 raise
-        G, h = self._with_asked(*self.containment(self.pool))
         if -self.gradient.min() >= self.gradient.max():
             H, f = self.hessian(self.gram, self.gradient, TIE_BREAK)
+            G, h = self._with_asked(*self.containment(self.pool))
             answer = solve_qp(Programme(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep))
             self.store(answer.xi * steep)
             return answer.solver
-        simplex = Simplex(np.concatenate([np.zeros(self.r), self.gradient / steep]), self.lower, self.upper)
-        simplex.add(G, h)
-        self.store(simplex.solve())
+        self.store(self._narrowest(self.gradient / steep))
         return "HiGHS simplex"
 
     def collinear(self) -> bool:
@@ -415,12 +413,16 @@ class Programmes(Row):
 
         `cost` (q,): of the free half-widths; `most` (q,): they are no larger than this.
         """
+        return float(cost @ self._narrowest(cost, most)[self.r :])
+
+    def _narrowest(self, cost: Array, most: Array | None = None) -> Array:
+        """Scaled unknowns with that minimum."""
         upper = self.upper.copy()
         if most is not None:
             upper[self.r :] = np.minimum(upper[self.r :], most)
         simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, upper)
         simplex.add(*self._with_asked(*self.containment(self.pool)))
-        return float(cost @ simplex.solve()[self.r :])
+        return simplex.solve()
 
     def linear_gap(self) -> float:
         """As `duality_gap`, by the simplex method.

@@ -401,15 +401,14 @@ class Simplex:
         self._highs: Any = highspy.Highs()
         self._set({"output_flag": False, "solver": "simplex", "threads": 1})
         self._set({"primal_feasibility_tolerance": 1e-10, "dual_feasibility_tolerance": 1e-10})
-        self._infinity = infinity = highspy.kHighsInf
-        self._size = len(cost)
+        self._infinity = highspy.kHighsInf
+        self._size = size = len(cost)
         self._rows, self._limits = np.empty((0, len(cost))), np.empty(0)
         self._optimal = highspy.HighsModelStatus.kOptimal
         self._endless = highspy.HighsModelStatus.kIterationLimit
-        self._set({"simplex_iteration_limit": _ITERATIONS * (len(cost) + 100)})
-        for c, low, high in zip(cost, lower, upper, strict=True):
-            self._highs.addVar(max(low, -infinity), min(high, infinity))
-            self._highs.changeColCost(self._highs.getNumCol() - 1, c)
+        self._set({"simplex_iteration_limit": _ITERATIONS * (size + 100)})
+        self._highs.addVars(size, np.maximum(lower, -self._infinity), np.minimum(upper, self._infinity))
+        self._highs.changeColsCost(size, np.arange(size, dtype=np.int32), cost)
 
     def _set(self, options: dict[str, Any]) -> None:
         for option, value in options.items():
