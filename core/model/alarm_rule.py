@@ -14,7 +14,7 @@ from __future__ import annotations
 import reprlib
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -55,6 +55,7 @@ class AlarmRule:
     bounds that are judged; `horizon`: steps of the bounds that are judged.
     """
 
+    kind: ClassVar[str] = CONTAINMENT
     violations: int = 1
     window: int = 1
     margin: float = 1.0
@@ -72,11 +73,6 @@ class AlarmRule:
             raise _wrong("margin", self.margin, f"a positive number, {1 / LARGEST:g} to {LARGEST:g}")
         object.__setattr__(self, "margin", float(self.margin))
         _check_horizon(self.horizon)
-
-    @property
-    def kind(self) -> str:
-        """`containment`."""
-        return CONTAINMENT
 
     @property
     def span(self) -> str:

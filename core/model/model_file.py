@@ -69,7 +69,7 @@ def structure(model: Any) -> dict[str, Any]:
         "step": None if isinstance(signals.step, str) else signals.step,
         "table": _dict(signals.table),
     }
-    box = {name: getattr(domain, name).tolist() for name in ("x_min", "x_max", "u_min", "u_max")}
+    box = {name: getattr(domain, name) for name in ("x_min", "x_max", "u_min", "u_max")}
     found = {"measure": _dict(domain.measure), "step_max": finite_data(domain.step_max), "anywhere": domain.anywhere}
     whole = {
         "format": FORMATS[0],
@@ -79,8 +79,7 @@ def structure(model: Any) -> dict[str, Any]:
         **regimes,
         "horizons": [horizon.to_dict() for horizon in model.horizons] or None,
         "run": _dict(model.run),
-        "domain": {name: [v if math.isfinite(v) else None for v in limits] for name, limits in box.items()}
-        | _known(found, _OF_DOMAIN),
+        "domain": finite_data(box) | _known(found, _OF_DOMAIN),
         "residuals": _dict(model.residuals),
         "alarm": {key: getattr(rule, key) for key in ("violations", "window", "margin")}
         if model.alarm == (rule,)
@@ -114,7 +113,7 @@ def _signal(signal: Signal, keys: Sequence[str]) -> dict[str, Any]:
     """Entry of a signal; null for no limit of what is valid."""
     entry: dict[str, Any] = {key: getattr(signal, key) for key in keys}
     if signal.valid is not None:
-        entry["valid"] = [v if math.isfinite(v) else None for v in signal.valid]
+        entry["valid"] = finite_data(signal.valid)
     if signal.at != "departure":
         entry["at"] = signal.at
     if signal.judged:

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, runs
 from uncertain_lti.kernel.arithmetic import stretches
 from uncertain_lti.signals.signal_map import Signal
 
@@ -134,10 +134,8 @@ def _at(values: Array, stops: Iterable[float]) -> bool:
 
 def _arrivals(column: Array, end: float) -> list[float]:
     """Mean step over the samples before each time that a signal comes to be held at a value."""
-    there = np.concatenate([[False], column == end, [False]])
-    starts, ends = np.flatnonzero(there[1:] & ~there[:-1]), np.flatnonzero(~there[1:] & there[:-1])
     speeds = []
-    for start, stop in zip(starts, ends, strict=True):
+    for start, stop in runs(column == end):
         before = column[max(start - STILL_SAMPLES, 0) : start]
         if stop - start >= STILL_SAMPLES and len(before) > 1 and np.isfinite(before).all():
             speeds.append(float(np.abs(np.diff(before)).mean()))
