@@ -131,7 +131,7 @@ def test_objective_is_that_of_the_problem_as_written(criterion, additive, kind):
 
 
 @pytest.mark.parametrize("criterion", ["qp", "lp"])
-@pytest.mark.parametrize(("held", "many"), [(working_set._HELD_BYTES, programmes.MANY), (1, 1)])
+@pytest.mark.parametrize(("held", "many"), [(working_set._HELD_BYTES, solvers.MANY), (1, 1)])
 def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypatch):
     """Beyond the first subsample, where full passes have to correct it; rows proven together, or in groups of two.
 
@@ -140,8 +140,8 @@ def test_large_problem_reaches_the_same_optimum(criterion, held, many, monkeypat
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
     monkeypatch.setattr(working_set, "_FURTHEST", 400)
     monkeypatch.setattr(working_set, "_MANY", many)
-    monkeypatch.setattr(programmes, "MANY", many)
-    monkeypatch.setattr(programmes, "VERY_MANY", many)
+    monkeypatch.setattr(solvers, "MANY", many)
+    monkeypatch.setattr(solvers, "VERY_MANY", many)
     monkeypatch.setattr(working_set, "_HELD_BYTES", held)
     transient = drawn(small_plant(8, n=3), 3000, 8, noise=1e-3)
     model = fit(transient, criterion, additive="noise")
@@ -155,7 +155,7 @@ def test_a_row_without_a_proof_by_multipliers_is_proven_by_the_simplex_method(mo
     """And by that alone: it is not solved a third time, in refined coordinates."""
     refined = []
     monkeypatch.setattr(working_set, "SUBSAMPLE", 1000)
-    monkeypatch.setattr(programmes, "linear_bound", lambda *_: (-np.inf, np.empty(0)))
+    monkeypatch.setattr(solvers, "linear_bound", lambda *_: (-np.inf, np.empty(0)))
     monkeypatch.setattr(programmes.Programmes, "refine", refined.append)
     model = fit(drawn(small_plant(8), 3000, 8, noise=1e-3), "lp", additive="noise")
     assert not refined and 0.0 <= model.fit_summary["optimality_gap"] < 1e-7

@@ -55,7 +55,7 @@ def test_a_fit_of_many_unknowns_starts_from_one_that_is_near(criterion, monkeypa
     run = Transient(0.1 * np.arange(3001), x, u)
     near, part = fit(run, criterion, additive="noise"), run.replace(slice(0, 2500))
     alone, started = (fit(part, criterion, additive="noise", near=of) for of in (None, near))
-    monkeypatch.setattr("uncertain_lti.identification.programmes.VERY_MANY", 1000)
+    monkeypatch.setattr("uncertain_lti.identification.solvers.VERY_MANY", 1000)
     slow = fit(part, criterion, additive="noise")
     of = [model.fit_summary["solver"] for model in (started, alone, slow)]
     assert of[0]["rounds"] <= 3 * (2 if criterion == "lp" else 1) < of[1]["rounds"]

@@ -20,22 +20,8 @@ import numpy as np
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.identification import solvers
 from uncertain_lti.identification.row import COLLINEAR, TOLERANCE, Row
-from uncertain_lti.identification.solvers import (
-    FEASIBLE,
-    MANY,
-    VERY_MANY,
-    Answer,
-    Face,
-    Programme,
-    Sense,
-    Simplex,
-    dual_bound,
-    linear_bound,
-    solve_near,
-    solve_on_face,
-    solve_qp,
-)
 
 TIE_BREAK = 1e-8
 """Weight of the squared distance of the centre relative to the squared half-widths.
@@ -78,13 +64,13 @@ class Programmes(Row):
         self.allowed = 0.0  # δ that the ties may have, in the same units
         self.exact = False  # (11) by the simplex method
         self.least = 0.0  # δ of (11) that it or `nominal` found, in the same units as the limit
-        self._face: Face | None = None
+        self._face: solvers.Face | None = None
         self.attempt: tuple[float, float] = _ATTEMPTS[0]
-        self._last: dict[str, Answer] = {}  # to the last programme of a kind
+        self._last: dict[str, solvers.Answer] = {}  # to the last programme of a kind
         self._start_simplex_afresh()
 
     def _start_simplex_afresh(self) -> None:
-        self._simplex: Simplex | None = None
+        self._simplex: solvers.Simplex | None = None
         self._known: Index = np.empty(0, dtype=np.intp)
 
     def refine(self) -> None:
@@ -138,7 +124,7 @@ class Programmes(Row):
 
         objective(factor on the tie-break, ridge) -> H, f. Raises FitError where DAQP, or any solver, gives up.
         """
-        feasible = FEASIBLE if self.refined else ROUGH
+        feasible = solvers.FEASIBLE if self.refined else ROUGH
         last, known, start = self._last.get(kind), self._sides(kind), None
         if last is not None and last.active is not None and known is not None and len(self.pool):
             known = known[:, : len(self.pool)]  # the pool grows, but for discards
@@ -150,24 +136,25 @@ class Programmes(Row):
         if last is None and self.basis is None:
             begin[: self.r] = self.scaled()[0]
         limits = *self._with_asked(G, h), lower, upper
-        inside = len(lower) >= MANY and (kind != "regularised" or last is None)  # that moves on with its tie-break
-        accurate = len(lower) >= VERY_MANY and kind == "quadratic"
+        moves_on = kind == "regularised" and last is not None  # with its tie-break
+        inside = len(lower) >= solvers.MANY and not moves_on
+        accurate = len(lower) >= solvers.VERY_MANY and kind == "quadratic"
         for self.attempt in _ATTEMPTS:
-            programme = Programme(*objective(*self.attempt), *limits)
+            programme = solvers.Programme(*objective(*self.attempt), *limits)
             like = objective(_LIKE * self.attempt[0], self.attempt[1]) if inside else None
             try:
-                answer = solve_near(programme, begin, start, feasible, like=like, accurate=accurate)
+                answer = solvers.solve_near(programme, begin, start, feasible, like=like, accurate=accurate)
                 break
             except FitError:
                 continue
         else:
             if not any_solver:
                 raise FitError("DAQP could not solve the quadratic programme")
-            answer = solve_qp(Programme(*objective(*self.attempt), *limits), feasible=feasible)
+            answer = solvers.solve_qp(solvers.Programme(*objective(*self.attempt), *limits), feasible=feasible)
         self._last[kind] = answer
         return answer.xi, answer.solver
 
-    def _sides(self, kind: str) -> Sense | None:
+    def _sides(self, kind: str) -> solvers.Sense | None:
         """Which rows of each sample were active in the last programme of a kind, (rows, samples of its pool)."""
         last = self._last.get(kind)
         if last is None or last.active is None:
@@ -184,14 +171,14 @@ class Programmes(Row):
             return np.flatnonzero(self.slack() < slack)
         return np.asarray(self.pool[(sides != 0).any(axis=0)])
 
-    def _active_sets(self, kind: str, count: int) -> list[Sense | None]:
+    def _active_sets(self, kind: str, count: int) -> list[solvers.Sense | None]:
         """What to make multipliers of: what was active in the last programme of a kind and size, then the slack."""
         last = self._last.get(kind)
         return [None] if last is None or last.active is None or len(last.active) != count else [last.active, None]
 
     def quadratic(self) -> str:
         """Solve (10) on the working set; of many unknowns, with what is next to join it."""
-        if self.r + self.q >= VERY_MANY:
+        if self.r + self.q >= solvers.VERY_MANY:
             self.widen_pool((self.r + self.q) // 2, np.inf)
 
         def objective(factor: float, ridge: float) -> tuple[Array, Array]:
@@ -325,16 +312,16 @@ class Programmes(Row):
         xi, cost = np.append(np.concatenate(self.scaled()), self.limit), np.append(np.zeros(self.r + self.q), 1.0)
         low, high = np.append(self.lower, 0.0), np.append(self.upper, np.inf)
         for active in self._active_sets("regularised", len(xi) + len(h)):
-            bound = max(bound, linear_bound(cost, G, h, low, high, xi, active)[0])
+            bound = max(bound, solvers.linear_bound(cost, G, h, low, high, xi, active)[0])
             if self.limit <= (1.0 + 2.0 * WIDTH_SLACK) * bound:
                 break
         return bound
 
-    def minimax(self, nominal_alone: bool = False) -> Simplex:
+    def minimax(self, nominal_alone: bool = False) -> solvers.Simplex:
         """Minimise δ, the last unknown, after all others or the nominal elements alone."""
         size = self.r if nominal_alone else self.r + self.q
         cost = np.append(np.zeros(size), 1.0)
-        simplex = Simplex(cost, np.append(self.lower[:size], 0.0), np.append(self.upper[:size], np.inf))
+        simplex = solvers.Simplex(cost, np.append(self.lower[:size], 0.0), np.append(self.upper[:size], np.inf))
         simplex.add(*self._with_asked(np.empty((0, len(cost))), np.empty(0)))
         return simplex
 
@@ -352,11 +339,11 @@ class Programmes(Row):
             theta = np.linalg.lstsq(self.basis, theta, rcond=None)[0].astype(np.float64)
         H, f = self.hessian(self.gram, self.gradient, factor * TIE_BREAK, ridge)
         xi = np.concatenate([theta, d])
-        programme = Programme(H, f, *self._with_asked(*self.containment(self.pool)), self.lower, self.upper)
+        programme = solvers.Programme(H, f, *self._with_asked(*self.containment(self.pool)), self.lower, self.upper)
         objective, value = float(0.5 * xi @ H @ xi + f @ xi), max(self.value(d), self.least_value())
         above = np.inf
         for active in self._active_sets("quadratic", len(f) + len(programme.h)):
-            above = min(above, objective - dual_bound(programme, xi, active))
+            above = min(above, objective - solvers.dual_bound(programme, xi, active))
             if above <= GOOD * value:
                 break
         weight = factor * TIE_BREAK * float(np.diagonal(self.gram).min(initial=1.0))
@@ -398,7 +385,9 @@ class Programmes(Row):
         if -self.gradient.min() >= self.gradient.max():
             H, f = self.hessian(self.gram, self.gradient, TIE_BREAK)
             G, h = self._with_asked(*self.containment(self.pool))
-            answer = solve_qp(Programme(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep))
+            answer = solvers.solve_qp(
+                solvers.Programme(H, f / steep, G, h / steep, self.lower / steep, self.upper / steep)
+            )
             self.store(answer.xi * steep)
             return answer.solver
         self.store(self._narrowest(self.gradient / steep))
@@ -420,7 +409,7 @@ class Programmes(Row):
         upper = self.upper.copy()
         if most is not None:
             upper[self.r :] = np.minimum(upper[self.r :], most)
-        simplex = Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, upper)
+        simplex = solvers.Simplex(np.concatenate([np.zeros(self.r), cost]), self.lower, upper)
         simplex.add(*self._with_asked(*self.containment(self.pool)))
         return simplex.solve()
 
@@ -462,14 +451,14 @@ class Programmes(Row):
         tight = np.concatenate([face.bounds, np.pad(face.samples, ((0, 0), (0, more))).ravel(), face.asked])
         H, f = self.hessian(self.plain, self.plain_gradient, BOUNDED_TIE_BREAK)
         limits = np.minimum(limits - rows @ face.xi, 0.0)  # the optimum satisfies them, but for rounding
-        programme = Programme(H, f + H @ face.xi, rows, limits, self.lower - face.xi, self.upper - face.xi)
+        programme = solvers.Programme(H, f + H @ face.xi, rows, limits, self.lower - face.xi, self.upper - face.xi)
         self.attempt, step, solver = _ATTEMPTS[0], np.zeros(len(face.xi)), ""
         with suppress(FitError):  # or the ties stay as they are
-            step, solver = solve_on_face(programme, tight)
+            step, solver = solvers.solve_on_face(programme, tight)
         self.store_limited(np.append(face.xi + step, self.allowed))
         return solver or ("HiGHS simplex" if self.exact else self._last["nominal"].solver)
 
-    def face(self) -> Face:
+    def face(self) -> solvers.Face:
         """Where the optima of (11) are, on the working set of the last that was found.
 
         Raises FitError where no multipliers prove that it was one.
@@ -485,7 +474,7 @@ class Programmes(Row):
             if box is not None:  # a sample that is as far off as it may be is as wide as it may be
                 xi = np.concatenate([xi[:-1], box * (xi[-1] * self._unit), xi[-1:]])
                 bounds, samples = np.pad(bounds, (0, self.q)), np.vstack([samples, samples.any(axis=0)])
-            self._face = Face(xi[:-1], bounds, samples, asked)
+            self._face = solvers.Face(xi[:-1], bounds, samples, asked)
         return self._face
 
     def _priced(self, kinds: int) -> tuple[Array, Array]:
@@ -502,7 +491,7 @@ class Programmes(Row):
         G, h = self._with_asked(*self._distances(self.pool))
         limits = np.append(self.lower[: self.r], 0.0), np.append(self.upper[: self.r], np.inf)
         for active in self._active_sets("nominal", len(xi) + len(h)):
-            bound, prices = linear_bound(np.eye(len(xi))[-1], G, h, *limits, xi, active)
+            bound, prices = solvers.linear_bound(np.eye(len(xi))[-1], G, h, *limits, xi, active)
             if xi[-1] <= (1.0 + WIDTH_SLACK) * bound:
                 self.least = bound * self._unit
                 return xi, np.delete(prices, len(xi) - 1)
@@ -526,13 +515,13 @@ class Programmes(Row):
         try:
             inside = self._with_asked(np.vstack([phi, -phi]), np.concatenate([y - half, -y - half]))
             H, limits = self.centre + self.attempt[1] * np.eye(self.r), (self.lower[: self.r], self.upper[: self.r])
-            programme = Programme(H, -self.target, *inside, *limits)
-            feasible = FEASIBLE if self.refined else ROUGH
-            if self.r < MANY:
-                answer = solve_qp(programme, any_solver=False, feasible=feasible)
+            programme = solvers.Programme(H, -self.target, *inside, *limits)
+            feasible = solvers.FEASIBLE if self.refined else ROUGH
+            if self.r < solvers.MANY:
+                answer = solvers.solve_qp(programme, any_solver=False, feasible=feasible)
             else:
                 begin = self.scaled()[0] if self.basis is None else np.zeros(self.r)
-                answer = solve_near(programme, begin, feasible=feasible, like=programme[:2])
+                answer = solvers.solve_near(programme, begin, feasible=feasible, like=programme[:2])
         except FitError:  # the half-widths leave no room at all
             return
         self.store_theta(answer.xi)

@@ -199,22 +199,21 @@ def _signal(need_topics: bool, data: Any, where: str) -> Signal:
     return Signal(**entry)
 
 
-def _one_of(write: str, *values: str) -> Reader:
+def _that(fits: Callable[[Any], bool], write: str) -> Reader:
     def reader(value: Any, where: str) -> Any:
-        if value not in values:
+        if not fits(value):
             raise wrong(where, value, write)
         return value
 
     return reader
+
+
+def _one_of(write: str, *values: str) -> Reader:
+    return _that(lambda value: value in values, write)
 
 
 def _of_type(write: str, *kinds: type) -> Reader:
-    def reader(value: Any, where: str) -> Any:
-        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            raise wrong(where, value, write)
-        return value
-
-    return reader
+    return _that(lambda v: isinstance(v, kinds) and (bool in kinds or not isinstance(v, bool)), write)
 
 
 def _number_or_auto(value: Any, where: str) -> Any:
