@@ -62,7 +62,8 @@ def machine(tmp_path_factory):
     modes = {20: [3], 100: [1], 130: [3], 190: [1, 3], 220: [1], 221: [3]}
     messages = messages_of(transient(300, 2, start_ns=10**18, fault_at=60), modes)
     write(TOPICS, messages).save(folder / "run.mcap")
-    model = fit(read_transients(folder / "healthy.mcap", folder / "signals.yaml"), alarm_rule=AlarmRule(2, 5))
+    model = fit(read_transients(folder / "healthy.mcap", folder / "signals.yaml"))
+    model = model.replace(alarm_rule=AlarmRule(2, 5))
     model.save(folder / "m.model.json")
     return model, folder, messages
 

@@ -509,7 +509,8 @@ def test_validate_refuses_what_it_cannot_vouch_for(folder):
 
 def test_a_model_is_validated_with_its_own_settings(runs):
     """validate(model, runs) is validate(runs, ...) with every setting of the fit given again by hand."""
-    model = fit(runs[:6], "lp", additive="noise", schedule={"x1": 2}, alarm_rule=AlarmRule(2, 3), count="transient")
+    model = fit(runs[:6], "lp", additive="noise", schedule={"x1": 2}, count="transient")
+    model = model.replace(alarm_rule=AlarmRule(2, 3))
     mine = uncertain_lti.validate(model, runs[:6], confidence=0.8).to_dict()
     by_hand = validate(runs[:6], full=model, criterion="lp", additive="noise", count="transient", confidence=0.8)
     assert mine == by_hand.to_dict() and "2 of 3" in mine["false_alarms"][0]["rule"]

@@ -190,7 +190,6 @@ def fit_archive(
         signals,
         criterion,
         structure=structure_of(signals, scheduled),
-        alarm_rule=alarm_rule,
         progress=progress,
         dt_median=fleet.median_dt() if dt is None else float(np.median(dt)),
         where=where,
@@ -203,7 +202,7 @@ def fit_archive(
         "transients": len(recordings),
         "sources": [{"file": file} for file in dict.fromkeys(file for _, files in recordings for file in files)],
     }
-    return with_repeats(model.replace(fit_summary=facts), visit("repeats in", repeats, model))
+    return with_repeats(model.replace(fit_summary=facts, alarm_rule=alarm_rule), visit("repeats in", repeats, model))
 
 
 def _cached(

@@ -38,7 +38,6 @@ from uncertain_lti.identification.regimes import Knots, asked_by, scheduled_by, 
 from uncertain_lti.identification.row import InfeasibleError
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.identification.working_set import WorkingSet
-from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.domain import Domain, Sampling, largest_steps
 from uncertain_lti.model.horizon import MOST_STEPS, Widths
 from uncertain_lti.model.operating_point import OperatingPoint
@@ -73,7 +72,6 @@ def fit(
     method: Literal["working-set", "cvxpy"] = "working-set",
     describe_data: bool = True,
     seek_carriers: bool = False,
-    alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
     near: UncertainLTI | None = None,
 ) -> UncertainLTI:
@@ -133,7 +131,6 @@ def fit(
         criterion,
         structure=structure,
         method=method,
-        alarm_rule=alarm_rule,
         progress=progress,
         dt_median=median_step(problem.dt),
         describe_data=describe_data,
@@ -241,7 +238,6 @@ def fit_fleet(
     *,
     structure: Structure | None = None,
     method: str = "working-set",
-    alarm_rule: AlarmRule | None = None,
     progress: Callable[[str], None] | None = None,
     dt_median: float | None = None,
     describe_data: bool = True,
@@ -278,7 +274,6 @@ def fit_fleet(
             signals=signals,
             sampling=Sampling(dt_median, sums.dt_min, sums.dt_max),
             domain=domain,
-            alarm_rule=alarm_rule,
         )
 
     try:

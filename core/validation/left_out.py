@@ -107,8 +107,8 @@ def leave_out(
     if full is not None and options.get("schedule") is not None:
         raise FitError("full has its own schedule, which every fit is given; leave schedule out")
     if full is None:
-        full = fit(transients, weights=weights, alarm_rule=alarm_rule, **options)
-    elif alarm_rule is not None:
+        full = fit(transients, weights=weights, **options)
+    if alarm_rule is not None:
         full = full.replace(alarm_rule=alarm_rule)
     options |= {
         "operating_point": full.operating_point,
