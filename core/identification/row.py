@@ -182,9 +182,9 @@ class Row:
         self.centre = self.phi_columns.square(sums.centre) * np.outer(self.unit_phi, self.unit_phi) / sums.count
         target = sums.target[:, i] - sums.centre @ self.fixed_theta
         self.target = self.phi_columns.take(target) * self.unit_phi / (sums.count * self.scale)
-        plain = self._gram(sums.plain_gram, sums.count)
+        plain = self._gram(sums.plain_gram)
         self.plain, self.plain_gradient, _ = plain
-        self.gram, self.gradient, self.known = plain if sums.gram is None else self._gram(sums.gram[i], sums.count)
+        self.gram, self.gradient, self.known = plain if sums.gram is None else self._gram(sums.gram[i])
         self.basis: Array | None = None  # scaled θ = basis η, in refined coordinates
         self.asked: Array = np.empty((0, self.r))  # asked η >= asked_limits: constraints of the structure on θ there
         self.asked_limits: Array = np.empty(0)
@@ -277,9 +277,9 @@ class Row:
             theta = theta - self.fixed_theta[self.free_phi]
         return theta / (self.unit_phi * self.scale), d / (self.unit_psi * self.scale)
 
-    def _gram(self, gram: Array, count: int) -> tuple[Array, Array, float]:
+    def _gram(self, gram: Array) -> tuple[Array, Array, float]:
         """Squared widths as ½ dᵀ G d + gᵀ d + k in scaled units; G has order one."""
-        unit = self.unit_psi
+        unit, count = self.unit_psi, self.sums.count
         inside = self.psi_columns.square(gram) * np.outer(unit, unit) / count
         linear = self.psi_columns.take(gram @ self.fixed_d) * unit / (count * self.scale)
         largest = float(np.diagonal(inside).max(initial=0.0)) or 1.0

@@ -122,7 +122,7 @@ def solve_qp(
 
 
 def _solved(
-    of: Programme, active: Sense | None, any_solver: bool, feasible: float, equations: bool = False
+    of: Programme, active: Sense | None, any_solver: bool, feasible: float, equations: bool
 ) -> tuple[Answer, float]:
     """The answer of the first solver that has a good one, and by how much it violates a row."""
     scaled, s = _scaled(of)

@@ -375,12 +375,10 @@ class Transient:
     def _repr_html_(self) -> str:
         """Range, largest step and missing samples of each signal."""
         rows = []
-        units = [s.unit for s in self.signals.signals] if self.signals else [""] * 10**4
-        groups = {"state": self.state_names, "control": self.control_names, "scheduling": self.scheduling_names}
-        names = [name for group in groups.values() for name in group]
-        kinds = [kind for kind, group in groups.items() for _ in group]
+        kinds = ["state"] * self.x.shape[1] + ["control"] * self.u.shape[1] + ["scheduling"] * self.s.shape[1]
+        units = [s.unit for s in self.signals.signals] if self.signals else [""] * len(kinds)
         columns = [*self.x.T, *self.u[:-1].T, *self.s[:-1].T]
-        for name, kind, unit, values in zip(names, kinds, units, columns, strict=False):
+        for name, kind, unit, values in zip(self.signal_names, kinds, units, columns, strict=False):
             finite = values[np.isfinite(values)]
             low, high = (float(finite.min()), float(finite.max())) if len(finite) else (math.nan, math.nan)
             rms = float(np.sqrt(np.nanmean(np.diff(values) ** 2))) if len(finite) > 1 else math.nan
