@@ -172,17 +172,14 @@ def map_arguments(data: Any, source: str, need_topics: bool) -> dict[str, Any]:
 
     What is null is as if it were left out.
     """
-    readers: dict[str, Reader] = _OF_THE_MAP | dict.fromkeys(LISTS, partial(_signals, need_topics))
+    entry = partial(_signal, need_topics)
+    readers = _OF_THE_MAP | dict.fromkeys(LISTS, lambda listed, where: checked_list(listed, where, entry))
     top = expand(checked_mapping(data, source, {*readers}), source)
     top |= _with_memories(top)
     found = {key: readers[key](value, f"{source}: {key}") for key, value in top.items() if value is not None}
     listed = (entry for entry in top.get("controls") or () if isinstance(entry, dict))
     given = {"source": source, "ends_given": any(entry.get("at") is not None for entry in listed)}
     return {"states": (), "time": found.pop("topics", {}), **given, **found}
-
-
-def _signals(need_topics: bool, data: Any, where: str) -> tuple[Signal, ...]:
-    return checked_list(data, where, partial(_signal, need_topics))
 
 
 def _signal(need_topics: bool, data: Any, where: str) -> Signal:
