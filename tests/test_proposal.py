@@ -987,6 +987,17 @@ def test_of_a_plant_a_twin_is_judged_and_what_says_the_same_to_the_last_digit_is
     assert re.search("P_error: follows from .*P_set", proposal.text)  # a step of the set point is no fault
 
 
+def test_of_a_plant_a_set_point_that_only_rises_is_no_counter(tmp_path):
+    """That of a furnace that heats up, in whole degrees: it was left out, and nothing was a control."""
+    rng, paths = np.random.default_rng(0), []
+    for batch, rate in enumerate((8, 10, 12)):
+        asked = np.minimum(30 + np.arange(3000) * rate // 60, 500)
+        columns = {"Setpoint_C": asked, "Zone_C": (20 + answers(rng, asked[:, None] - 20.0, 0.3)[:, 0] / 50).round(1)}
+        paths.append(table_of(tmp_path / f"{batch}.csv", columns, np.arange(3000)))
+    for some in (paths[:1], paths):
+        assert signals_of(propose(some)) == ([("/table", "Zone_C")], [("/table", "Setpoint_C")])
+
+
 def test_two_sensors_of_one_row_are_both_states_and_what_is_computed_from_one_is_not(tmp_path):
     """Of a robot's wheels and gyro, which tell the same, the wheels were left out, and no slip was seen."""
     rng = np.random.default_rng(0)

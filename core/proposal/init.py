@@ -339,7 +339,7 @@ def _unfit(candidate: Candidate, source: Source) -> str:
     if clock := called_time(candidate.path.rpartition(".")[2]) or not names.isdisjoint(words_of(candidate.path)):
         steps = np.concatenate([np.diff(v) for v in apart])
         clock = bool(np.mean(steps[steps != 0] > 0) > 0.9)  # that of a day starts anew
-    if not clock and source.role != "control":  # counts, or adds up, by its name or from one recording to the next
+    if not clock and source.role not in ("control", "reference"):  # counts or adds up: in name, or from run to run
         named = not _ADDED.isdisjoint(words_of(candidate.path))
         rises = np.concatenate([np.diff(v) for v in apart]) if named else np.diff(finite)
         adds = not wheel and bool((rises >= 0).all()) and (named or (len(apart) > 1 and bool(np.mean(rises > 0) > 0.5)))
