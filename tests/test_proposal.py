@@ -987,6 +987,18 @@ def test_of_a_plant_a_twin_is_judged_and_what_says_the_same_to_the_last_digit_is
     assert re.search("P_error: follows from .*P_set", proposal.text)  # a step of the set point is no fault
 
 
+def test_of_a_plant_a_position_that_keeps_close_to_its_set_point_is_judged(tmp_path):
+    """Within the rounding of the set point it was taken for a copy, and a valve that sticks was not seen."""
+    rng = np.random.default_rng(0)
+    sent = np.repeat(rng.integers(10, 90, 150), 20)
+    flow, keeps = answers(rng, sent[:, None] / 50)[:, 0], (sent + 0.05 * rng.normal(size=3000)).round(1)
+    columns = {"Inlet_setpoint_pct": sent, "Inlet_opening_pct": keeps, "Flow": flow, "Sent_pct": 1.0 * sent}
+    proposal = propose([table_of(tmp_path / "a.csv", columns, 5.0 * np.arange(3000))])
+    assert [c.path for c in proposal.states] == ["Inlet_opening_pct", "Flow"], proposal.text
+    assert [c.path for c in proposal.controls] == ["Inlet_setpoint_pct"]
+    assert "Sent_pct: moves with Inlet_setpoint_pct" in proposal.text
+
+
 def test_of_a_plant_a_set_point_that_only_rises_is_no_counter(tmp_path):
     """That of a furnace that heats up, in whole degrees: it was left out, and nothing was a control."""
     rng, paths = np.random.default_rng(0), []

@@ -229,7 +229,8 @@ def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
         return bool(abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
     slope, offset = np.polyfit(b, a, 1)
     last_digits = np.diff(np.unique(a)).min() + abs(slope) * np.diff(np.unique(b)).min()
-    last_digits *= not (_alike(one, other) and abs(slope - 1.0) < 0.05)  # rounded copies in one unit would be equal
+    of_one = one.source.role == other.source.role and not (_alike(one, other) and abs(slope - 1.0) < 0.05)
+    last_digits *= of_one  # rounded copies in one unit would be equal, and what follows a set point closely is none
     return bool(np.abs(a - slope * b - offset).max() <= last_digits + 1e-9 * np.ptp(a))
 
 

@@ -65,8 +65,7 @@ def plant_signals(sources: Sequence[Source]) -> tuple[list[Candidate], list[Cand
     for alike in (two_valued, [c for c in moving if c not in two_valued]):  # a power is no copy of what switches it
         drop_copies(alike, exact=True)
     free = [c for c in every if not c.reason]
-    called = {c for s in sources if s.role in ("control", "reference") for c in s.candidates}
-    controls = [c for c in free if _is_set(c, c in called)]
+    controls = [c for c in free if _is_set(c, c.source.role in ("control", "reference"))]
     switches = [c for c in controls if c.why.startswith("switched")]
     for candidate in free:
         on = next((s for s in switches if _gated(candidate, s)), None) if candidate not in controls else None
