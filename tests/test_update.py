@@ -142,6 +142,20 @@ def test_thresholds_and_promise_are_learnt_from_all_recordings():
         assert f"only changes {times}: fit all recordings together" in said["note"], said["note"]
 
 
+@pytest.mark.parametrize("seed, criterion", [(12, "qp"), (3, "lp")])
+def test_what_the_alarm_sees_is_by_the_bounds_after_the_update(seed, criterion):
+    """With a recording of another machine they are far wider; the jumps stayed those of the bounds before it."""
+    runs = runs_of(seed, (1500,) * 4)
+    far = runs[3].replace(x=5.0 * runs[3].x[:, ::-1] + 40.0, name="other")
+    model, whole = fit(runs[:3], criterion, additive="noise"), fit([*runs[:3], far], criterion, additive="noise")
+    updated = model.update([*runs[:3], far])
+    before, after, of_all = (np.array(m.fit_summary["alarm"]["biases"]) for m in (model, updated, whole))
+    assert (after > 5.0 * before).all() and (after > 0.5 * of_all).all() and (after < 2.5 * of_all).all()
+    assert "but for those of another machine, or in other units" in updated.fit_summary["alarm"]["note"]
+    same = model.update(runs[3]).fit_summary["alarm"]
+    assert same["biases"] == pytest.approx(before, rel=0.25) and "machine" not in same["note"]
+
+
 def test_an_alarm_that_was_changed_stays():
     runs = runs_of(11, (1500,) * 4)
     model = fit(runs[:3], "qp", additive="noise")

@@ -269,8 +269,7 @@ def updated(
         """1 where a transition begins outside the ranges of the model: all that it keeps of what it was fitted to."""
         return model.domain.beyond(model.normalised_columns(steps)).astype(np.intp)
 
-    every = (judge(model, model, run, run.name, level=beyond) for run in runs)
-    parts = [part for part in every if part.judged]
+    parts = [part for run in runs if (part := judge(model, model, run, run.name, level=beyond)).judged]
     panel = None
     if kept and parts:
         panel = extended(Evidence.from_dict(kept), model, alarm, parts, fitted_parts(found, runs))
@@ -282,7 +281,8 @@ def updated(
         if panel.figure > GROWN * before:
             note = (
                 f"brought up to date with recordings unlike the earlier ones, so that the alarm sees only changes "
-                f"{panel.figure / before:.1f} times as large as the fit before them saw: fit all recordings together"
+                f"{panel.figure / before:.1f} times as large as the fit before them saw: fit all recordings together, "
+                "but for those of another machine, or in other units"
             )
         kept = panel.evidence.to_dict()
         alarm = {**alarm, **panel.summary(found), "fitted_figure": before, "note": note}
