@@ -56,6 +56,17 @@ def test_output_that_cannot_be_written(folder, what):
     assert "Exception ignored" not in done.stderr
 
 
+def test_a_library_warns_of_nothing_on_the_terminal(tmp_path):
+    """Of the largest number there is, which stands for none, numpy wrote lines of the program's own text there."""
+    values = (-1.7e308 if k % 9 == 3 else 1.7e308 if k % 9 == 4 else k % 5 for k in range(60))
+    rows = [f"{0.1 * k:.1f},{k % 7},{value}" for k, value in enumerate(values)]
+    (tmp_path / "a.csv").write_text("\n".join(["time,a,b", *rows]))
+    started = [sys.executable, "-c", "import sys; from uncertain_lti.cli import begin; sys.exit(begin())"]
+    for words in (["topics"], ["plot", "--output", "a.html"]):
+        done = run([*words, "a.csv"], started, capture_output=True, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
 @pytest.mark.parametrize("package", ["mcap", "rosbags", "zstandard"])
 def test_a_robot_that_only_monitors_is_told_what_recordings_need(folder, package):
     """There apt installs numpy and PyYAML alone. MCAP files need the first; not every file needs the others."""

@@ -15,6 +15,7 @@ May import every room.
 from __future__ import annotations
 
 import sys
+import warnings
 from typing import Any
 
 FAULT, INTERRUPTED = 70, 130
@@ -24,6 +25,8 @@ _interrupts: list[int] = []
 
 def begin() -> int:
     """Import the program and run it: one that cannot be imported never ends with the exit status of an alarm."""
+    if not sys.warnoptions:  # of a library, as numpy's of an overflow: with nothing that a reader could do
+        warnings.simplefilter("ignore")
     try:
         import signal
 

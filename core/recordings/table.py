@@ -268,7 +268,7 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
             words = f"its steps are {step / least:.4g} times those of {fastest.path}: if its times are in {unit}"
             table._warnings.append(f"{table.path}: {words} and those in s, call its column time_{unit}")
     dated = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > DATED_NS]
-    alone = [t for t in dated if len(_numbers(t.columns_by_field)) == 1]
+    alone = [t for t in dated if sum(c.dtype.kind not in "OM" for c in t.columns_by_field.values()) == 1]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
             remedy = "if each of them is of another signal of one machine, write them as columns of one file"
@@ -336,11 +336,6 @@ def _times_of_rows(
         even, taken = times, f"only the first of such rows counts: {each * (number > 1)}"
     same = f"{equal} of {len(times)} rows have the time of a row before in column '{time}', and {taken}"
     return np.ones_like(again), even, [f"{same}write times with more decimals, or take another, `--table time=COLUMN`"]
-
-
-def _numbers(columns: Mapping[str, Column]) -> list[Column]:
-    """Columns that are neither text nor instants."""
-    return [column for column in columns.values() if column.dtype.kind not in "OM"]
 
 
 def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> tuple[int, str]:
