@@ -166,6 +166,16 @@ def test_what_was_fitted_proves_nothing(engine, cli, tmp_path):
     assert "left out one recording at a time" in page
 
 
+def test_a_long_note_keeps_its_remedy(engine):
+    model = UncertainLTI.load(engine / "m.model.json")
+    note = f"rank deficient: {'signals of long names, ' * 30}record them moving independently, or leave one out"
+    noted = model.replace(fit_summary={**model.fit_summary, "messages": [note]})
+    run = read_transients(engine / "other.mcap", engine / "signals.yaml")[0]
+    verdicts = [EnvelopeMonitor(noted).check(run)]
+    page = html_report(noted, verdicts, findings(noted, "m.json", verdicts))
+    assert "leave one out" in page.partition("What happened?</h")[0].rpartition("May I rely on it?")[2]
+
+
 def test_names_from_files_are_text(engine):
     """In names, units, notes, messages, sections of the model file and paths."""
     model = UncertainLTI.load(engine / "m.model.json")

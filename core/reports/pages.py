@@ -34,7 +34,7 @@ from markupsafe import Markup, escape
 from uncertain_lti.base.arrays import Array, Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import target, written
-from uncertain_lti.base.text import Block, Table, beyond, number, plural, shortened, shortlist
+from uncertain_lti.base.text import Block, Table, beyond, number, plural, printable, shortened, shortlist
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.verdict import Verdicts
 from uncertain_lti.recordings.recording import Progress, Recording
@@ -148,7 +148,7 @@ def html_report(
 
 def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     rely, reasons = facts["rely"], facts["rely"]["reasons"]
-    items = [{"lead": r["weight"], "tone": _TONE[r["weight"]], "text": _cut(r["text"])} for r in reasons]
+    items = [{"lead": r["weight"], "tone": _TONE[r["weight"]], "text": printable(r["text"])} for r in reasons]
     answer = rely["answer"]
     yield _card("May I rely on it?", _TONE[answer], answer, items, 6, "trust")
     what, look = _headline(facts)
@@ -157,7 +157,7 @@ def _cards(facts: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
     if answer == NO and look == "bad":
         card["list"].append({"text": "The model is not to be relied on: the machine may be well, and the model wrong."})
     yield card
-    items = [{"text": _cut(text)} for text in facts["sees"]["texts"]]
+    items = [{"text": printable(text)} for text in facts["sees"]["texts"]]
     yield _card("Which faults would it see?", "wide", facts["sees"]["answer"], items, 6, "trust")
 
 
@@ -210,11 +210,6 @@ def _where_from(facts: Mapping[str, Any]) -> list[Block]:
     rows += [["checked", f["file"], f["sha256"]] for r in facts["recordings"] for f in r["files"]]
     fit = [[key, number(v) if isinstance(v, float) else str(v)] for key, v in model["fit"].items()]
     return [Table(("what", "file", "sha256"), rows, left=(1, 2), most=300), Table(("fit", ""), fit, left=(1,))]
-
-
-def _cut(text: str) -> str:
-    """The beginning of a text of a file."""
-    return text[:400] + (" ..." if len(text) > 400 else "")
 
 
 # --- panels ------------------------------------------------------------------------------------------------------
