@@ -1607,6 +1607,10 @@ def test_a_clock_whose_rows_are_far_apart_in_no_unit_is_refused_until_its_unit_i
     refuses(BagError, "12000 from row to row: has no unit.*--table unit=us", read_csv, tmp_path, "timestamp,x", rows)
     (bag,) = group_recordings([tmp_path / "a.csv"], layout=TableLayout(unit="us"))
     assert np.median(np.diff(bag.times)) == 12_000_000
+    rows = [f"{10**8 * k},{k % 7}" for k in range(60)]  # 10 a second, which us made a row in 100 s
+    refuses(
+        BagError, "100000000 from row to row: has no unit; name it time_ns, .*unit=ns", read_csv, tmp_path, "t,x", rows
+    )
     polled = read_csv(tmp_path, "timestamp,x", (f"{1732860000 + 302 * k},{k % 7}" for k in range(60)))  # since 1970
     assert np.median(np.diff(polled.times)) == 302 * 10**9
 

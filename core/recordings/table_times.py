@@ -127,13 +127,12 @@ def instants(path: object, table: RawTable, layout: TableLayout) -> Instants:
                 raise BagError(f"{where}: may be s or days: {days} (in a file `table: {{unit: d}}`); for s, `unit=s`")
             unit, doubt = "d", ""
         if unit == "s" and not stated and (step := _coarse(values)):
-            doubt, likely = f", {step:.10g} from row to row", "us" if step >= 1000 else "ms"
+            doubt, likely = f", {step:.10g} from row to row", "ms" if step < 1000 else "us" if step < 1e7 else "ns"
             given = f"`--table unit={likely}` (in a signals file `table: {{unit: {likely}}}`)"
             dated = _since_1970(float(np.nanmedian(values)))
             if step >= _UNLIKELY[dated] or (step >= _ODD and step % 5 and not dated):
-                none = "has no unit, which may be s, ms or us"
-                raise BagError(f"{where}{doubt}: {none}; name it time_us or time_ms, or give {given}; for s, `unit=s`")
-            doubt += f": for others name it time_us or time_ms, or give {given}"
+                raise BagError(f"{where}{doubt}: has no unit; name it time_{likely}, or give {given}; for s, `unit=s`")
+            doubt += f": for others name it time_{likely}, or give {given}"
         elif unit == "s" and not stated and _counts_rows(values):
             said.append("its numbers are those of the rows, taken for s: of another rate give `--table step=0.01`")
         if layout.unit is None and (unit != "s" or doubt):
