@@ -607,6 +607,19 @@ def test_speeds_and_times_that_are_none_are_refused_in_words(text: str, capsys: 
         assert ended.value.code == 2 and says in capsys.readouterr().err
 
 
+def test_lockstep_with_a_node_that_takes_no_topic_is_refused(world: World, tmp_path: Path) -> None:
+    """It went through the recording at once, with status 0."""
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = json.dumps({"received": {"/y": 0}, "use_sim_time": True})
+        return response
+
+    world.node.create_service(Trigger, "/listener/status", answer)
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 2 * 10**8))).save(tmp_path / "in.mcap")
+    player = world.command("play", bag, "--lockstep", "listener", "--wait", "2")
+    assert player.wait() == 2 and "listener: takes no topic that is played; is it active" in player.output
+
+
 def test_lockstep_asks_again_where_an_answer_is_lost(world: World, tmp_path: Path) -> None:
     """Of each five answers of the status service the second leaves the node only after the next one."""
     received, answers, held = [0], [0], list[Any]()

@@ -223,7 +223,7 @@ def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[
         return
     unmet = [topic for topic, there, found in zip(played, wanted(), counts, strict=True) if there > found]
     if not any(wanted()):
-        note(f"there is no subscriber to {', '.join(played)} after {limit:g} s; playing nevertheless")
+        note(f"there is no subscriber to {', '.join(played)} after {limit:g} s")
     elif unmet:
         note(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
 
@@ -284,8 +284,9 @@ def _lockstep(
 ) -> None:  # fmt: skip
     follower = _Follower(life, f"{resolved_name(life.node, node, 'node', '/envelope_monitor')}/status", wait)
     if clock is not None and not follower.status.get("use_sim_time", True):
-        remedy = "start it with -p use_sim_time:=true, or leave out --clock"
-        raise UncertainLTIError(f"{node}: does not follow /clock; {remedy}")
+        raise UncertainLTIError(f"{node}: does not follow /clock; give it -p use_sim_time:=true, or leave out --clock")
+    if life.alive and not {p.publisher.topic_name for p in played.values()} & {*follower.status.get("received", ())}:
+        raise UncertainLTIError(f"{node}: takes no topic that is played; is it active, with a model of these topics?")
     for sent, message in enumerate(messages, start=1):
         if clock is not None:
             follower.reach(clock, message.log_time_ns)
