@@ -15,7 +15,6 @@ OPENBLAS_NUM_THREADS=1 python benchmarks/large.py 100 20 20000
 
 import argparse
 import time
-from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
 import numpy as np
@@ -49,12 +48,11 @@ def measured(size, criterion, name):
     options = {"additive": "noise", "alarm": "containment"}
     fit(plant(4, 2, 2000), criterion, **options)  # imports
     run = plant(*size)
+    cpu, wall, model = seconds(lambda: fit(run, criterion, **options))
+    gap, peak = f"{model.fit_summary['optimality_gap']:.1g}", f"{peak_memory() / 2**20:.0f} MiB"  # less those of lstsq
     z, step = np.hstack([run.x, run.u])[:-1], np.diff(run.x, axis=0)
     least = min(seconds(lambda: np.linalg.lstsq(z, step, rcond=None))[0] for _ in range(3))
-    del z, step  # of lstsq alone; the peak is of the recording and its fit
-    cpu, wall, model = seconds(lambda: fit(run, criterion, **options))
-    fitted = f"{least:.3f} s", f"{cpu:.1f} s", f"{wall:.1f} s", f"{cpu / least:.0f}"
-    return [name, *fitted, f"{model.fit_summary['optimality_gap']:.1g}", f"{peak_memory() / 2**20:.0f} MiB"]
+    return [name, f"{least:.3f} s", f"{cpu:.1f} s", f"{wall:.1f} s", f"{cpu / least:.0f}", gap, peak]
 
 
 def main():
@@ -62,8 +60,8 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("size", type=int, nargs="*", default=[40, 8, 20_000], help="states, controls, transitions")
     size = parser.parse_args().size
-    with ProcessPoolExecutor(1, get_context("spawn"), max_tasks_per_child=1) as own:
-        rows = list(own.map(measured, [size, size], ["qp", "lp"], ["(10)", "(11)"]))
+    with get_context("spawn").Pool(1, maxtasksperchild=1) as own:
+        rows = own.starmap(measured, [(size, "qp", "(10)"), (size, "lp", "(11)")], chunksize=1)
     header = ["criterion", "lstsq", "CPU", "wall", "CPU over lstsq", "gap", "peak memory"]
     table("n = {}, m = {}, {} transitions".format(*size), header, rows)
 
