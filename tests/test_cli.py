@@ -187,7 +187,7 @@ REFUSED = [
     ("plot m.model.json run.mcap --output no/r.html", "make it first"),
     ("layout m.model.json", "--foxglove"),
     ("layout m.model.json --foxglove no/x.json", "make it first"),
-    ("validate m.model.json run.mcap bad.mcap", "do not give this model again"),
+    ("validate m.model.json run.mcap bad.mcap", "do not give this model again (not as fitted: bad.mcap), so"),
     ("validate m.model.json absent.mcap --false-alarms -1", "give a positive number per hour"),
     ("validate m.model.json --within 0", "positive number of seconds"),
     ("validate m.model.json --output no/m.json", "make it first"),

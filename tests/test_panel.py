@@ -510,6 +510,7 @@ def test_a_recording_of_which_more_than_a_third_is_beyond_the_others_does_not_re
     given = replace(left, parts=[replace(first, extrapolated=far), *others])
     panel = learn(given, fitted_parts(full, runs))
     assert panel.unlike == (first.name,) * named
+    assert (f" not repeat what the others show ({first.name})," in worth(full, panel)[1]) == bool(named)
     # that third was not counted: an excavator was promised one alarm in seven at most, and had seven in eight
     (told,) = [sentence for sentence in promises(full, panel) if "of further ones" in sentence]
     assert (" within what they cover, " in told) == ("further ones that stay there" in told) == bool(named)

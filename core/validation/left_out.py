@@ -20,8 +20,9 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.base.errors import FitError
+from uncertain_lti.base.files import sha256
 from uncertain_lti.base.progress import CountedStep
-from uncertain_lti.base.text import moment, plural
+from uncertain_lti.base.text import moment, plural, shortlist
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import split_weights
 from uncertain_lti.identification.structure import Structure
@@ -220,9 +221,12 @@ def validate(
         runs, operating_point=subject.operating_point, schedule=subject.schedule or {}, **own, **_horizons(subject)
     )
     if not _same(again, subject):
+        known = {source.get("sha256") for source in subject.fit_summary.get("sources", ())}
+        other = [file for run in runs for file in run.sources if known - {None} and sha256(file) not in known]
         raise FitError(
-            "these recordings do not give this model again, so what was left out of them would say nothing about it; "
-            "name the recordings it was fitted to, or fit it again"
+            f"these recordings do not give this model again{f' (not as fitted: {shortlist(other, 3)})' * bool(other)}, "
+            f"so what was left out of them would say nothing about it; name the recordings it was fitted to, or fit it "
+            f"again"
         )
     kept = subject.residuals
     if kept is not None and again.residuals is not None and again.residuals.alike(kept) is None:  # of an older file

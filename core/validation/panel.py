@@ -542,8 +542,8 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         return "some", f"worth little: it sees jumps of {ranges} only, which a plot shows as well; {missing}"
     if count:
         return "some", (
-            f"worth having within what was recorded: {unlike}, so nothing vouches for operation that none of them shows"
-            + f"; one recording says nothing of another day: {further}" * alone
+            f"worth having within what was recorded: {unlike} ({shortlist(panel.unlike, 3)}), so nothing vouches for "
+            "operation that none of them shows" + f"; one recording says nothing of another day: {further}" * alone
         )
     sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
     if alone:
