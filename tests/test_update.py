@@ -260,6 +260,9 @@ def test_the_command_updates(tmp_path, capsys):
     old.replace(signatures=[Signature("worn", [1], [np.eye(old.n)])]).save(names[0])
     assert main(["fit", bags[2], "--update", names[0], "--output", names[1], "--force"]) == 0
     assert "its signatures" in capsys.readouterr().err
+    engine_bag(tmp_path / "run2x.mcap", 200, 2)  # it has grown
+    assert main(["fit", bags[2], "--update", names[1], "--output", names[2], "--force"]) == 0
+    assert f"{bags[2]}: fitted before with other samples, and both count; " in capsys.readouterr().out
 
 
 def test_the_command_reads_earlier_recordings_again_where_they_are_needed(tmp_path, monkeypatch, capsys):

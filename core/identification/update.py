@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Array, Index
 from uncertain_lti.base.errors import FitError, UnprovenError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.identification import passes
 from uncertain_lti.identification.assembly import assemble, is_constant, median_step
 from uncertain_lti.identification.diagnosis import of_sums
@@ -166,6 +167,9 @@ def updated(
         repeats=found.repeats and (found.repeats.and_of(model.repeats) if model.repeats else found.repeats),
         alarm=model.alarm,
     )
+    if again := [t.name for t in runs if t.sources and t.name in (recording.name for recording in memory.recordings)]:
+        words = "fitted before with other samples, and both count; if a file has grown, fit all recordings"
+        found.fit_summary["messages"].append(f"{shortlist(again, 3)}: {words}")
     if not found.memory:
         words = "the room for what an update needs is used up; fit all recordings the next time"
         found.fit_summary["messages"].append(words)
