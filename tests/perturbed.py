@@ -33,8 +33,8 @@ from uncertain_lti.model.repeats import Repeats
 from uncertain_lti.model.schedule import Axis, BlockData, Schedule
 from uncertain_lti.model.terms import ARRAYS
 from uncertain_lti.monitor.alarm import Condition
-from uncertain_lti.monitor.deployed import DeployedMonitor
-from uncertain_lti.monitor.session import Rule, Session, listed_states, topic_types
+from uncertain_lti.monitor.deployed import DeployedMonitor, listed_states
+from uncertain_lti.monitor.session import Rule, Session, topic_types
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_reader import MessageReader
 from uncertain_lti.signals.signal_map import Signal

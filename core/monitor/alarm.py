@@ -17,7 +17,7 @@ from __future__ import annotations
 import operator
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -118,13 +118,14 @@ class Alarm:
         self._rows = [row_of(rule, model) for rule in self.rules]
         alike = Counter((rule.kind, rule.horizon) for rule in self.rules)
         self._spans = [rule.span if alike[rule.kind, rule.horizon] > 1 else "" for rule in self.rules]
-        names = list[str]()
+        self._places: list[tuple[int, str, float]] = []  # of each of `values`: number of its rule, state and threshold
         self._begins: list[int] = []  # of each rule, where its numbers begin in `values`
-        for rule, label in zip(self.rules, self.labels, strict=True):
-            self._begins.append(len(names))
+        for i, rule in enumerate(self.rules):
+            self._begins.append(len(self._places))
             if not isinstance(rule, AlarmRule):
-                names += [f"{label}/{s}" for s in ((EVERY_STATE,) if rule.kind in JOINT else model.state_names)]
-        self.names = tuple(names)
+                states = (EVERY_STATE,) if rule.kind in JOINT else model.state_names
+                self._places += zip([i] * len(states), states, rule.thresholds(model.n), strict=True)
+        self.names = tuple(f"{self.labels[i]}/{state}" for i, state, _ in self._places)
         self._parts = [self._part(rule, row) for rule, row in zip(self.rules, self._rows, strict=True)]
         self.needs_table = any(rule.horizon > 1 or rule.kind != "containment" for rule in self.rules)
         self.needs_residual = any(row >= residual_row(model) for row in self._rows)
@@ -166,38 +167,26 @@ class Alarm:
         """Each statistic over its threshold, 1 and -1 being the threshold, in the order of `names`."""
         return self._statistics.values()
 
-    def _known(self, values: Sequence[float]) -> Iterator[tuple[Rule, str, Nearest]]:
-        """Each statistic that has a value, with its rule and what that is called."""
-        for rule, label, begin in zip(self.rules, self.labels, self._begins, strict=True):
-            if isinstance(rule, AlarmRule):
-                continue
-            limits = rule.thresholds(self._model.n)
-            names = (EVERY_STATE,) if rule.kind in JOINT else self._model.state_names
-            for value, limit, name in zip(values[begin : begin + len(limits)], limits, names, strict=True):
-                if value == value:
-                    yield rule, label, Nearest(name, value * limit, limit)
-
     def nearest(self, values: Sequence[float]) -> dict[str, Nearest]:
         """Of each rule with a statistic the one that is nearest to its threshold."""
         found = dict[str, Nearest]()
-        for _, label, one in self._known(values):
-            if label not in found or one.share > found[label].share:
-                found[label] = one
+        for (i, state, limit), value in zip(self._places, values, strict=True):
+            one, before = Nearest(state, value * limit, limit), found.get(self.labels[i])
+            if value == value and (before is None or one.share > before.share):
+                found[self.labels[i]] = one
         return found
 
     def farthest(self, values: Array) -> tuple[int, Raised] | None:
         """Of many verdicts (K, statistics) the one after which some statistic that counts is largest, and that one."""
-        limits = [() if isinstance(rule, AlarmRule) else rule.thresholds(self._model.n) for rule in self.rules]
-        places = [(i, j) for i, some in enumerate(limits) for j in range(len(some))]
-        joint = [self.rules[i].kind in JOINT for i, _ in places]
-        counts = np.array([one or self._counted[j] for one, (_, j) in zip(joint, places, strict=True)], dtype=bool)
+        counted = dict(zip(self._model.state_names, self._counted, strict=True))
+        counts = [self.rules[i].kind in JOINT or counted[state] for i, state, _ in self._places]
         sizes = np.fmax(np.fmax.reduce(values, initial=np.nan), -np.fmin.reduce(values, initial=np.nan))
         if not (sizes := np.where(counts, sizes, np.nan))[~np.isnan(sizes)].any():
             return None
         column = int(np.nanargmax(sizes))
-        k, (i, j) = int(np.nanargmax(np.abs(values[:, column]))), places[column]
-        state = "" if joint[column] else self._model.state_names[j]
+        k, (i, state, _) = int(np.nanargmax(np.abs(values[:, column]))), self._places[column]
         rule, size = self.rules[i], float(values[k, column])
+        state = "" if rule.kind in JOINT else state
         return k, Raised(self.labels[i], rule.kind, rule.horizon, state, size, self._spans[i])
 
     def raised(self) -> tuple[tuple[int, int], ...]:

@@ -27,7 +27,6 @@ from uncertain_lti.model.repeats import Moved
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.deployed import Days, conditions_in_words
 from uncertain_lti.monitor.deployed import Rule as Rule
-from uncertain_lti.monitor.deployed import listed_states as listed_states
 from uncertain_lti.monitor.outputs import JUDGED
 from uncertain_lti.monitor.reason import TOO_LARGE, why_not
 from uncertain_lti.monitor.stream import FUTURE, SHOWN, Period, Stream
