@@ -291,7 +291,7 @@ def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any
     """The same checksums of a check of every sample sent, and how often the alarm was raised."""
     from uncertain_lti import EnvelopeMonitor, Transient, UncertainLTI
     from uncertain_lti.monitor.outputs import VerdictRecords
-    from uncertain_lti.recordings.mcap_records import MESSAGE
+    from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD
 
     model = UncertainLTI.load(model_path)
     values = np.resize(rows_of(n, left), (len(stamps), n + CONTROLS[n]))
@@ -309,7 +309,7 @@ def checked(model_path: Path, n: int, left: float, stamps: Any) -> dict[str, Any
         numbers = {name: getattr(verdicts, name)[rows] for name in names}
         t_ns = transient.t_ns[rows]
         data, _ = records.encode(t_ns, t_ns, verdicts.judged[rows], verdicts.alarm[rows], numbers)
-        at, head = 0, 9 + MESSAGE.size
+        at, head = 0, MESSAGE_HEAD.size
         while at < len(data):
             length = int.from_bytes(data[at + 1 : at + 9], "little")
             channel = int.from_bytes(data[at + 9 : at + 11], "little")

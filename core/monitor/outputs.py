@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.verdict import place
-from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD
+from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD, message_head
 
 VECTOR_TYPE, FLAG_TYPE, TEXT_TYPE = "sensor_msgs/msg/JointState", "std_msgs/msg/Bool", "std_msgs/msg/String"
 NODE = "/envelope_monitor"
@@ -142,7 +142,6 @@ _STAMP = struct.Struct("<iI")
 _CDR = b"\x00\x01\x00\x00"
 FIRST_S, LAST_S = -(2**31), 2**31 - 1
 """Seconds that a stamp holds."""
-_MESSAGE = 5  # opcode
 
 
 @cython.cclass
@@ -322,7 +321,7 @@ class VerdictRecords:
         for output, channel in zip(self._outputs, self._channels, strict=True):
             data = FALSE if output.type == FLAG_TYPE else self._vectors[output.name].template
             self._begins.append(len(row))
-            row += MESSAGE_HEAD.pack(_MESSAGE, MESSAGE_HEAD.size - 9 + len(data), channel, 0, 0, 0) + data
+            row += message_head(channel, 0, 0, len(data)) + data
             if output.when == "message":
                 assert self._unjudged == self._begins[-1], "OUTPUTS has those of every clock message first"
                 self._unjudged = len(row)

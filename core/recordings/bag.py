@@ -96,11 +96,10 @@ class Bag(Recording):
         wanted = set(topics)
         for topic in sorted(wanted):
             self._require(topic, readable)
-        each = [
-            {k: c for k, c in channels.items() if c.topic in wanted and (c.counted or not readable)}
-            for channels in self._channels
+        return [
+            (part, {k: c for k, c in channels.items() if c.topic in wanted and (c.counted or not readable)})
+            for part, channels in zip(self._contents, self._channels, strict=True)
         ]
-        return list(zip(self._contents, each, strict=True))
 
     def leave_out(self, undecoded: Mapping[str, tuple[int, str]]) -> None:
         """Warn of messages that cannot be decoded: topic -> how many, and why one of them cannot."""
@@ -192,8 +191,10 @@ class Bag(Recording):
 
     def _topic(self, topic: str, kinds: dict[tuple[str, str, str], list[tuple[int, int]]]) -> TopicInfo:
         """Choose the channels of a topic that count."""
-        found = {kind: [self._contents[part].tally.get(key) for part, key in keys] for kind, keys in kinds.items()}
-        tallies = {kind: [tally for tally in of_kind if tally is not None] for kind, of_kind in found.items()}
+        tallies = {
+            kind: [tally for part, key in keys if (tally := self._contents[part].tally.get(key))]
+            for kind, keys in kinds.items()
+        }
         counts = {kind: sum(tally.count for tally in of_kind) for kind, of_kind in tallies.items()}
         chosen = max(counts, key=lambda kind: counts[kind])
         type_name, encoding, reason = chosen

@@ -91,7 +91,6 @@ class ColumnReader:
         self.total = sum(counts.values())
         self.readers: dict[tuple[int, Definition], FieldReader] = {}
         self.undecoded: dict[str, tuple[int, str]] = {}
-        self.filled = 0
         self.filled_of = [0] * len(counts)
         self.topic = np.empty(self.total, dtype=np.int64)
         self.arrival = np.empty(self.total, dtype=np.int64)
@@ -141,14 +140,13 @@ class ColumnReader:
                 raise IndexMismatchError  # more than it states
             self.filled_of[where] = end = begin + int(kept[rows].sum())
             self.values[where][begin:end] = values[kept[rows]]
-        log_time = batch.log_time[kept]
-        to = slice(self.filled, self.filled + len(log_time))
-        self.topic[to], self.arrival[to], self.stamp[to] = topic[kept], log_time, stamp[kept]
-        self.filled += len(log_time)
+        filled = sum(self.filled_of)
+        to = slice(filled - int(kept.sum()), filled)
+        self.topic[to], self.arrival[to], self.stamp[to] = topic[kept], batch.log_time[kept], stamp[kept]
 
     def _in_order(self) -> Columns:
         """Stable sort by log time: messages are in file order so far."""
-        topic, arrival, stamp = self.topic[: self.filled], self.arrival[: self.filled], self.stamp[: self.filled]
+        topic, arrival, stamp = (column[: sum(self.filled_of)] for column in (self.topic, self.arrival, self.stamp))
         values = [v[:n] for v, n in zip(self.values, self.filled_of, strict=True)]
         alone = sum(reader.alone for reader in self.readers.values())
         if (arrival[1:] >= arrival[:-1]).all():

@@ -43,11 +43,11 @@ from uncertain_lti.recordings.mcap_records import (
     Contents,
     Tally,
     count,
-    message_record,
     messages,
     parse,
 )
 from uncertain_lti.recordings.mcap_scan import outline, scan
+from uncertain_lti.recordings.mcap_writer import message_head
 from uncertain_lti.recordings.message_types import define, distribution_text, ros2_text
 from uncertain_lti.recordings.unreadable import (
     SUFFIXES,
@@ -106,7 +106,7 @@ class Foreign(Contents):
                     number = self.numbers[connection.id]
                     if _usable(time, data):
                         message = convert[number](bytes(data)) if convert else data
-                        pieces.append(message_record(number, len(pieces), time, time, message))
+                        pieces += (message_head(number, len(pieces) // 2, time, len(message)), message)
         except Exception as error:  # a library raises whatever the bytes lead it to
             raise changed(self.path, f" ({one_line(error)})") from None
         if block is self.blocks[-1]:

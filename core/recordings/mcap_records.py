@@ -46,12 +46,10 @@ except ImportError:
 LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
 PIECE = 1 << 24  # bytes that are read or decompressed at once
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
 FOOTER_SIZE = RECORD.size + 20
 PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 LATEST = 2**63 - 1  # ns; times are kept with a sign
-_MESSAGE = int(Opcode.MESSAGE)
 
 
 class Block(NamedTuple):
@@ -130,12 +128,6 @@ class Contents:
         if len(records) < block.length:
             raise changed(self.path)
         return bytes(records[: block.length])
-
-
-def message_record(channel: int, sequence: int, log_time: int, publish_time: int, data: bytes | memoryview) -> bytes:
-    """One message as an MCAP file has it."""
-    head = MESSAGE_HEAD.pack(_MESSAGE, MESSAGE.size + len(data), channel, sequence & 0xFFFFFFFF, log_time, publish_time)
-    return b"".join((head, data))
 
 
 def messages(records: bytes) -> Iterator[tuple[int, int, int, int]]:

@@ -48,7 +48,6 @@ from uncertain_lti.recordings.mcap_records import (
     FOOTER_SIZE,
     LARGEST_CHUNK,
     LATEST,
-    MESSAGE,
     PIECE,
     PRIVATE,
     RECORD,
@@ -63,6 +62,7 @@ from uncertain_lti.recordings.mcap_records import (
     walk,
 )
 from uncertain_lti.recordings.mcap_walk import Records, walk_records
+from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD
 from uncertain_lti.recordings.unreadable import LARGEST_RATIO, most_inflated, not_mcap, os_error
 
 _DATA_END_SIZE = RECORD.size + 4
@@ -434,7 +434,7 @@ def _contents(path: Path, size: int, stated: _Summary, statistics: Statistics, s
         if block.channels:
             found.blocks.append(block._replace(channels=shared.setdefault(block.channels, block.channels)))
         for channel in block.channels:
-            room[channel] = room.get(channel, 0) + block.length // (RECORD.size + MESSAGE.size)
+            room[channel] = room.get(channel, 0) + block.length // (MESSAGE_HEAD.size)
             there = found.tally.setdefault(channel, Tally(counts.get(channel, 0), block.start, block.end))
             there.first, there.last = min(there.first, block.start), max(there.last, block.end)
     can_be = (

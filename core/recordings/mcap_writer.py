@@ -48,6 +48,11 @@ def _record(opcode: int, body: bytes) -> bytes:
     return struct.pack("<BQ", opcode, len(body)) + body
 
 
+def message_head(channel: int, sequence: int, time: int, size: int) -> bytes:
+    """What precedes the bytes of a message, of which there are `size`; it was published when it was logged, ns."""
+    return MESSAGE_HEAD.pack(_MESSAGE, MESSAGE_HEAD.size - 9 + size, channel, sequence, time, time)
+
+
 def _compressor(name: str | None) -> tuple[str, Callable[[bytes], bytes]]:
     if name == "lz4":
         import lz4.frame  # type: ignore[import-untyped]
@@ -96,7 +101,7 @@ class McapWriter:
         entries = self._index.setdefault(channel, bytearray())
         sequence = self._counts[channel] + len(entries) // INDEX_ENTRY.size
         entries += INDEX_ENTRY.pack(log_time, self._length)
-        head = MESSAGE_HEAD.pack(_MESSAGE, 22 + len(data), channel, sequence, log_time, log_time)
+        head = message_head(channel, sequence, log_time, len(data))
         self._parts += (head, data)
         self._length += len(head) + len(data)
         if self._length >= _CHUNK_BYTES:
