@@ -196,13 +196,8 @@ def _shown(flags: dict[int, Any], since: int, names: list[str], start_ns: int) -
 @contextlib.contextmanager
 def _process(command: list[str]) -> Iterator[subprocess.Popen[bytes]]:
     """A process that ends with the block, also when that fails."""
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    try:
-        yield process
-    finally:
-        process.terminate()
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL) as process:
         try:
-            process.wait(10)
-        except subprocess.TimeoutExpired:
-            process.kill()
-            process.wait()
+            yield process
+        finally:
+            process.terminate()

@@ -16,9 +16,9 @@ import json
 import math
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -71,15 +71,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-q", "--quiet", action="store_true", help="print errors only (and with --json the data)")
 
 
-@dataclass
-class _Played:
-    """A topic that can be played, its messages and how many were sent."""
-
-    count: int
-    publisher: Publisher
-    sent: int = 0
-
-
 def _unstamped(bag: Bag, topics: Sequence[str]) -> list[str]:
     """Topics without a header stamp, or with none but zeros as far as one looks."""
     stamped: dict[str, bool] = {}
@@ -108,18 +99,23 @@ def run(args: argparse.Namespace) -> Result:
         _wait(life, played, args.wait, note)
         messages = (m for m in bag.raw_messages(list(played)) if m.channel.counted)
         if args.progress.shown:
-            messages = args.progress.iterate("playing")(messages, sum(p.count for p in played.values()))
-        heard = _listeners(played)
+            messages = args.progress.iterate("playing")(messages, sum(bag.topics[topic].count for topic in played))
+        heard, sent = _listeners(played), Counter[str]()
+
+        def send(message: RawMessage) -> None:
+            played[message.topic].publish(message.data)
+            sent[message.topic] += 1
+
         began, behind, crowd = time.monotonic(), 0.0, _crowd(bag, played)
         with closing(messages):  # takes the bar away
             if args.lockstep:
-                _lockstep(life, played, clock, args.lockstep, messages, args.wait)
+                _lockstep(life, played, send, clock, args.lockstep, messages, args.wait)
             else:
                 for message, late in when_due(messages, args.rate or 1.0, crowd, lambda: life.alive):
                     behind = max(behind, late)
                     if clock is not None:
                         clock.publish(_clock(message.log_time_ns))
-                    _send(played, message)
+                    send(message)
         if behind > 1.0 and life.alive:
             apart = f"to keep messages at least {1e3 / crowd:.2g} ms apart"
             note(f"fell behind the requested rate by up to {behind:.1f} s, {apart}")
@@ -128,15 +124,14 @@ def run(args: argparse.Namespace) -> Result:
             note(f"{', '.join(joined)}: a subscriber came after playing began, and lacks what was before; play again")
         if missed := _unconfirmed(life, played):
             note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
-    sent = sum(p.sent for p in played.values())
-    ended = f"{bag.path}: played {plural(sent, 'message')} of {plural(len(played), 'topic')} in {took:.1f} s"
+    ended = f"{bag.path}: played {plural(sent.total(), 'message')} of {plural(len(played), 'topic')} in {took:.1f} s"
     if life.signal is None:
         args.say(ended)
     else:
         none = f"{bag.path}: interrupted before a message was played"
-        complain("play", f"{ended}, then interrupted" if sent else none)
+        complain("play", f"{ended}, then interrupted" if sent.total() else none)
     data = {
-        "bag": str(bag.path), "messages": sent, "topics": {topic: p.sent for topic, p in played.items()},
+        "bag": str(bag.path), "messages": sent.total(), "topics": {topic: sent[topic] for topic in played},
         "seconds": took, "unconfirmed": missed, "interrupted": life.signal is not None,
     }  # fmt: skip
     return Result(_SIGNALLED + life.signal if life.signal is not None else DONE, data)
@@ -144,14 +139,14 @@ def run(args: argparse.Namespace) -> Result:
 
 def _offer(
     node: Node, bag: Bag, topics: list[str] | None, clock: bool, note: Callable[[str], None]
-) -> dict[str, _Played]:
+) -> dict[str, Publisher]:
     """Publishers of what can be played; reports for each other topic why it cannot."""
     asked = list(bag.topics) if topics is None else list(dict.fromkeys(topics))
     for topic in asked:
         if topic not in bag.topics:
             there = f"{meant(topic, bag.topics)}; topics there: {', '.join(bag.topics) or 'none'}"
             raise BagError(f"{bag.path}: there is no topic {topic}{there}")
-    played: dict[str, _Played] = {}
+    played: dict[str, Publisher] = {}
     for topic in asked:
         info = bag.topics[topic]
         try:
@@ -165,8 +160,7 @@ def _offer(
             note(f"{topic} is not played: {error}")
             continue
         qos = QoSProfile(depth=_DEPTH, durability=_durability(bag, topic))
-        publisher = node.create_publisher(kind, topic, qos)
-        played[topic] = _Played(info.count, publisher)
+        played[topic] = node.create_publisher(kind, topic, qos)
     if not played:
         raise BagError(f"{bag.path}: no topic of it can be played here; the lines above say why")
     return played
@@ -196,7 +190,7 @@ def _durability(bag: Bag, topic: str) -> DurabilityPolicy:
     return DurabilityPolicy.VOLATILE
 
 
-def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
+def _crowd(bag: Bag, played: Iterable[str]) -> float:
     """Messages a second that are sent at most while catching up."""
     infos = [bag.topics[topic] for topic in played]
     times = [at for info in infos for at in (info.first, info.last) if at is not None]
@@ -204,14 +198,14 @@ def _crowd(bag: Bag, played: dict[str, _Played]) -> float:
     return max(_CROWD, 1.5 * sum(info.count for info in infos) / span) if span > 1.0 else _CROWD
 
 
-def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[str], None]) -> None:
+def _wait(life: Life, played: dict[str, Publisher], limit: float, note: Callable[[str], None]) -> None:
     """Wait until every subscription that the graph shows is connected, and no new one appears for a while."""
     changed = time.monotonic()
     counts: list[int] = []
 
     def settled() -> bool:
         nonlocal changed, counts
-        before, counts = counts, [p.publisher.get_subscription_count() for p in played.values()]
+        before, counts = counts, [publisher.get_subscription_count() for publisher in played.values()]
         if counts != before:
             changed = time.monotonic()
         return any(counts) and counts == wanted() and time.monotonic() - changed >= _SETTLE
@@ -228,10 +222,10 @@ def _wait(life: Life, played: dict[str, _Played], limit: float, note: Callable[[
         note(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
 
 
-def _listeners(played: dict[str, _Played]) -> dict[str, int]:
+def _listeners(played: dict[str, Publisher]) -> dict[str, int]:
     """Subscribers that are connected, of each topic whose messages none gets later."""
     volatile = DurabilityPolicy.VOLATILE
-    publishers = {topic: p.publisher for topic, p in played.items() if p.publisher.qos_profile.durability == volatile}
+    publishers = {topic: one for topic, one in played.items() if one.qos_profile.durability == volatile}
     return {topic: publisher.get_subscription_count() for topic, publisher in publishers.items()}
 
 
@@ -257,19 +251,13 @@ def when_due(
         yield message, last - due
 
 
-def _unconfirmed(life: Life, played: dict[str, _Played]) -> list[str]:
+def _unconfirmed(life: Life, played: dict[str, Publisher]) -> list[str]:
     """Topics with a subscriber that does not confirm all messages in time; none where a signal came first."""
     end, waiting = time.monotonic() + _ACKNOWLEDGED, list(played)
     while life.alive and waiting and time.monotonic() < end:
         some = Duration(seconds=_REPEAT)
-        waiting = [topic for topic in waiting if not played[topic].publisher.wait_for_all_acked(some)]
+        waiting = [topic for topic in waiting if not played[topic].wait_for_all_acked(some)]
     return waiting if life.alive else []
-
-
-def _send(played: dict[str, _Played], message: RawMessage) -> None:
-    topic = played[message.topic]
-    topic.publisher.publish(message.data)
-    topic.sent += 1
 
 
 def _clock(t_ns: int) -> Clock:
@@ -279,22 +267,22 @@ def _clock(t_ns: int) -> Clock:
 
 
 def _lockstep(
-    life: Life, played: dict[str, _Played], clock: Publisher | None, node: str, messages: Iterator[RawMessage],
-    wait: float,
+    life: Life, played: dict[str, Publisher], send: Callable[[RawMessage], None], clock: Publisher | None, node: str,
+    messages: Iterator[RawMessage], wait: float,
 ) -> None:  # fmt: skip
     follower = _Follower(life, f"{resolved_name(life.node, node, 'node', '/envelope_monitor')}/status", wait)
     if clock is not None and not follower.status.get("use_sim_time", True):
         raise UncertainLTIError(f"{node}: does not follow /clock; give it -p use_sim_time:=true, or leave out --clock")
-    if life.alive and not {p.publisher.topic_name for p in played.values()} & {*follower.status.get("received", ())}:
+    if life.alive and not {one.topic_name for one in played.values()} & {*follower.status.get("received", ())}:
         raise UncertainLTIError(f"{node}: takes no topic that is played; is it active, with a model of these topics?")
     for sent, message in enumerate(messages, start=1):
         if clock is not None:
             follower.reach(clock, message.log_time_ns)
         if not life.alive:
             break
-        topic = played[message.topic].publisher.topic_name
+        topic = played[message.topic].topic_name
         before = follower.received(topic)
-        _send(played, message)
+        send(message)
         follower.take(topic, before, sent)
 
 
