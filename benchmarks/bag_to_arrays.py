@@ -37,7 +37,7 @@ from measure import best, peak_memory, table
 from recorded import COMPRESSIONS, FRAMES, JAZZY, ROBOT, payloads, write
 
 from uncertain_lti.recordings.bag import Bag
-from uncertain_lti.recordings.mcap_records import crc32
+from uncertain_lti.recordings.mcap_scan import crc32
 from uncertain_lti.sampling.reading import read_stream, read_transients, sample
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import Signal, SignalMap

@@ -94,7 +94,7 @@ sys.modules["isal"] = None
 sys.path[:0] = {sys.path!r}
 from pathlib import Path
 from test_mcap_batches import outcome
-from uncertain_lti.recordings.mcap_records import crc32
+from uncertain_lti.recordings.mcap_scan import crc32
 assert crc32.__module__ == "zlib", crc32.__module__
 print([outcome(Path(path), False) for path in {[str(path), str(damaged)]!r}])
 """

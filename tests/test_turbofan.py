@@ -22,8 +22,9 @@ from turbofan_fleet import Ramped, first_sample, simulate_fleet
 from uncertain_lti import SignalMap, read_transients
 from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.plants import turbofan as gas
-from uncertain_lti.plants.turbofan import CONTROLS, HEALTHY, T_STANDARD, Engine, GasPathSolver, engine
+from uncertain_lti.plants.turbofan import HEALTHY, T_STANDARD, Engine, GasPathSolver, engine
 from uncertain_lti.plants.turbofan_runs import (
+    CONTROLS,
     DT,
     KINDS,
     START_NS,

@@ -30,8 +30,7 @@ from uncertain_lti.base.text import printable
 from uncertain_lti.signals.values import CHOICES, CRITERIA
 
 if TYPE_CHECKING:
-    from uncertain_lti import Transient, UncertainLTI
-    from uncertain_lti.signals.signal_map import SignalMap
+    from uncertain_lti import UncertainLTI
 
 DONE, ALARM, BAD_INPUT, UNKNOWN, NOT_READ = 0, 1, 2, 3, 141
 """Exit statuses: 1 means that the alarm was raised, and nothing else; 3 that a check says nothing of the machine.
@@ -403,17 +402,6 @@ def load_model(name: str) -> UncertainLTI:
         if near := meant(name, ["leibov2006"]):
             raise ModelError(f"{name}: there is no such model file{near}; write one with `uncertain-lti fit`")
     return UncertainLTI.load(name)
-
-
-def read_fitted(options: argparse.Namespace, bags: Iterable[str], signals: SignalMap) -> Iterator[Transient]:
-    """Read recordings as a model has its signals."""
-    from uncertain_lti.recordings.formats import group_recordings
-    from uncertain_lti.sampling.reading import read_as_fitted
-
-    for bag in group_recordings(bags, layout=signals.table):
-        transient = read_as_fitted(bag, signals, options.progress.iterate("reading"))
-        options.progress.note(*transient.notes)
-        yield transient
 
 
 def model_target(path: str, force: bool, bags: Iterable[str] = ()) -> Path:

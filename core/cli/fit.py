@@ -15,7 +15,7 @@ import argparse
 import logging
 import os
 import shlex
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
@@ -23,20 +23,22 @@ from typing import TYPE_CHECKING, Any
 from uncertain_lti.base.errors import BagError, FitError, ModelError, UnprovenError
 from uncertain_lti.base.text import plural
 from uncertain_lti.cli import interrupted
-from uncertain_lti.cli.command import (
-    OPTIONS,
-    RECORDINGS,
-    RULES,
-    Result,
-    declared,
-    helped,
-    load_model,
-    model_target,
-    read_fitted,
-)
+from uncertain_lti.cli.command import OPTIONS, RECORDINGS, RULES, Result, declared, helped, load_model, model_target
 
 if TYPE_CHECKING:
     from uncertain_lti import SignalMap, Transient, UncertainLTI
+
+
+def read_fitted(options: argparse.Namespace, bags: Iterable[str], signals: SignalMap) -> Iterator[Transient]:
+    """Read recordings as a model has its signals."""
+    from uncertain_lti.recordings.formats import group_recordings
+    from uncertain_lti.sampling.reading import read_as_fitted
+
+    for bag in group_recordings(bags, layout=signals.table):
+        transient = read_as_fitted(bag, signals, options.progress.iterate("reading"))
+        options.progress.note(*transient.notes)
+        yield transient
+
 
 # --- fit -------------------------------------------------------------------------------------------------------------
 

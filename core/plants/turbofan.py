@@ -204,9 +204,6 @@ STATES = (
     "turbine_exit_total_pressure",
     "turbine_exit_total_temperature",
 )
-STATE_UNITS = ("rpm", "rpm", "Pa", "Pa", "K")
-CONTROLS = ("main_fuel_flow", "nozzle_throat_area", "fan_inlet_guide_vane_angle", "compressor_outlet_guide_vane_angle")
-CONTROL_UNITS = ("kg/s", "m^2", "deg", "deg")
 
 
 @dataclass(frozen=True)
@@ -300,7 +297,7 @@ class GasPath:
 
 
 class Engine:
-    """The nonlinear engine, sized at its design point; STATES and CONTROLS in recorded units."""
+    """The nonlinear engine, sized at its design point; states and controls in recorded units."""
 
     def __init__(self) -> None:
         d = self.design = DesignPoint()

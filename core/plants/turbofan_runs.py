@@ -26,21 +26,13 @@ from uncertain_lti.base.errors import UncertainLTIError
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.operating_point import OperatingPoint
 from uncertain_lti.plants.leibov import CONTROL_TOPIC, DT_NS, JOINT_STATE, STATE_TOPIC
-from uncertain_lti.plants.turbofan import (
-    CONTROL_UNITS,
-    CONTROLS,
-    HEALTHY,
-    STATE_UNITS,
-    STATES,
-    T_STANDARD,
-    GasPath,
-    GasPathSolver,
-    Health,
-    engine,
-)
+from uncertain_lti.plants.turbofan import HEALTHY, STATES, T_STANDARD, GasPath, GasPathSolver, Health, engine
 from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
+STATE_UNITS = ("rpm", "rpm", "Pa", "Pa", "K")
+CONTROLS = ("main_fuel_flow", "nozzle_throat_area", "fan_inlet_guide_vane_angle", "compressor_outlet_guide_vane_angle")
+CONTROL_UNITS = ("kg/s", "m^2", "deg", "deg")
 IDLE, MAXIMUM = 12.0, 68.0
 """Power-lever angle, deg."""
 DT = DT_NS * 1e-9

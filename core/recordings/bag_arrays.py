@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import BagError
-from uncertain_lti.recordings.mcap_records import CHUNK, RECORD, Block, Contents, crc32, inflate, parse
-from uncertain_lti.recordings.mcap_scan import most_records
+from uncertain_lti.recordings.mcap_records import RECORD, Block, Contents, inflate, parse
+from uncertain_lti.recordings.mcap_scan import CHUNK, crc32, most_records
 from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.message_reader import NO_STAMP, NOT_PLAIN, Plan, header_stamp_ns
 from uncertain_lti.recordings.message_types import Definition, RecordedChannel

@@ -36,16 +36,7 @@ from mcap.records import Channel, Metadata, Schema
 
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import MAGIC, natural
-from uncertain_lti.recordings.mcap_records import (
-    LATEST,
-    RECORD,
-    Block,
-    Contents,
-    Tally,
-    count,
-    messages,
-    parse,
-)
+from uncertain_lti.recordings.mcap_records import LATEST, RECORD, Block, Contents, Tally, count, messages, parse
 from uncertain_lti.recordings.mcap_scan import outline, scan
 from uncertain_lti.recordings.mcap_writer import message_head
 from uncertain_lti.recordings.message_types import define, distribution_text, ros2_text

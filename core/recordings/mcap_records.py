@@ -37,18 +37,8 @@ from uncertain_lti.recordings.mcap_walk import walk_records
 from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD, McapWriter
 from uncertain_lti.recordings.unreadable import changed, os_error
 
-try:
-    from isal.isal_zlib import crc32 as crc32
-except ImportError:
-    from zlib import crc32 as crc32
-
-
-LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
 PIECE = 1 << 24  # bytes that are read or decompressed at once
 RECORD = struct.Struct("<BQ")  # opcode, length of what follows
-CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
-FOOTER_SIZE = RECORD.size + 20
-PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 LATEST = 2**63 - 1  # ns; times are kept with a sign
 
 
@@ -136,18 +126,6 @@ def messages(records: bytes) -> Iterator[tuple[int, int, int, int]]:
     return zip(*(column.tolist() for column in found[:4]), strict=True)
 
 
-def walk(records: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
-    """Whole records, until the first one that is cut."""
-    position, size, header, unpack = 0, len(records), RECORD.size, RECORD.unpack_from
-    while position + header <= size:
-        opcode, length = unpack(records, position)
-        begin = position + header
-        position = begin + length
-        if position > size or opcode == 0:
-            return
-        yield opcode, begin, position
-
-
 def inflate(compression: str, data: memoryview, limit: int) -> tuple[bytes | memoryview, str]:
     """Decompress with a limit, whatever the data claims of itself."""
     if not compression:
@@ -196,11 +174,6 @@ def parse(kind: type[Any], content: bytes | memoryview) -> Any:
 def count(number: int, what: str) -> str:
     """A count for a sentence: `1 message`, `61 340 messages`."""
     return f"{number:,}".replace(",", " ") + f" {what}{'' if number == 1 else 's'}"
-
-
-def seconds(time_ns: int) -> str:
-    """Nanoseconds written as seconds, exact to the millisecond."""
-    return f"{time_ns // 10**9}.{time_ns % 10**9 // 10**6:03d}"
 
 
 _LARGEST = 1 << 30  # bytes of a record outside blocks

@@ -33,6 +33,7 @@ from __future__ import annotations
 import bisect
 import struct
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
@@ -43,30 +44,23 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, ChunkIndex, DataEnd, Schema, Statistics
 
 from uncertain_lti.base.files import MAGIC
-from uncertain_lti.recordings.mcap_records import (
-    CHUNK,
-    FOOTER_SIZE,
-    LARGEST_CHUNK,
-    LATEST,
-    PIECE,
-    PRIVATE,
-    RECORD,
-    Block,
-    Contents,
-    Tally,
-    count,
-    crc32,
-    inflate,
-    parse,
-    seconds,
-    walk,
-)
+from uncertain_lti.recordings.mcap_records import LATEST, PIECE, RECORD, Block, Contents, Tally, count, inflate, parse
 from uncertain_lti.recordings.mcap_walk import Records, walk_records
 from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD
 from uncertain_lti.recordings.unreadable import LARGEST_RATIO, most_inflated, not_mcap, os_error
 
+try:
+    from isal.isal_zlib import crc32 as crc32
+except ImportError:
+    from zlib import crc32 as crc32
+
+
+CHUNK = struct.Struct("<QQQII")  # first and last log time, size, checksum, length of the compression's name
+_LARGEST_CHUNK = 1 << 28  # bytes, decompressed; recorders write chunks of 1 to 10 MB
+_PRIVATE = 0x80  # opcodes from here on mean something to their maker alone
 _DATA_END_SIZE = RECORD.size + 4
 _FOOTER = struct.Struct("<QQI")  # begin of the summary, begin of its offsets, checksum
+_FOOTER_SIZE = RECORD.size + _FOOTER.size
 _IN_SUMMARY: dict[int, Any] = {
     Opcode.SCHEMA: Schema, Opcode.CHANNEL: Channel, Opcode.STATISTICS: Statistics, Opcode.CHUNK_INDEX: ChunkIndex,
 }  # fmt: skip
@@ -196,7 +190,7 @@ class _Scanner:
                 self.sums = crc32(content, self.sums)
                 self._chunk(position, begin, content)
             else:  # attachments, metadata, indexes, private records: only their bytes and their place count
-                if opcode in (Opcode.ATTACHMENT, Opcode.METADATA) or opcode >= PRIVATE:
+                if opcode in (Opcode.ATTACHMENT, Opcode.METADATA) or opcode >= _PRIVATE:
                     self.found.others.append(position)
                 left = length
                 while left and (piece := self.stream.read(min(left, PIECE))):
@@ -251,7 +245,7 @@ class _Scanner:
                 where = str(position)
                 if len(content) >= CHUNK.size:
                     first, last, *_ = CHUNK.unpack_from(content)
-                    where += f" (log time {seconds(first)} to {seconds(last)} s)"
+                    where += f" (log time {_seconds(first)} to {_seconds(last)} s)"
                 path = self.found.path
                 self.chunk_warnings.append(f"{path}: chunk at byte {where}: {why}; its messages are left out")
 
@@ -268,12 +262,12 @@ class _Scanner:
         data = memoryview(content)[data_begin : data_begin + length]
         if not cut and (data_begin + length != len(content) or (not compression and length != stated)):
             return "its sizes contradict each other"
-        if compression and stated > LARGEST_CHUNK and not cut:
+        if compression and stated > _LARGEST_CHUNK and not cut:
             return (
-                f"it states {count(stated, 'byte')} decompressed, and at most {LARGEST_CHUNK >> 20} MiB are taken: "
+                f"it states {count(stated, 'byte')} decompressed, and at most {_LARGEST_CHUNK >> 20} MiB are taken: "
                 f"write smaller ones with `mcap compress {self.found.path.name} -o smaller.mcap`"
             )
-        stated = min(stated, max(LARGEST_CHUNK, len(data)))
+        stated = min(stated, max(_LARGEST_CHUNK, len(data)))
         if compression and stated > self.bytes_left:
             return f"with it the file is over {LARGEST_RATIO} times its size when decompressed"
         records, trouble = inflate(compression, data, stated)
@@ -352,6 +346,11 @@ def _tally(found: Records) -> dict[int, Tally]:
     return {channel: Tally(number, first, last) for channel, number, first, last in rows}
 
 
+def _seconds(time_ns: int) -> str:
+    """Nanoseconds written as seconds, exact to the millisecond."""
+    return f"{time_ns // 10**9}.{time_ns % 10**9 // 10**6:03d}"
+
+
 @dataclass
 class _Summary:
     """What the summary of a file states.
@@ -371,11 +370,11 @@ class _Summary:
 
 def _summary_of(stream: BinaryIO, size: int) -> _Summary | None:
     """The summary of a file; None where it has none."""
-    foot = size - len(MAGIC) - FOOTER_SIZE
+    foot = size - len(MAGIC) - _FOOTER_SIZE
     if foot < len(MAGIC):
         return None
     stream.seek(foot)
-    tail = stream.read(FOOTER_SIZE + len(MAGIC))
+    tail = stream.read(_FOOTER_SIZE + len(MAGIC))
     if tail[:9] != RECORD.pack(Opcode.FOOTER, _FOOTER.size) or not tail.endswith(MAGIC):
         return None
     begin, _, checksum = _FOOTER.unpack_from(tail, RECORD.size)
@@ -383,8 +382,8 @@ def _summary_of(stream: BinaryIO, size: int) -> _Summary | None:
         return None
     stream.seek(begin)
     records = stream.read(foot - begin)
-    found = _Summary(begin, checksum in (0, crc32(tail[: FOOTER_SIZE - 4], crc32(records))))
-    for opcode, start, stop in walk(records if found.whole else b""):
+    found = _Summary(begin, checksum in (0, crc32(tail[: _FOOTER_SIZE - 4], crc32(records))))
+    for opcode, start, stop in _whole_records(records if found.whole else b""):
         if (kind := _IN_SUMMARY.get(opcode)) is None:
             continue
         record = parse(kind, records[start:stop])
@@ -398,6 +397,18 @@ def _summary_of(stream: BinaryIO, size: int) -> _Summary | None:
             table = found.schemas if kind is Schema else found.channels
             found.sound &= table.setdefault(record.id, record) == record
     return found
+
+
+def _whole_records(records: bytes) -> Iterator[tuple[int, int, int]]:
+    """Opcode, begin and end of the content of each record, until the first one that is cut."""
+    end = 0
+    while end + RECORD.size <= len(records):
+        opcode, length = RECORD.unpack_from(records, end)
+        begin = end + RECORD.size
+        end = begin + length
+        if end > len(records) or opcode == 0:
+            return
+        yield opcode, begin, end
 
 
 def outline(path: Path) -> Contents | None:
@@ -471,7 +482,7 @@ def _can_be(chunk: ChunkIndex, data_end: int) -> bool:
         chunk.chunk_length == block.unchecked + block.size
         and len(MAGIC) <= begin <= begin + chunk.chunk_length + chunk.message_index_length <= data_end
         and block.compression in ("", "lz4", "zstd")
-        and block.length <= LARGEST_CHUNK
+        and block.length <= _LARGEST_CHUNK
         and (bool(block.compression) or block.length == block.size)
         and block.end <= LATEST
     )

@@ -23,19 +23,7 @@ from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Mask, runs
 from uncertain_lti.base.errors import FitError
-from uncertain_lti.base.text import (
-    Block,
-    Table,
-    beyond,
-    lasting,
-    named,
-    number,
-    plural,
-    share,
-    shortlist,
-    text_of,
-    times,
-)
+from uncertain_lti.base.text import Table, beyond, lasting, named, number, plural, share, shortlist, text_of, times
 from uncertain_lti.model.domain import STRANGE, jump_words, jumps, outside_in_words, vouched
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.repeats import far_longer, repeat_words
@@ -499,9 +487,9 @@ def check_text(data: dict[str, Any]) -> str:
     return text_of(check_blocks(data))
 
 
-def check_blocks(data: Mapping[str, Any]) -> list[Block]:
+def check_blocks(data: Mapping[str, Any]) -> list[str | Table]:
     """Summary of `check_data`, what weighs most first and what came of it last."""
-    blocks: list[Block] = []
+    blocks: list[str | Table] = []
     if data["outcome"] == "unknown":
         blocks.append(f"UNKNOWN: {data['reason']}")
     elif data["alarm"] and data["reason"]:
