@@ -317,10 +317,7 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
 
     Without metadata.yaml the parts are the folder's `<stem>_<i>.mcap`, `.db3` or `.bag` of one stem in natural order.
     """
-    try:
-        inside = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)
-    except OSError as error:
-        raise os_error(folder, error) from None
+    inside = sorted((p for p in folder.iterdir() if not p.name.startswith(".")), key=natural)
     found = [p for p in inside if p.suffix in SUFFIXES and not p.is_dir()]
     listed = listed_parts(folder)
     if listed:
@@ -347,10 +344,9 @@ def parts_of(folder: Path) -> tuple[list[Path], bool, list[str]]:
 def survey(path: Path, indexed: bool = False) -> Contents:
     """What is in a file; if `indexed`, what its index states where it has one."""
     try:
-        found = scan_foreign(path)
+        return scan_foreign(path) or (outline(path) if indexed else None) or scan(path)
     except OSError as error:
         raise os_error(path, error) from None
-    return found or (outline(path) if indexed else None) or scan(path)
 
 
 def not_one_recording(parts: Sequence[Contents]) -> str:

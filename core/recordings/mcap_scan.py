@@ -47,7 +47,7 @@ from uncertain_lti.base.files import MAGIC
 from uncertain_lti.recordings.mcap_records import LATEST, PIECE, RECORD, Block, Contents, Tally, count, inflate, parse
 from uncertain_lti.recordings.mcap_walk import Records, walk_records
 from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD
-from uncertain_lti.recordings.unreadable import LARGEST_RATIO, most_inflated, not_mcap, os_error
+from uncertain_lti.recordings.unreadable import LARGEST_RATIO, most_inflated, not_mcap
 
 try:
     from isal.isal_zlib import crc32 as crc32
@@ -81,16 +81,13 @@ def most_records(size: int) -> int:
 
 def scan(path: Path) -> Contents:
     """Walk a file once and note where its messages are."""
-    try:
-        with open(path, "rb", buffering=1 << 18) as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            head = stream.read(4096)
-            if not head.startswith(MAGIC):
-                raise not_mcap(path, head)
-            return _Scanner(path, stream, size).run()
-    except OSError as error:
-        raise os_error(path, error) from None
+    with open(path, "rb", buffering=1 << 18) as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        head = stream.read(4096)
+        if not head.startswith(MAGIC):
+            raise not_mcap(path, head)
+        return _Scanner(path, stream, size).run()
 
 
 class _Scanner:
@@ -418,17 +415,14 @@ def outline(path: Path) -> Contents | None:
     of messages of every channel. Where anything is not as stated, the file is walked instead, so a damaged file reads
     the same either way. Damage to what is not read stays unseen.
     """
-    try:
-        with open(path, "rb", buffering=0) as stream:
-            size = stream.seek(0, 2)
-            stream.seek(0)
-            stated = _summary_of(stream, size) if stream.read(len(MAGIC)) == MAGIC else None
-            if stated is None or not stated.whole or stated.begin < len(MAGIC) + _DATA_END_SIZE:
-                return None
-            stream.seek(stated.begin - _DATA_END_SIZE)
-            data_end = stream.read(_DATA_END_SIZE)
-    except OSError as error:
-        raise os_error(path, error) from None
+    with open(path, "rb", buffering=0) as stream:
+        size = stream.seek(0, 2)
+        stream.seek(0)
+        stated = _summary_of(stream, size) if stream.read(len(MAGIC)) == MAGIC else None
+        if stated is None or not stated.whole or stated.begin < len(MAGIC) + _DATA_END_SIZE:
+            return None
+        stream.seek(stated.begin - _DATA_END_SIZE)
+        data_end = stream.read(_DATA_END_SIZE)
     if data_end[:9] != RECORD.pack(Opcode.DATA_END, 4) or stated.statistics is None:
         return None
     return _contents(path, size, stated, stated.statistics, data_end[9:] != bytes(4))

@@ -45,7 +45,6 @@ from uncertain_lti.recordings.table_text import (
     without_bad,
 )
 from uncertain_lti.recordings.table_times import NO_TIME, Instants, called_time, instants, may_be, spread
-from uncertain_lti.recordings.unreadable import missing
 from uncertain_lti.signals.field_path import QUATERNION_ARRAYS, FieldPath, FieldType, TypeFields, of_quaternion
 from uncertain_lti.signals.values import TABLE, TABLE_TOPIC, TableLayout
 
@@ -416,8 +415,6 @@ def _every_run(path: Path, layout: TableLayout) -> list[Table]:
 
 
 def _read(file: Path) -> RawTable:
-    if not file.exists():
-        raise missing(file)
     raw = read_table(file)
     good, doubts = without_bad(raw.columns)
     return replace(raw, columns={**raw.columns, **good}, notes=[*raw.notes, *doubts])
