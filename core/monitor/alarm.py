@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import WORTH_THREADS, Array, on_cores
+from uncertain_lti.base.arrays import WORTH_THREADS, Array, Index, Integers, Mask, on_cores
 from uncertain_lti.base.errors import ModelError, SignalError
 from uncertain_lti.kernel.arithmetic import Statistic, Statistics, Window
 from uncertain_lti.model.alarm_rule import JOINT, KINDS, AlarmRule, Rule, labels
@@ -112,7 +112,7 @@ class Alarm:
     `alarm`: whether some rule raises the alarm.
     """
 
-    def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: NDArray[np.bool_]) -> None:
+    def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: Mask) -> None:
         self.rules, self.labels, self.alarm = tuple(rules), labels(rules), False
         self._model, self._counted = model, counted
         self._rows = [row_of(rule, model) for rule in self.rules]
@@ -220,13 +220,13 @@ class Alarm:
         self,
         spans: Sequence[tuple[int, int]],
         dt: Array,
-        violated: NDArray[np.bool_],
+        violated: Mask,
         rows: Sequence[Any],
-        judged: NDArray[np.bool_] | None = None,
-        each: NDArray[np.bool_] | None = None,
+        judged: Mask | None = None,
+        each: Mask | None = None,
         values: Array | None = None,
         blamed: NDArray[np.int16] | None = None,
-    ) -> NDArray[np.bool_]:
+    ) -> Mask:
         """Many verdicts, those of each span [start, stop) from a cleared alarm; after each what `push` gives.
 
         `dt` (K,): steps, s; `violated` (K,): as for `push`; `rows`: of the table of `push`, (K, n) each, None for one
@@ -241,7 +241,7 @@ class Alarm:
         values = np.empty((count, 0)) if values is None else values
 
         def push_all(
-            part: Window | Statistic, row: int, after: NDArray[np.bool_], own: Array, pointed: NDArray[np.int16] | None
+            part: Window | Statistic, row: int, after: Mask, own: Array, pointed: NDArray[np.int16] | None
         ) -> None:
             for start, stop in spans:
                 on, table = slice(start, stop), rows[row]
@@ -324,7 +324,7 @@ def steps_back(instant: int, last: int, before: int) -> bool:
     return instant < last and instant <= before
 
 
-def back_and_restarts(t_ns: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def back_and_restarts(t_ns: Integers) -> tuple[Mask, Mask]:
     """`steps_back` at each sample (N+1,), and whether time has stepped back to the one before and stays there."""
     back, restarts = np.zeros((2, len(t_ns)), dtype=bool)
     np.less(t_ns[1:], t_ns[:-1], out=back[1:])
@@ -342,9 +342,9 @@ class Armed(NamedTuple):
     whether the alarm starts over before the verdict on the sample; `asked` (N+1,): whether the sample is judged.
     """
 
-    counts: NDArray[np.bool_]
-    cleared: NDArray[np.bool_]
-    asked: NDArray[np.bool_]
+    counts: Mask
+    cleared: Mask
+    asked: Mask
 
 
 class Arming:
@@ -395,9 +395,7 @@ class Arming:
             self._counted = not self._grace or t_ns >= self._from
         return self._counted
 
-    def over(
-        self, t_ns: NDArray[np.int64], before: NDArray[np.intp] | Sequence[int] = (), values: ArrayLike = ()
-    ) -> Armed:
+    def over(self, t_ns: Integers, before: Index | Sequence[int] = (), values: ArrayLike = ()) -> Armed:
         """`learn` and `at` over the samples of a recording, as the live session calls them one after the other.
 
         `t_ns` (N+1,): instants of the samples, ns; a step back starts the grace time over; `before` (K,): samples

@@ -18,8 +18,9 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import Index
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.base.text import plural, shortened
 from uncertain_lti.model.alarm_rule import StatisticRule
@@ -99,9 +100,7 @@ class DeployedMonitor:
         if self.start is not None and self.stop is not None and not self.start < self.stop:
             raise ModelError(f"from {self.start:g} s to {self.stop:g} s leaves nothing to judge; give a later end")
 
-    def check(
-        self, transient: Transient, before: NDArray[np.intp] | Sequence[int] = (), values: ArrayLike = ()
-    ) -> Verdicts:
+    def check(self, transient: Transient, before: Index | Sequence[int] = (), values: ArrayLike = ()) -> Verdicts:
         """Verdicts over a recording with the alarm that the node would have published.
 
         `before` (K,): samples decided before each value of the condition's field came, of `read_field`; `values` (K,):

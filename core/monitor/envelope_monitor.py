@@ -22,7 +22,7 @@ import cython
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from uncertain_lti.base.arrays import Array, numbers, on_cores
+from uncertain_lti.base.arrays import Array, Integers, Mask, numbers, on_cores
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.kernel import arithmetic as kernel
 from uncertain_lti.kernel.arithmetic import LOWER, RESIDUAL, UPPER, UTILISATION, Judgement, all_carried
@@ -37,7 +37,7 @@ from uncertain_lti.sampling.sampler import Step, all_finite
 from uncertain_lti.sampling.transient import Transient, Transitions
 
 
-def _alarm_spans(t_ns: NDArray[np.int64], armed: Armed) -> list[tuple[int, int]]:
+def _alarm_spans(t_ns: Integers, armed: Armed) -> list[tuple[int, int]]:
     """[start, stop) of samples over which the alarm goes on from a cleared one; others raise none."""
     counts, count = armed.counts, len(t_ns)
     _, restarts = back_and_restarts(t_ns)
@@ -446,7 +446,7 @@ class EnvelopeMonitor:
         rows_of = [seen[UTILISATION], *longer, seen[RESIDUAL], *longer_residual]
         spans = _alarm_spans(transient.t_ns, armed)
 
-        def over(**into: Any) -> NDArray[np.bool_]:
+        def over(**into: Any) -> Mask:
             alarms = Alarm(self.alarms.rules, model, self._counted)  # threads may ask for the statistics at once
             return alarms.over(spans, dt, violated, rows_of, judged, **into)
 
@@ -468,7 +468,7 @@ class EnvelopeMonitor:
 
     def _look_all(
         self, transient: Transient, steps: Transitions, marks: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.bool_], dict[tuple[int, int], str]]:
+    ) -> tuple[Mask, Mask, Mask, dict[tuple[int, int], str]]:
         """`frozen`, `withheld`, `repeating`, `why_frozen` of `Verdicts`, by the watch of `judge`."""
         frozen, withheld, repeating = (np.zeros((len(transient), self.model.n), dtype=bool) for _ in range(3))
         why: dict[tuple[int, int], str] = {}
@@ -496,7 +496,7 @@ class EnvelopeMonitor:
         return numbers
 
 
-def _blank(numbers: Sequence[Any], judged: NDArray[np.bool_], withheld: NDArray[np.bool_]) -> None:
+def _blank(numbers: Sequence[Any], judged: Mask, withheld: Mask) -> None:
     """NaN in place of numbers without a verdict."""
     missing, some = np.flatnonzero(~judged), bool(withheld.any())
     for values in numbers:

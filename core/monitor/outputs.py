@@ -25,6 +25,7 @@ import cython
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Integers, Mask
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.monitor.verdict import place
 from uncertain_lti.recordings.mcap_writer import MESSAGE_HEAD, message_head
@@ -333,12 +334,7 @@ class VerdictRecords:
         return len(self._row)
 
     def encode(
-        self,
-        log_time: NDArray[np.int64],
-        t_ns: NDArray[np.int64],
-        judged: NDArray[np.bool_],
-        alarm: NDArray[np.bool_],
-        numbers: Mapping[str, NDArray[np.generic]],
+        self, log_time: Integers, t_ns: Integers, judged: Mask, alarm: Mask, numbers: Mapping[str, NDArray[np.generic]]
     ) -> tuple[bytes, dict[int, bytes]]:
         """Records of K verdicts in rising log time.
 

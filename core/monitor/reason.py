@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Mask
 from uncertain_lti.model.alarm_rule import AlarmRule, Rule, labels
 from uncertain_lti.model.domain import jumps, jumps_in_words
 from uncertain_lti.model.repeats import Moved
@@ -154,7 +155,7 @@ def over_recording(verdicts: Verdicts, model: UncertainLTI) -> Iterator[tuple[in
             said = text
 
 
-def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Status]) -> NDArray[np.bool_]:
+def _may_change(verdicts: Verdicts, model: UncertainLTI, statuses: Sequence[Status]) -> Mask:
     """Samples of which something else may be said than of the one before."""
     rows: list[NDArray[Any]] = [verdicts.alarm, verdicts.armed, verdicts.unknown_regime, verdicts.rule_alarms]
     rows += [verdicts.frozen, verdicts.withheld]

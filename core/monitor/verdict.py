@@ -22,7 +22,7 @@ import cython
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, runs
+from uncertain_lti.base.arrays import Array, Mask, runs
 from uncertain_lti.base.text import html_table, named, number, plural, times
 from uncertain_lti.kernel.arithmetic import FLAGS, LOWER, RESIDUAL, UPPER, UTILISATION
 from uncertain_lti.model.repeats import Looked
@@ -377,24 +377,24 @@ class Verdicts:
     transient: Transient
     numbers: Callable[[], list[Array]]
     utilisation: Array
-    judged: NDArray[np.bool_]
-    violated: NDArray[np.bool_]
-    outside_domain: NDArray[np.bool_]
-    alarm: NDArray[np.bool_]
-    unfitted_step: NDArray[np.bool_]
-    unlisted_mode: NDArray[np.bool_]
-    unknown_regime: NDArray[np.bool_]
-    frozen: NDArray[np.bool_]
-    withheld: NDArray[np.bool_]
-    repeating: NDArray[np.bool_]
+    judged: Mask
+    violated: Mask
+    outside_domain: Mask
+    alarm: Mask
+    unfitted_step: Mask
+    unlisted_mode: Mask
+    unknown_regime: Mask
+    frozen: Mask
+    withheld: Mask
+    repeating: Mask
     over_thresholds: Callable[[], tuple[Array, NDArray[np.int16]]]
-    rule_alarms: NDArray[np.bool_]
+    rule_alarms: Mask
     alarms: Alarm
     longer_utilisation: Array
     longer_residual: Array
     why_frozen: dict[tuple[int, int], str]
-    asked: NDArray[np.bool_]
-    armed: NDArray[np.bool_]
+    asked: Mask
+    armed: Mask
 
     def __reduce__(self) -> tuple[Any, ...]:  # with the numbers, not what computes them
         given = {one.name: getattr(self, one.name) for one in fields(self)}

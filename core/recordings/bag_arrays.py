@@ -23,7 +23,7 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Integers
+from uncertain_lti.base.arrays import Array, Integers, Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.recordings.mcap_records import RECORD, Block, Contents, inflate, parse
 from uncertain_lti.recordings.mcap_scan import CHUNK, crc32, most_records
@@ -226,7 +226,7 @@ def _as_stated(contents: Contents, block: Block, head: memoryview, records: byte
     return head == stated and (crc32(records) == checksum if checksum else not contents.summed)
 
 
-def _messages(data: bytearray, ends: Sequence[int], wanted: NDArray[np.bool_], contents: Contents) -> Batch:
+def _messages(data: bytearray, ends: Sequence[int], wanted: Mask, contents: Contents) -> Batch:
     """Messages of wanted channels among the records."""
     left = most_records(contents.size)
     found: list[tuple[NDArray[Any], ...]] = []

@@ -22,8 +22,8 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Array, Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import printable
 from uncertain_lti.recordings.message_types import Definition, RawMessage
@@ -84,10 +84,10 @@ class Columns:
     that had to be decoded one by one.
     """
 
-    topic: NDArray[np.int64]
-    arrival: NDArray[np.int64]
-    stamp: NDArray[np.int64]
-    values: list[NDArray[np.float64]]
+    topic: Integers
+    arrival: Integers
+    stamp: Integers
+    values: list[Array]
     alone: int = 0
 
 
@@ -199,7 +199,7 @@ def _facts(info: TopicInfo, seen: _Seen) -> TopicFacts:
         return signal_paths(definition.fields, definition.type_name, definition.decode(raw.data))
 
     times, offsets, zeros = seen.times, seen.offsets, seen.zeros
-    t_ns: NDArray[np.int64] = np.array(times, dtype=np.int64)
+    t_ns: Integers = np.array(times, dtype=np.int64)
     steps = t_ns[1:] - t_ns[:-1]
     step, bursts = usual_step(steps)
     fields: tuple[str, ...] = ()
@@ -221,7 +221,7 @@ def _facts(info: TopicInfo, seen: _Seen) -> TopicFacts:
     )
 
 
-def usual_step(steps: NDArray[np.int64]) -> tuple[float, bool]:
+def usual_step(steps: Integers) -> tuple[float, bool]:
     """Step that a topic's rate is that of: the median one, or the mean where most messages come in bursts."""
     if not len(steps):
         return 0.0, False

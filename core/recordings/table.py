@@ -25,8 +25,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Index, Integers, Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
@@ -217,7 +217,7 @@ class Table(Recording):
         columns = {name: self.columns_by_field[name] for name in self._fields[topic]}
         return columns, {base: names for base, names in self._quaternions.items() if columns.keys() >= set(names)}
 
-    def _in_order(self, topics: Sequence[str]) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    def _in_order(self, topics: Sequence[str]) -> tuple[Integers, Index]:
         """Position of the topic of each message among some, and its row, as they come in the file."""
         every = [self._rows[topic] for topic in topics]
         of = np.repeat(np.arange(len(every), dtype=np.int64), [len(rows) for rows in every])
@@ -275,9 +275,7 @@ def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table
     return tables
 
 
-def _rows_in_order(
-    rows: NDArray[np.intp], times: NDArray[np.int64], time: str, written: bool
-) -> tuple[NDArray[np.intp], list[str]]:
+def _rows_in_order(rows: Index, times: Integers, time: str, written: bool) -> tuple[Index, list[str]]:
     """Rows that have a time, the oldest first, and what there is to say of their order; `written`: as dates or text."""
     notes = []
     known = times[rows] != NO_TIME
@@ -312,9 +310,7 @@ def _no_numbers(columns: Mapping[str, Column]) -> list[str]:
     return notes
 
 
-def _times_of_rows(
-    times: NDArray[np.int64], time: str, columns: Mapping[str, Column]
-) -> tuple[NDArray[np.bool_], NDArray[np.int64], list[str]]:
+def _times_of_rows(times: Integers, time: str, columns: Mapping[str, Column]) -> tuple[Mask, Integers, list[str]]:
     """Rows that count, their times, evenly where rows of the same time flow, and what there is to say of such rows."""
     again = np.append(False, np.diff(times) == 0)
     if not (equal := np.count_nonzero(again)) > 0.1 * len(times):
@@ -337,7 +333,7 @@ def _times_of_rows(
     return np.ones_like(again), even, [f"{same}write times with more decimals, or take another, `--table time=COLUMN`"]
 
 
-def _for_each_time(times: NDArray[np.int64], columns: Mapping[str, Column]) -> tuple[int, str]:
+def _for_each_time(times: Integers, columns: Mapping[str, Column]) -> tuple[int, str]:
     """Rows that a time usually has, and the column of few values that tells them apart, if there is one."""
     _, rows = np.unique(times, return_counts=True)
     number = int(np.median(rows))
@@ -381,7 +377,7 @@ def _file_and_run(path: Path) -> tuple[Path, str | None]:
     return path.with_name(match["file"]), match["run"]
 
 
-_Run = tuple[Path, RawTable, Instants, NDArray[np.intp] | None]
+_Run = tuple[Path, RawTable, Instants, Index | None]
 """A file, what it holds, its `instants`, and the rows of one run in it; None for all."""
 
 
@@ -420,7 +416,7 @@ def _read(file: Path) -> RawTable:
     return replace(raw, columns={**raw.columns, **good}, notes=[*raw.notes, *doubts])
 
 
-def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[np.intp]]:
+def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, Index]:
     """Rows of each run, by its value in the column, in order of first rows."""
     assert layout.runs is not None
     of = find_column(file, layout.runs, list(raw.columns), "the runs")
@@ -436,7 +432,7 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
     if len(of_each) > min(_MOST_RUNS, max(10, len(column) // 2)):
         values = f"{len(of_each)} values in {len(column)} rows"
         raise BagError(f"{file}: column '{layout.runs}' has {values}, so it names no runs; choose another")
-    found: dict[str, NDArray[np.intp]] = {}
+    found: dict[str, Index] = {}
     for key, own in of_each.items():
         name = key.translate(_IN_A_NAME)
         if name in _NO_RUN:
@@ -448,7 +444,7 @@ def _runs(file: Path, raw: RawTable, layout: TableLayout) -> dict[str, NDArray[n
     return found
 
 
-def _rows_of_each(keys: Column) -> dict[str, NDArray[np.intp]]:
+def _rows_of_each(keys: Column) -> dict[str, Index]:
     """Rows of each text (N,), in order of their first rows."""
     names, first, of = np.unique(keys, return_index=True, return_inverse=True)
     rows = np.split(np.argsort(of, kind="stable"), np.cumsum(np.bincount(of, minlength=len(names)))[:-1])
@@ -460,7 +456,7 @@ def names_signals(column: str) -> bool:
     return re.fullmatch(rf"(?i)(.*[\W_])?{_OF_SIGNALS}", column) is not None
 
 
-def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[str, str, dict[str, NDArray[np.intp]]]:
+def _naming(columns: Mapping[str, Column], times: Integers) -> tuple[str, str, dict[str, Index]]:
     """The column that names the signal of each row's one number, as historians write it, that, and each name's rows.
 
     Few names change from row to row, or the time begins anew with each. Nothing for other tables.
@@ -490,7 +486,7 @@ def _naming(columns: Mapping[str, Column], times: NDArray[np.int64]) -> tuple[st
     return "", "", {}
 
 
-def _of_units(names: Column, others: Sequence[Column], times: NDArray[np.int64]) -> Column:
+def _of_units(names: Column, others: Sequence[Column], times: Integers) -> Column:
     """Names with those of units, in other columns, before them, where numbers of one name and time are of several."""
 
     def known(cells: Column) -> int:
@@ -509,8 +505,8 @@ def _of_units(names: Column, others: Sequence[Column], times: NDArray[np.int64])
 
 
 def _side_by_side(
-    of_each: Mapping[str, NDArray[np.intp]], values: Column, times: NDArray[np.int64]
-) -> tuple[dict[str, Column], NDArray[np.int64]] | None:
+    of_each: Mapping[str, Index], values: Column, times: Integers
+) -> tuple[dict[str, Column], Integers] | None:
     """A column for each name, and the times; nothing where the names do not come together, or one after the other."""
     rows = {name: timed for name, of in of_each.items() if len(timed := of[times[of] != NO_TIME])}
     stamps = np.unique(times[times != NO_TIME])

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Index, Mask
 from uncertain_lti.base.errors import BagError, absent
 from uncertain_lti.base.text import once, shortlist
 from uncertain_lti.recordings.table_text import ROWS_EACH, YEARS, Column, RawTable, read_csv, unique
@@ -265,7 +266,7 @@ _READERS: Mapping[str, Callable[[Path], Any]] = {
 }
 
 
-def by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
+def by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[list[str], Index]]:
     """Fields and rows of each topic: of several messages by turns, each of two numbers or more, or of several rates."""
     one = {TABLE_TOPIC: (list(columns), np.arange(number))}
     numbers = {name: column for name, column in columns.items() if column.dtype.kind not in "OM"}
@@ -304,9 +305,9 @@ def by_message(columns: Mapping[str, Column], number: int) -> dict[str, tuple[li
     return {f"{TABLE_TOPIC}/{topic}": of for topic, of in zip(topics, zip(fields, rows_of, strict=True), strict=True)}
 
 
-def _slower(names: Mapping[bytes, list[str]], number: int) -> dict[str, tuple[list[str], NDArray[np.intp]]]:
+def _slower(names: Mapping[bytes, list[str]], number: int) -> dict[str, tuple[list[str], Index]]:
     """Fields and rows of a topic for each slower rate, if nearly every row has a number of the fastest."""
-    groups: list[tuple[NDArray[np.bool_], list[str]]] = []
+    groups: list[tuple[Mask, list[str]]] = []
     for kind in sorted(names, key=lambda kind: -kind.count(1)):
         there = np.frombuffer(kind, np.bool_)
         of = (g for first, g in groups if np.count_nonzero(first & there) >= _SAME * np.count_nonzero(first))
@@ -316,7 +317,7 @@ def _slower(names: Mapping[bytes, list[str]], number: int) -> dict[str, tuple[li
             groups.append((there, [*names[kind]]))
     if not groups or np.count_nonzero(groups[0][0]) < _SAME * number:
         return {}
-    slower: dict[str, tuple[list[str], NDArray[np.intp]]] = {}
+    slower: dict[str, tuple[list[str], Index]] = {}
     order = [*chain(*names.values())]
     for there, group in groups[1:]:
         rows = np.flatnonzero(there)

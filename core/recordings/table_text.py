@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Mask
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import meant, once, plural, shortlist
 
@@ -392,7 +393,7 @@ _QUALITIES = (0, 4, 8, 12, 16, 20, 24, 28, 64, 68, 80, 84, 88, 192, 216)  # bad,
 _GOOD = 192
 
 
-def rated(column: Column) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def rated(column: Column) -> tuple[Mask, Mask]:
     """Cells of a column of qualities, as OPC has them, that are good, and those that are not; none where it is none."""
     if column.dtype.kind == "O":
         words = np.array([str(cell).strip().casefold()[:4] for cell in column])

@@ -19,8 +19,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from uncertain_lti.base.arrays import Integers
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.text import shortlist
 from uncertain_lti.recordings.mcap_records import LATEST
@@ -87,7 +87,7 @@ class Instants(NamedTuple):
     """Column of the time, instants (rows,), ns or `NO_TIME`, and what was taken for granted, in words and as a unit."""
 
     column: str
-    times: NDArray[np.int64]
+    times: Integers
     words: str = ""
     unit: str = ""
 
@@ -202,7 +202,7 @@ def _likely(path: object, table: RawTable) -> tuple[str, str]:
     )
 
 
-def spread(times: NDArray[np.int64]) -> NDArray[np.int64]:
+def spread(times: Integers) -> Integers:
     """Times that several rows share, such as whole seconds, as if the rows of each came evenly until the next.
 
     Beside a pause, and at both ends, they come as fast as usual.
@@ -458,7 +458,7 @@ def _coarse(values: Column) -> float:
     return step if step > 1 and (steps % (60 if step <= 3600 else 3600) != 0).mean() > 0.5 else 0.0
 
 
-def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> NDArray[np.int64]:
+def _of_numbers(where: str, table: RawTable, name: str, factor: int) -> Integers:
     values = table.columns[name]
     if values.dtype.kind in "iu":
         if len(values) and max(abs(int(values.max())), abs(int(values.min()))) * factor > LATEST:
@@ -491,7 +491,7 @@ def _too_late(where: str) -> BagError:
     return BagError(f"{where}: is past the year 2262 in ns; say its unit in the signals file, `table: {{unit: ms}}`")
 
 
-def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], str]:
+def _of_text(where: str, cells: Sequence[object]) -> tuple[Integers, str]:
     """ISO 8601 with or without a zone (UTC where there is none), or times of day; what was taken for granted.
 
     A cell that is neither has no time, if few are.
@@ -531,7 +531,7 @@ def _of_text(where: str, cells: Sequence[object]) -> tuple[NDArray[np.int64], st
     return times, order
 
 
-def _parsed(where: str, texts: Sequence[str]) -> NDArray[np.int64]:
+def _parsed(where: str, texts: Sequence[str]) -> Integers:
     try:
         return np.array(texts, dtype="datetime64[ns]").astype(np.int64)
     except ValueError:

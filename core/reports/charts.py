@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Mask, runs
+from uncertain_lti.base.arrays import Array, Index, Mask, runs
 from uncertain_lti.base.text import plural
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
@@ -60,7 +60,7 @@ class Columns:
     samples; `alarm, judged` (P,): whether any of its samples has one; `loops`: passes after the first.
     """
 
-    starts: NDArray[np.intp]
+    starts: Index
     stop: int
     t: Array
     edges: Array
@@ -160,7 +160,7 @@ class Columns:
         return found
 
 
-def _some(which: Mask, starts: NDArray[np.intp], stop: int) -> Mask:
+def _some(which: Mask, starts: Index, stop: int) -> Mask:
     return np.logical_or.reduceat(which[:stop], starts) if len(starts) else which[:0]
 
 

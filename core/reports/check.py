@@ -19,9 +19,8 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array, Mask, runs
+from uncertain_lti.base.arrays import Array, Index, Mask, runs
 from uncertain_lti.base.errors import FitError
 from uncertain_lti.base.text import Table, beyond, lasting, named, number, plural, share, shortlist, text_of, times
 from uncertain_lti.model.domain import STRANGE, jump_words, jumps, outside_in_words, vouched
@@ -185,7 +184,7 @@ def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]
     return states
 
 
-def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, Any]:
+def _worst(verdicts: Verdicts, state: int, rows: Index) -> dict[str, Any]:
     """Utilisation farthest from 0 among these samples (None where the bounds have no width), and when."""
     if not len(rows):
         return {"utilisation": None, "t": None}
@@ -194,7 +193,7 @@ def _worst(verdicts: Verdicts, state: int, rows: NDArray[np.intp]) -> dict[str, 
     return {"utilisation": value if math.isfinite(value) else None, "t": _instant(verdicts.transient, k)["t"]}
 
 
-def _jump(verdicts: Verdicts, name: str, bad: NDArray[np.intp], change: Array, largest: float) -> dict[str, Any] | None:
+def _jump(verdicts: Verdicts, name: str, bad: Index, change: Array, largest: float) -> dict[str, Any] | None:
     """The largest jump with which a state left its bounds, if it is larger than any of the fit."""
     size = np.nan_to_num(np.abs(change[bad]))
     if not size.any():
@@ -274,7 +273,7 @@ def _explained(model: UncertainLTI, verdicts: Verdicts) -> Iterator[dict[str, An
             }
 
 
-def _episodes(verdicts: Verdicts) -> Iterator[NDArray[np.intp]]:
+def _episodes(verdicts: Verdicts) -> Iterator[Index]:
     """The violated samples of each episode: fewer than `APART` verdicts lie between them, and no step back in time."""
     rows = np.flatnonzero(verdicts.violated)
     if len(rows):
@@ -283,7 +282,7 @@ def _episodes(verdicts: Verdicts) -> Iterator[NDArray[np.intp]]:
         yield from np.split(rows, np.flatnonzero((np.diff(order) > APART) | (np.diff(back) > 0)) + 1)
 
 
-def _episode(model: UncertainLTI, verdicts: Verdicts, rows: NDArray[np.intp]) -> dict[str, Any]:
+def _episode(model: UncertainLTI, verdicts: Verdicts, rows: Index) -> dict[str, Any]:
     first, last = int(rows[0]), int(rows[-1])
     states = {}
     for i, name in enumerate(model.state_names):
@@ -427,7 +426,7 @@ def check_regimes(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any
     return found
 
 
-def sample_blocks(model: UncertainLTI, verdicts: Verdicts) -> NDArray[np.intp]:
+def sample_blocks(model: UncertainLTI, verdicts: Verdicts) -> Index:
     """The block of the largest weight for the verdict on each sample (N+1,); -1 where there is no verdict."""
     return np.where(verdicts.judged, model.main_block(_before(model, verdicts)), -1)
 
