@@ -105,11 +105,10 @@ def residual_row(model: UncertainLTI) -> int:
 class Alarm:
     """All rules of one alarm.
 
-    `rules`: at least one; `model`: what they judge by; `counted` (n,): states that count; `rules`: as given; `labels`:
-    what each is called; `names`: of the statistics, `energy/fan_speed` for
-    example; empty if every rule is containment; `needs_table`: whether some rule looks at more than the one-step
-    violation; `needs_residual`: whether some rule looks at residuals, which follow the utilisation in the table;
-    `alarm`: whether some rule raises the alarm.
+    `rules`: at least one; `model`: what they judge by; `counted` (n,): states that count; `labels`: what each rule is
+    called; `names`: of the statistics, `energy/fan_speed` for example; empty if every rule is containment;
+    `needs_table`: whether some rule looks at more than the one-step violation; `needs_residual`: whether some rule
+    looks at residuals, which follow the utilisation in the table; `alarm`: whether some rule raises the alarm.
     """
 
     def __init__(self, rules: Sequence[Rule], model: UncertainLTI, counted: Mask) -> None:
@@ -352,8 +351,8 @@ class Arming:
 
     `condition`: none for alarms that always count; `grace_ns`: no alarm this long, ns, in the samples' own time, after
     the first sample, after time jumped back, and after the condition began to hold; `value`: the last value of the
-    condition, if it is known already; `value`: the last value of the condition; None while none was received; `on`:
-    whether the condition holds; None while nothing, or nothing that is a number, is known. Without a condition True.
+    condition; None while none was received; `on`: whether the condition holds; None while nothing, or nothing that is a
+    number, is known. Without a condition True.
     """
 
     def __init__(self, condition: Condition | None, grace_ns: int, value: float | None = None) -> None:

@@ -35,6 +35,7 @@ _MOST_NAMES = 50  # of topics in an error
 _MOST_HELD = 1 << 30  # bytes
 _SIZE_OF_AN_ENTRY = 400  # bytes; in memory, with what Python puts around it
 _NEVER = 2**64
+_Described = list[tuple[Contents, dict[int, RecordedChannel]]]
 _LEAST_LINES = 50  # that a definition counts for, however short it is
 
 
@@ -89,9 +90,7 @@ class Bag(Recording):
             self._undecoded = {}
             self._take([survey(part.path) if part.indexed else part for part in self._contents])
 
-    def described(
-        self, topics: Iterable[str], readable: bool = True
-    ) -> list[tuple[Contents, dict[int, RecordedChannel]]]:
+    def described(self, topics: Iterable[str], readable: bool = True) -> _Described:
         """Each file, and its channels of some topics: those that count and can be decoded, or all."""
         wanted = set(topics)
         for topic in sorted(wanted):
@@ -225,7 +224,7 @@ class Bag(Recording):
         if readable and not info.readable:
             raise BagError(f"{self.path}: topic {topic} cannot be decoded: {info.reason}; choose another topic")
 
-    def _decoded(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[tuple[str, int, Any]]:
+    def _decoded(self, parts: _Described) -> Iterator[tuple[str, int, Any]]:
         undecoded: dict[str, tuple[int, str]] = {}
         for raw in self._sorted(parts):
             try:
@@ -237,7 +236,7 @@ class Bag(Recording):
                 continue
             yield raw.topic, raw.log_time_ns, message
 
-    def _sorted(self, parts: list[tuple[Contents, dict[int, RecordedChannel]]]) -> Iterator[RawMessage]:
+    def _sorted(self, parts: _Described) -> Iterator[RawMessage]:
         """Messages of these channels of each file in order of log time, ties in file order.
 
         Blocks are read in order of their smallest log time; what is earlier than all that are left is final.

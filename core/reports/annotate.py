@@ -20,7 +20,7 @@ from __future__ import annotations
 import json
 import os
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -207,6 +207,5 @@ def _schema(writer: McapWriter, contents: Sequence[Contents], type_name: str) ->
     return writer.schema(type_name, "ros2msg", jazzy_text(type_name).encode())
 
 
-def _fields(types: object) -> str:
-    assert isinstance(types, dict)
+def _fields(types: Mapping[str, Any]) -> str:
     return repr(sorted((name, fields) for name, (_, fields) in types.items()))

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from uncertain_lti.base.arrays import Array, Index, Mask, runs
-from uncertain_lti.base.text import plural
+from uncertain_lti.base.text import named, plural
 from uncertain_lti.model.alarm_rule import AlarmRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Raised
@@ -193,7 +193,7 @@ class Panel:
     @property
     def heading(self) -> str:
         """Name and unit."""
-        return f"{self.title} [{self.unit}]" if self.unit else self.title
+        return named(self.title, self.unit)
 
 
 @dataclass(frozen=True)
