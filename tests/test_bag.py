@@ -783,6 +783,9 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
     late = "float64 y\nstd_msgs/Header header\n"
     topics = [Topic("/usable", kind), Topic("/zero", kind), Topic("/mixed", kind), Topic("/none"), Topic("/once")]
     topics += [Topic("/big", kind), Topic("/late", "x/msg/Late", schema=late), Topic("/never", kind)]
+    own = {"Head": "x/Moment stamp", "Moment": "int32 sec\nuint32 nanosec"}  # types of their own, read alike
+    parts = ("x/Head header\nfloat64 y", *(f"MSG: x/{name}\n{fields}" for name, fields in own.items()))
+    topics.append(Topic("/own", "x/msg/Own", schema=f"\n{'=' * 80}\n".join(parts) + "\n"))
     timestamped = "uint64 timestamp\nfloat32 x\n"
     topics += [Topic(name, "px4_msgs/msg/Odd", schema=timestamped) for name in ("/px4", "/booting")]
     messages = []
@@ -792,7 +795,7 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
         messages += [Message("/mixed", t, stamped(t if i % 2 else 0)), Message("/none", t, float64(i))]
         messages += [Message("/big", t, stamped(t, little_endian=False))]
         behind = b"\0\1\0\0" + struct.pack("<diII", 1.0, 5, 7, 1) + b"\0"
-        messages += [Message("/late", t, behind)]
+        messages += [Message("/late", t, behind), Message("/own", t, b"\0\1\0\0" + struct.pack("<iId", 5, 7, 1.0))]
         for topic, offset in (("/px4", 3 * SECOND), ("/booting", t)):  # us; 0 before the clock is known
             messages.append(Message(topic, t, b"\0\1\0\0" + struct.pack("<Qf", (t - offset) // 1000, 1.0)))
     messages.append(Message("/once", 0, float64(0)))
@@ -804,7 +807,7 @@ def test_describe_counts_rates_gaps_and_stamps(tmp_path: Path) -> None:
     stamps = {topic: item.stamps for topic, item in found.items()}
     assert stamps == {
         "/usable": "usable", "/zero": "zero", "/mixed": "mixed", "/none": "none", "/once": "none", "/big": "usable",
-        "/late": "usable", "/never": "none", "/px4": "usable", "/booting": "zero",
+        "/late": "usable", "/own": "usable", "/never": "none", "/px4": "usable", "/booting": "zero",
     }  # fmt: skip
     assert found["/usable"].stamp_offset == pytest.approx(7) and found["/big"].stamp_offset == 0
     assert found["/px4"].stamp_offset == pytest.approx(3, abs=1e-6) and "timestamp" in found["/px4"].fields

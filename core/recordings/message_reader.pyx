@@ -145,7 +145,7 @@ cdef class Plan:
     cdef list codes, parts, every, functions
     cdef readonly bint able
     cdef bint named, met
-    cdef Py_ssize_t seconds, nanoseconds  # slots of a stamp, and ns of what is in the first
+    cdef readonly Py_ssize_t seconds, nanoseconds  # slots of a stamp, and ns of what is in the first
     cdef int64_t unit
     cdef const uint8_t* data
     cdef Py_ssize_t at, size, reserved

@@ -32,7 +32,7 @@ from rosbags.typesys.base import normalize_fieldname
 from rosbags.typesys.store import Typestore
 
 from uncertain_lti.base.errors import BagError, SignalError
-from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan, is_timestamped
+from uncertain_lti.recordings.message_reader import CODES, ENCAPSULATIONS, Plan
 from uncertain_lti.recordings.unreadable import one_line
 from uncertain_lti.signals.field_path import FieldType, full_name
 
@@ -112,17 +112,10 @@ class Definition:
             for _, (node, what) in fields
         )
 
-    @functools.cached_property
+    @property
     def has_header(self) -> bool:
-        """Whether the type has a field `header` with a time stamp, or a stamp of its own (`is_timestamped`)."""
-        fields = self.fields(self.type_name)
-        if is_timestamped(self.type_name, fields):
-            return True
-        header = fields.get("header")
-        if header is None or header.kind != "message" or header.array is not None:
-            return False
-        stamp = self.fields(header.type_name).get("stamp")
-        return stamp is not None and stamp.type_name == "builtin_interfaces/msg/Time"
+        """Whether messages have a stamp that is read, of a header or their own."""
+        return self._plan.seconds >= 0
 
     def stamp_ns(self, data: bytes) -> int | None:
         """`header_stamp_ns` of an encoded message; None of one that cannot be decoded."""
