@@ -19,7 +19,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from io import BytesIO
+from io import BufferedReader, BytesIO, FileIO
 from pathlib import Path
 
 import lz4.frame
@@ -61,6 +61,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2Writer
 
 from uncertain_lti.base.errors import BagError
+from uncertain_lti.recordings import mcap_scan
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.formats import group_recordings
 from uncertain_lti.recordings.message_reader import header_stamp_ns
@@ -182,6 +183,26 @@ def test_a_cut_file_reads_as_a_prefix(messages: list[Message], layout: Layout, w
     assert any("no footer" in warning and number in warning for warning in bag.warnings)
 
 
+def test_a_file_that_grows_while_it_is_read_is_read_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As of a recorder at work, whose file ends with a chunk each time."""
+    file = write(TWO, ramp("/a", range(100)), Layout(chunk_size=500, indexes=False))
+    whole, cut = file.save(tmp_path / "whole.mcap"), tmp_path / "cut.mcap"
+
+    class Grows(BufferedReader):
+        def seek(self, offset: int, whence: int = 0) -> int:
+            return super().seek(offset - (len(file.data) - size if whence else 0), whence)
+
+    def opened(path: Path, *_: object, **__: object) -> BufferedReader:
+        return (Grows if path == whole else BufferedReader)(FileIO(path))
+
+    monkeypatch.setattr(mcap_scan, "open", opened, raising=False)
+    ends = [place.end for place in places(file.data) if place.opcode == Opcode.CHUNK]
+    for size in [end + more for end in ends for more in (0, 1, 8, 9, 10)]:
+        expected = mcap_scan.scan(file.save(cut, size))
+        assert (found := mcap_scan.scan(whole)).count == expected.count
+        assert found.warnings == [warning.replace("cut.mcap", "whole.mcap") for warning in expected.warnings]
+
+
 @pytest.mark.parametrize("compression", COMPRESSIONS)
 def test_the_chunk_that_a_cut_goes_through_is_read_as_far_as_it_goes(compression: str, tmp_path: Path) -> None:
     file = chunked(compression, 15_000, 10**9)
@@ -204,7 +225,7 @@ def test_a_file_cut_after_its_data_is_complete(tmp_path: Path) -> None:
 
 
 def test_zeros_after_a_power_cut_end_the_reading(tmp_path: Path) -> None:
-    file = write(TWO, ramp("/a", range(1000)), Layout(chunk_size=500))
+    file = write(TWO, ramp("/a", range(1000)), Layout(chunk_size=500, indexes=False))
     cut = len(file.data) // 2
     path = tmp_path / "x.mcap"
     path.write_bytes(file.data[:cut] + bytes(1_000_000))

@@ -148,7 +148,7 @@ class _Scanner:
         self.sums = crc32(MAGIC)
         self.stream.seek(position)
         while True:
-            header = self.stream.read(RECORD.size)
+            header = self.stream.read(min(RECORD.size, size - position))  # a recorder may write more meanwhile
             if len(header) < RECORD.size:
                 return False
             opcode, length = RECORD.unpack(header)
