@@ -551,6 +551,17 @@ def test_a_model_is_swapped_as_a_whole(bench: StartBench, tmp_path: Path) -> Non
     assert list(on.flags.count(10)[9].name) == ["a"]
 
 
+def test_what_takes_effect_with_the_next_model_may_be_set_with_it(bench: StartBench) -> None:
+    on = bench()
+    on.plant.padding = [0.0] * 200
+    on.plant.send(1)
+    on.flags.count(1)
+    assert not on.world.set(model="absent", largest_message=0.1)[0]
+    assert on.world.set(model=str(on.path), largest_message=0.001) == (True, "")
+    on.plant.send(1)
+    until(lambda: on.world.status()["unreadable"] == {STATE: 1}, "a message over largest_message")
+
+
 def test_the_alarm_rule_can_be_set_and_is_checked(bench: StartBench) -> None:
     on = bench()
     violation = on.world.listen(Bool, "/envelope_monitor/violation").connected()

@@ -141,20 +141,19 @@ class EnvelopeMonitorNode(LifecycleNode):
         least: float = self.settings["state_timeout"]
         return max(least, self.session.between_verdicts) if self.session else least
 
-    def _make_session(self, path: str, rule: Rule) -> Session:
-        return make_session(path, rule, self.settings, self.session.arming if self.session else None)
+    def _make_session(self, settings: Settings) -> Session:
+        return make_session(settings, self.session.arming if self.session else None)
 
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Prepare what the new values require, or refuse them; `_on_have_set` puts it in place."""
         given = {p.name: p.value for p in parameters}
-        changes = {name: value for name, value in given.items() if name in ("model", *RULE)}
-        self._candidate = None
+        self._candidate, settings = None, Settings(self, given)
         try:
             self.settings.check_snapshots(given.get("snapshot.on_alarm", False))
-            if "model" in changes:
-                self._candidate = self._make_session(changes["model"], self.settings.rule(changes))
-            elif changes:
-                rule = self.settings.rule(changes)
+            if "model" in given:
+                self._candidate = self._make_session(settings)
+            elif given.keys() & {*RULE}:
+                rule = settings.rule()
                 if self.session is not None:
                     self.session.check(rule)
                 self._candidate = rule
@@ -252,7 +251,7 @@ class EnvelopeMonitorNode(LifecycleNode):
             self.settings.requested_qos()
             self.settings.topic_prefix()
             fixed = False
-            self.intake.session = session = self._make_session(path, self.settings.rule({}))
+            self.intake.session = session = self._make_session(self.settings)
             fixed = True
             self.snapshots.open()
         except Exception as error:
@@ -527,7 +526,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is None:
             raise ModelError("the node is not configured; configure it, which reads the model file")
         path = self.settings["model"]
-        self._swap(self._make_session(path, self.settings.rule({})))
+        self._swap(self._make_session(self.settings))
         return True, f"{Path(path).name}: {self.session.model}"
 
     def _on_status(self) -> tuple[bool, str]:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
@@ -152,13 +152,14 @@ MIB = 1 << 20
 class Settings(dict[str, Any]):
     """What the parameters of a node are set to, by name: a call of rclpy takes 10 µs.
 
-    `node`: its parameters are declared.
+    `node`: its parameters are declared; `changes`: other values by name, instead of those that it has.
     """
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, changes: Mapping[str, Any] = {}) -> None:
         super().__init__()
         self._node = node
         self.read()
+        self.update(changes)
 
     def read(self) -> None:
         """Read the parameters: some were set."""
@@ -169,9 +170,9 @@ class Settings(dict[str, Any]):
         mebibytes: float = self[name]
         return round(mebibytes * MIB)
 
-    def rule(self, changes: dict[str, Any]) -> Rule:
+    def rule(self) -> Rule:
         """The alarm rule that the parameters define."""
-        rule = Rule(**{name: changes.get(name, self[name]) for name in RULE})
+        rule = Rule(**{name: self[name] for name in RULE})
         if condition := Condition.parse(rule.enable):
             self.there(condition.topic, "parameter enable: ")
         return rule
@@ -225,9 +226,10 @@ def _load(file: Path) -> UncertainLTI:
         raise ModelError(f"{file}: cannot be read within {_PATIENCE:g} s; copy it to a disk of this machine") from None
 
 
-def make_session(path: str, rule: Rule, settings: Settings, arming: Arming | None = None) -> Session:
-    """Load a model file, and start a session with it."""
-    if not path:
+def make_session(settings: Settings, arming: Arming | None = None) -> Session:
+    """Load the model file that the parameters name, and start a session with it."""
+    rule = settings.rule()
+    if not (path := settings["model"]):
         raise ModelError("parameter model is empty; give the path of a model file, -p model:=FILE")
     file = Path(os.path.expanduser(path))  # no shell does that behind :=
     if not (file.is_absolute() or os.path.exists(file)):
