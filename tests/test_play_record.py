@@ -307,6 +307,34 @@ def test_a_simulated_clock_that_goes_back_by_little_is_told(world: World, tmp_pa
     assert recorded == [0, 5 * 10**8, 5 * 10**8, 75 * 10**7]
 
 
+def test_a_system_clock_that_is_set_back_stops_nothing(world: World, tmp_path: Path) -> None:
+    """Log times go on, one by one, and what comes is still written out: as after the first answer of an NTP server."""
+    output, set_back = tmp_path / "out.mcap", tmp_path / "set_back"
+    # the node's own clock stands still, as one does for an hour that is set back by an hour
+    stands = "recorder.Node = partial(recorder.Node, parameter_overrides=[Parameter('use_sim_time', value=True)])"
+    falls = f"time.time_ns = lambda now=time.time_ns: now() - os.path.exists({str(set_back)!r}) * 3600 * 10**9"
+    modules = "import os, time; from functools import partial; from rclpy.parameter import Parameter"
+    code = f"{modules}; from uncertain_lti_ros import recorder; {stands}; {falls}; {COMMANDS}"
+    numbers = world.publisher(Float64, "/numbers")
+    process = world.start("record", "-c", code, "record", "/numbers", "--output", str(output))
+    process.says("recording")
+    world.subscribed(numbers)
+
+    def send(count: int) -> None:
+        for number in range(count):
+            numbers.publish(Float64(data=float(number)))
+            time.sleep(0.01)
+
+    send(100)
+    set_back.touch()
+    send(100)
+    until(lambda: len([*Bag(tmp_path / "out.mcap.part").raw_messages()]) == 200, "what is written out by then")
+    process.signal(signal.SIGINT)
+    assert "this machine's clock went back by up to 3.6e+03 s: log times go on all the same" in process.succeed()
+    times = np.array([message.log_time_ns for message in Bag(output).raw_messages()])
+    assert len(times) == 200 and (np.diff(times) > 0).mean() > 0.98 and np.diff(times).max() < 10**9
+
+
 def test_a_killed_recorder_leaves_what_it_had(world: World, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     numbers = world.publisher(Float64, "/numbers")

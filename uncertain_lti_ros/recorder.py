@@ -24,6 +24,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import yaml
+from rclpy.clock import Clock
+from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
@@ -82,9 +84,10 @@ def run(args: argparse.Namespace) -> Result:
             _record(life, subscriptions, file, taken, args.duration, step, args.progress.note)
         if taken.back:
             args.progress.note(taken.back)
-        if simulated and taken.fell_ns:
-            by = f"{CLOCK} went back by up to {taken.fell_ns * 1e-9:.2g} s"
-            args.progress.note(f"{by}: log times stand still there, and `check` may judge otherwise than a node")
+        if taken.fell_ns:
+            whose, times = (CLOCK, "stand still there") if simulated else ("this machine's clock", "go on all the same")
+            by = f"{whose} went back by up to {taken.fell_ns * 1e-9:.2g} s"
+            args.progress.note(f"{by}: log times {times}, and `check` may judge otherwise than a node")
         if not file.count:
             came = f"no message came on {', '.join(topics)}{f' after a time on {CLOCK}' * simulated}"
             raise BagError(f"{output}: not written, {came}; check who publishes")
@@ -157,8 +160,9 @@ def _record(
         limit = math.inf if duration is None or file.began is None else file.began + duration
         return bool(taken.back) or time.monotonic() >= limit
 
+    steady = Clock(clock_type=ClockType.STEADY_TIME)  # a clock that is set back must not stop these
     for period, task in ((POLL, poll), (_LOOK, look), (_FLUSH, file.flush)):
-        life.node.create_timer(period, task)
+        life.node.create_timer(period, task, clock=steady)
     life.until(over)
     taken.release(all_of_them=True)
     file.hold()
@@ -177,6 +181,7 @@ class _InOrder:
     def __init__(self, file: _File, topics: Iterable[str], clock: Callable[[], int] | None) -> None:
         self._file, self._began_ns = file, time.time_ns()
         self.clock, self._logged_ns, self.back, self.fell_ns = clock, 0, "", 0
+        self._ahead_ns = 0  # of log times, as the system's clock was set back
         self._came, self._least = -math.inf, dict[str, float]()
         self._heard = dict.fromkeys(topics, -math.inf)
         self._waiting: CatchUp | None = None
@@ -193,8 +198,11 @@ class _InOrder:
             self.back = f"{CLOCK} went back {to}, so the recording ends there; record what follows to another file"
         if self.back or log_ns <= 0:  # no time has come on /clock
             return
-        self.fell_ns = max(self.fell_ns, self._logged_ns - log_ns)
-        self._logged_ns = log_ns if self.clock is None else max(self._logged_ns, log_ns)
+        fell_ns = max(0, self._logged_ns - log_ns)
+        self.fell_ns = max(self.fell_ns, fell_ns)
+        self._ahead_ns += fell_ns if self.clock is None else 0
+        self._logged_ns = log_ns if self.clock is None else log_ns + fell_ns
+        log_ns += self._ahead_ns
         self._file.began = self._file.began or now
         way = (taken_ns - sent_ns) * 1e-9 if sent_ns else 0.0
         if now - self._came > STALL and self._waiting is None:
