@@ -386,6 +386,15 @@ def test_a_simulated_clock_that_jumps_starts_a_new_segment(world: World, tmp_pat
     until(lambda: abs(world.status()["now_ns"] - time.time_ns()) < 10**10, "wall time")
 
 
+def test_two_simulated_clocks_at_once_are_told(bench: StartBench) -> None:
+    on = bench(use_sim_time=True)
+    clocks = [on.world.publisher(Clock, "/clock") for _ in range(2)]
+    on.world.subscribed(*clocks)
+    for clock in clocks:
+        clock.publish(Clock())
+    on.diagnostics.reaches(STALE, saying="2 publishers send /clock, and time jumps between them; stop all but one")
+
+
 def test_a_node_that_was_busy_takes_each_message_at_its_simulated_time(world: World, tmp_path: Path) -> None:
     """rclpy keeps the last tick alone: all that had come meanwhile was of one instant."""
     model = by_hand("log")

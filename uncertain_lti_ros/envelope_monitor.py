@@ -40,7 +40,15 @@ from uncertain_lti.signals.field_path import full_name
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
-from uncertain_lti_ros.topics import POLL, Diagnostics, MatchedSubscription, Outputs, SimulatedTime, input_values
+from uncertain_lti_ros.topics import (
+    CLOCK,
+    POLL,
+    Diagnostics,
+    MatchedSubscription,
+    Outputs,
+    SimulatedTime,
+    input_values,
+)
 
 NAME = "envelope_monitor"
 _SUMMARY = (
@@ -92,7 +100,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self.reason = ""
         self._starts_itself = False  # autostart was asked for and has not succeeded yet
         self.inputs: dict[str, MatchedSubscription] = {}
-        self._enable_problem, self._twin = "", False
+        self._enable_problem, self._twin, self._clocks = "", False, 0
         self._candidate: Session | Rule | None = None  # accepted, not yet in place
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)  # a paused or looping simulation must not stop these
         self._looked = self._reported = time.monotonic()
@@ -402,7 +410,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         if self.session is not None:
             self.session.know_rivals(topic for topic, s in self.inputs.items() if s.takes_turns())
         self.outputs.look()
-        self._twin = self.count_publishers(f"~/{VIOLATION.name}") > 1
+        self._twin, self._clocks = self.count_publishers(f"~/{VIOLATION.name}") > 1, self.count_publishers(CLOCK)
         self._find_enable_type()
         if self.active:
             self.subscribe()
@@ -468,7 +476,9 @@ class EnvelopeMonitorNode(LifecycleNode):
             problems.append(f"another node publishes {topic} too; give one of them another name, -r __node:=NAME")
         problems += self.outputs.sender.problems
         if self.intake.clock is not None and not self.intake.clock():
-            problems.append("use_sim_time is true, and no time has come on /clock")
+            problems.append(f"use_sim_time is true, and no time has come on {CLOCK}")
+        if self.intake.clock is not None and self._clocks > 1:
+            problems.append(f"{self._clocks} publishers send {CLOCK}, and time jumps between them; stop all but one")
         return problems + self.snapshots.problems
 
     def _problems(self) -> list[str]:
