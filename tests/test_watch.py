@@ -9,6 +9,7 @@
 
 """`watch`: its page shows what the monitor says, to this machine alone, in a browser too."""
 
+import base64
 import json
 import re
 import shutil
@@ -136,9 +137,12 @@ def test_numbers_that_come_before_the_flags_of_their_sample_are_drawn(world):
     say(flags, 2, "speed", 0.0)
     until(lambda: "2 samples," in drawn(address)["note"], "the next sample")
     np.testing.assert_array_equal(numbers(drawn(address)["top"][0]["values"]["least"]), [0.25, 0.5])
+    say(flags, 1, "speed", 0.0)  # late
+    until(lambda: "3 samples, 0 s is the newest" in drawn(address)["note"], "one that is late")
+    assert np.frombuffer(base64.b64decode(drawn(address)["times"][0])).tolist() == [-1.0, 0.0, 0.0]
     for k in range(900, 1500, 100):
         say(flags, k, "speed", 0.0)
-    until(lambda: "8 samples," in drawn(address)["note"], "all of them")
+    until(lambda: "9 samples," in drawn(address)["note"], "all of them")
     time.sleep(2.1)
     assert "SILENT" not in drawn(address)["title"]  # a sample comes every 100 s
     for k in (500, 600, 700):  # a recording that is played again

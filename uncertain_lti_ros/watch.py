@@ -138,7 +138,8 @@ class Watched:
         shown = t_ns >= t_ns[-1:] - self._window * 1e9
         shown[: max(np.flatnonzero(np.diff(t_ns) < -BACK_NS), default=-1) + 1] = False  # of the pass before, in a loop
         alarm, flags, utilisation, statistics = (row[shown] for row in rows)
-        t = (t_ns[shown] - t_ns[-1:]) * 1e-9
+        t = np.maximum.accumulate(t_ns[shown])  # one that is late is drawn beside the one before it
+        t = (t - t[-1:]) * 1e-9
         quiet, gone = time.monotonic() - heard, ""
         silent = quiet > max(_SILENT, 3.0 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0)
         if silent and not self._node.count_publishers(f"{self.name}/flags"):
