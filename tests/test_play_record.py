@@ -648,6 +648,22 @@ def test_lockstep_with_a_node_that_takes_no_topic_is_refused(world: World, tmp_p
     assert player.wait() == 2 and "listener: takes no topic that is played; is it active" in player.output
 
 
+def test_lockstep_with_a_node_that_takes_a_topic_no_more_ends(world: World, tmp_path: Path) -> None:
+    """As one that is deactivated meanwhile: the rest of the recording went to nobody."""
+    received = list[Float64]()
+    world.node.create_subscription(Float64, "/x", received.append, 1000)
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.message = json.dumps({"received": {"/x": len(received)} if len(received) < 3 else {}})
+        return response
+
+    world.node.create_service(Trigger, "/listener/status", answer)
+    bag = write([Topic("/x")], ramp("/x", range(START_NS, START_NS + 10**9, 2 * 10**8))).save(tmp_path / "in.mcap")
+    player = world.command("play", bag, "--lockstep", "listener")
+    assert player.wait() == 2 and "takes /x no more, since message 3; was it deactivated?" in player.output
+    assert len(received) == 3
+
+
 def test_lockstep_asks_again_where_an_answer_is_lost(world: World, tmp_path: Path) -> None:
     """Of each five answers of the status service the second leaves the node only after the next one."""
     received, answers, held = [0], [0], list[Any]()

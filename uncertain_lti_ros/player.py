@@ -319,6 +319,8 @@ class _Follower:
         began = time.monotonic()
         while before is not None and self._life.alive and (self._ask() and self.received(topic)) == before:
             self._give_up(began, f"message {number}, on {topic},")
+        if before is not None and self._life.alive and self.received(topic) is None:
+            raise UncertainLTIError(f"{self._name}: takes {topic} no more, since message {number}; was it deactivated?")
 
     def _give_up(self, began: float, what: str) -> None:
         if time.monotonic() - began > _LOCKSTEP_TIMEOUT:
