@@ -136,7 +136,7 @@ def drop_idle_controls(steps: Steps, used: Sequence[Candidate], shows: Array) ->
 _ACCELERATION = "an acceleration answers within a step; add it if it has a memory of its own"
 _EFFORT = "an effort answers within a step; taken in, it shows friction and load, which a position loop hides"
 _BESIDE = (
-    (r"twist\.", r"pose\.", "a place in a fixed frame; its rate of change is the twist beside it"),
+    (r"twist\.", r"pose\.", "a pose in a fixed frame; its rate of change is the twist beside it"),
     (r"angular_velocity\.|\(orientation\)", r"linear_acceleration\.", _ACCELERATION),
     (r"^velocity\[.*wheel", r"^position\[(?!.*steer).*wheel", "grows with the way; its rate of change is beside it"),
     (r"^(position|velocity)\[", r"^effort\[", _EFFORT),
