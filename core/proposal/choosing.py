@@ -74,8 +74,7 @@ def drop_functions(steps: Steps, pool: list[Candidate]) -> list[Candidate]:
 
     ranked = np.argsort(-np.log(np.maximum(steps.effects()[0], 1.0)).round(1), kind="stable").tolist()
     for i in (i for i in ranked if i not in sums):
-        source = next((j for j in kept if function[j, i]), None)
-        if source is not None:
+        if (source := next((j for j in kept if function[j, i]), None)) is not None:
             drop(i, source)
             continue
         for j in [j for j in kept if function[i, j]]:  # x stays, its square goes
@@ -229,8 +228,8 @@ def _moves_with(one: Candidate, other: Candidate, exact: bool = False) -> bool:
         return bool(abs(np.corrcoef(a, b)[0, 1]) > 0.9999)
     slope, offset = np.polyfit(b, a, 1)
     last_digits = np.diff(np.unique(a)).min() + abs(slope) * np.diff(np.unique(b)).min()
-    of_one = one.source.role == other.source.role and not (_alike(one, other) and abs(slope - 1.0) < 0.05)
-    last_digits *= of_one  # rounded copies in one unit would be equal, and what follows a set point closely is none
+    # parts that do the same would be equal if they were copies in one unit, and what follows a set point is none
+    last_digits *= one.source.role == other.source.role and not (_alike(one, other) and abs(slope - 1.0) < 0.05)
     return bool(np.abs(a - slope * b - offset).max() <= last_digits + 1e-9 * np.ptp(a))
 
 

@@ -122,7 +122,6 @@ class Evidence:
 
     def __add__(self, other: Evidence) -> Evidence:
         """With what further recordings are evidence of; the median is the mean of both, which few have as another."""
-
         share = other.verdicts / (self.verdicts + other.verdicts)
         judged = self.judged + other.judged
         return Evidence(
