@@ -22,7 +22,7 @@ from typing import Any
 from uncertain_lti.base.arrays import LONGEST_S, Array
 from uncertain_lti.base.errors import ModelError, refuse_other
 from uncertain_lti.base.files import kind_of, written
-from uncertain_lti.base.text import finite_data, plural, shortlist
+from uncertain_lti.base.text import finite_data, list_of, plural, shortlist
 from uncertain_lti.model.alarm_rule import CONTAINMENT, AlarmRule, Rule, checked_rules, rule_from_dict
 from uncertain_lti.model.domain import Domain, Occupancy, Sampling
 from uncertain_lti.model.horizon import Horizon, Residuals, Run
@@ -252,6 +252,12 @@ def read(path: str | os.PathLike[str]) -> Any:
     except (ValueError, RecursionError) as error:
         detail = (str(error).splitlines() or [type(error).__name__])[0][:120]
         raise ModelError(f"{path}: is not JSON ({detail}); write one with `uncertain-lti fit`") from None
+
+
+def sources_of(model: Any) -> list[dict[str, str]]:
+    """`file` and `sha256` of what a model was fitted to, "" for what its file does not say; anything may be in it."""
+    sources = (source for source in list_of(model.fit_summary.get("sources")) if isinstance(source, Mapping))
+    return [{key: str(source.get(key) or "") for key in ("file", "sha256")} for source in sources]
 
 
 def read_rules(path: str | os.PathLike[str], states: Sequence[str]) -> tuple[Rule, ...]:

@@ -35,6 +35,7 @@ from uncertain_lti.identification.diagnosis import HARMLESS
 from uncertain_lti.model.alarm_rule import AlarmRule, with_containment
 from uncertain_lti.model.domain import UNVOUCHED
 from uncertain_lti.model.interchange import block_facts
+from uncertain_lti.model.model_file import sources_of
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import times_text
 from uncertain_lti.monitor.deployed import drift_in_words
@@ -126,11 +127,7 @@ def findings(
             "sha256": sha256(model_file) if os.path.isfile(model_file) else None,
             "fit": {key: fit[key] for key in _KNOWN if isinstance(fit.get(key), (str, int, float))},
             "messages": _messages(model),
-            "sources": [
-                {key: str(source.get(key, "")) for key in ("file", "sha256")}
-                for source in list_of(fit.get("sources"))
-                if isinstance(source, Mapping)
-            ],
+            "sources": sources_of(model),
             "regimes": block_facts(model),
         },
         "validation": validation,
@@ -305,8 +302,7 @@ def _width_reasons(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]])
 def _recording_reasons(
     model: UncertainLTI, recordings: Sequence[Mapping[str, Any]], validation: Mapping[str, Any] | None
 ) -> Reasons:
-    sources = [s for s in list_of(model.fit_summary.get("sources")) if isinstance(s, Mapping)]
-    fitted = {str(s.get("sha256") or "") for s in sources} - {""}
+    fitted = {source["sha256"] for source in sources_of(model)} - {""}
     if same := [os.path.basename(r["recording"]) for r in recordings if any(f["sha256"] in fitted for f in r["files"])]:
         proves = "which it contains by construction: that proves nothing"
         yield CARE, "recordings", f"checked on what it was fitted to ({shortlist(same, 4)}), {proves}"

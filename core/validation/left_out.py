@@ -27,6 +27,7 @@ from uncertain_lti.identification import fit
 from uncertain_lti.identification.assembly import split_weights
 from uncertain_lti.identification.structure import Structure
 from uncertain_lti.model.alarm_rule import AlarmRule
+from uncertain_lti.model.model_file import sources_of
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.clock import passed
 from uncertain_lti.sampling.transient import Transient, controls_as, listed_transients
@@ -221,8 +222,8 @@ def validate(
         runs, operating_point=subject.operating_point, schedule=subject.schedule or {}, **own, **_horizons(subject)
     )
     if not _same(again, subject):
-        known = {source.get("sha256") for source in subject.fit_summary.get("sources", ())}
-        other = [file for run in runs for file in run.sources if known - {None} and sha256(file) not in known]
+        known = {source["sha256"] for source in sources_of(subject)} - {""}
+        other = [file for run in runs for file in run.sources if known and sha256(file) not in known]
         raise FitError(
             f"these recordings do not give this model again{f' (not as fitted: {shortlist(other, 3)})' * bool(other)}, "
             f"so what was left out of them would say nothing about it; name the recordings it was fitted to, or fit it "
