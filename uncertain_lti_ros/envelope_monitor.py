@@ -16,6 +16,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial, wraps
 from pathlib import Path
@@ -40,15 +41,7 @@ from uncertain_lti.signals.field_path import full_name
 from uncertain_lti_ros.parameters import DEFAULTS, PARAMETERS, RULE, Settings, make_session
 from uncertain_lti_ros.process import BAD_USAGE, declare, living, run_node, spare_the_middleware, whole_to_real
 from uncertain_lti_ros.snapshot_writer import Snapshots
-from uncertain_lti_ros.topics import (
-    CLOCK,
-    POLL,
-    Diagnostics,
-    MatchedSubscription,
-    Outputs,
-    SimulatedTime,
-    input_values,
-)
+from uncertain_lti_ros.topics import CLOCK, POLL, Diagnostics, MatchedSubscription, Outputs, SimulatedTime, input_values
 
 NAME = "envelope_monitor"
 _SUMMARY = (
@@ -155,7 +148,8 @@ class EnvelopeMonitorNode(LifecycleNode):
     def _on_set(self, parameters: Iterable[Parameter]) -> SetParametersResult:
         """Prepare what the new values require, or refuse them; `_on_have_set` puts it in place."""
         given = {p.name: p.value for p in parameters}
-        self._candidate, settings = None, Settings(self, given)
+        self._candidate, settings = None, copy(self.settings)
+        settings.update(given)
         try:
             self.settings.check_snapshots(given.get("snapshot.on_alarm", False))
             if "model" in given:

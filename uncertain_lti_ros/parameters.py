@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
@@ -152,14 +152,13 @@ MIB = 1 << 20
 class Settings(dict[str, Any]):
     """What the parameters of a node are set to, by name: a call of rclpy takes 10 µs.
 
-    `node`: its parameters are declared; `changes`: other values by name, instead of those that it has.
+    `node`: its parameters are declared.
     """
 
-    def __init__(self, node: Node, changes: Mapping[str, Any] = {}) -> None:
+    def __init__(self, node: Node) -> None:
         super().__init__()
         self._node = node
         self.read()
-        self.update(changes)
 
     def read(self) -> None:
         """Read the parameters: some were set."""

@@ -439,7 +439,7 @@ def _contents(path: Path, size: int, stated: _Summary, statistics: Statistics, s
         if block.channels:
             found.blocks.append(block._replace(channels=shared.setdefault(block.channels, block.channels)))
         for channel in block.channels:
-            room[channel] = room.get(channel, 0) + block.length // (MESSAGE_HEAD.size)
+            room[channel] = room.get(channel, 0) + block.length // MESSAGE_HEAD.size
             there = found.tally.setdefault(channel, Tally(counts.get(channel, 0), block.start, block.end))
             there.first, there.last = min(there.first, block.start), max(there.last, block.end)
     can_be = (

@@ -423,7 +423,7 @@ def extended(
         return None
     new, shown, unlike = _gathered(rules, parts, fitted, evidence.dt)
     both = evidence + new if asked is not None else _unasked(evidence + new, rules, what)
-    before, now = (np.asarray(m.fit_summary["mean_width"]) for m in (model, fitted[0].judged_by))  # with them
+    before, now = (np.asarray(m.fit_summary["mean_width"]) for m in (model, fitted[0].model))  # with them
     wider = np.fmax(1.0, np.divide(now, before, out=np.ones(model.n), where=before > 0.0))
     both = replace(both.with_alarms(rules, what, shown), widths=wider * both.widths)
     return Panel.of(model, both, rules, what, [*alarm["unlike"], *unlike], asked)
