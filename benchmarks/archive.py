@@ -12,6 +12,7 @@
 python benchmarks/archive.py            # 64 tables of 5000 samples
 python benchmarks/archive.py --quick    # of 500
 python benchmarks/archive.py --wide     # 20 tables of 100 000 samples of 50 states, on one, two and four workers
+python benchmarks/archive.py --long     # 100 tables of 10^6 samples, 4.5 GB on disk and 12 GB of cache: time and memory
 
 Prints the time of each way, how far its matrices and its objective are from those of one process that holds everything
 in memory, and training transitions outside. In one of the runs a worker is killed while the fit is under way.
@@ -32,12 +33,13 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 from distributed import Client, LocalCluster
-from measure import best, table
+from measure import best, peak_memory, table
 
 from uncertain_lti import read_transients
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.archive import fit_archive
 from uncertain_lti.identification.fleet import DaskFleet
+from uncertain_lti.proposal.public_fit import fit_many
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
 COUNT = 64
@@ -46,11 +48,12 @@ LOCAL["silence_logs"] = logging.CRITICAL  # of the worker that is killed
 DT_NS = 25_000_000
 
 
-def tables(folder, count, samples, n, m):
+def tables(folder, count, samples, n, m, seed=0):
     """Tables of a machine of n states, every column a signal, and these signals."""
     rng = np.random.default_rng(0)
     A, B = 0.1 * rng.normal(size=(n, n)) - 2.0 * np.eye(n), rng.normal(size=(n, m))
     names = [*(f"x{i}" for i in range(n)), *(f"u{j}" for j in range(m))]
+    rng = np.random.default_rng(seed)
     u = rng.uniform(-1, 1, (count, samples // 20 + 1, m)).repeat(20, axis=1)[:, :samples]
     x = rng.uniform(-1, 1, (samples, count, n))
     for k in range(samples - 1):
@@ -58,7 +61,7 @@ def tables(folder, count, samples, n, m):
     for number in range(count):
         columns = {"t [s]": 1e-9 * DT_NS * np.arange(samples)}
         columns |= dict(zip(names, np.hstack([x[:, number], u[number]]).T, strict=True))
-        pq.write_table(pa.table(columns), folder / f"run{number:02}.parquet")
+        pq.write_table(pa.table(columns), folder / f"run{seed + number:02}.parquet")
     states, controls = (tuple(Signal(name, "/table", name) for name in some) for some in (names[:n], names[n:]))
     return sorted(folder.glob("run*.parquet")), SignalMap(states, controls)
 
@@ -105,21 +108,31 @@ def wide(count=20, samples=100_000):
     table(f"{count} tables, {count * (samples - 1)} transitions, n = 50, m = 10, (10) with noise", header, rows)
 
 
+def long(count=100, samples=1_000_000):
+    """The public call with more than memory is for."""
+    with tempfile.TemporaryDirectory() as temporary:
+        for seed in range(0, count, 5):
+            paths, signals = tables(Path(temporary), 5, samples, 5, 4, seed)
+        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here on
+        took, model = best(lambda: fit_many(paths, signals, cache=f"{temporary}/cache"), 1)
+        row = [f"{took:.0f} s", f"{peak_memory() / 2**20:.0f} MiB", f"{model.fit_summary['optimality_gap']:.0e}"]
+        table(f"{count} tables, {count * (samples - 1)} transitions", ["took", "peak memory", "gap"], [row])
+
+
 def main():
     """All ways, one after the other."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="a tenth of the size")
     parser.add_argument("--wide", action="store_true", help="many states, on more and more workers")
+    parser.add_argument("--long", action="store_true", help="10^8 transitions")
     options = parser.parse_args()
-    samples = 500 if options.quick else 5000
     print(f"{os.cpu_count()} cores, Python {platform.python_version()}, numpy {np.__version__}")
-    if options.wide:
-        wide()
-        return
+    if options.wide or options.long:
+        return wide() if options.wide else long()
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)
-        paths, signals = tables(folder, COUNT, samples, 5, 4)
+        paths, signals = tables(folder, COUNT, 500 if options.quick else 5000, 5, 4)
 
         def row(name, criterion, took, model):
             known = models[criterion]
@@ -139,26 +152,15 @@ def main():
         for criterion in ("qp", "lp"):
             took, models[criterion] = best(lambda c=criterion: fit(transients, c), 1)
             row("in memory", criterion, reading + took, models[criterion])
-            cache = folder / f"cache_{criterion}"
-            row(
-                "cache",
-                criterion,
-                *best(lambda c=criterion, f=cache: fit_archive(paths, signals, c, cache=f), 1),
-            )
+            given = {"cache": folder / f"cache_{criterion}"}
+            row("cache", criterion, *best(lambda c=criterion, g=given: fit_archive(paths, signals, c, **g), 1))
         with LocalCluster(n_workers=2, **LOCAL) as cluster, Client(cluster) as client:
             for criterion in ("qp", "lp"):
-                row(
-                    "two workers",
-                    criterion,
-                    *best(lambda c=criterion: fit_archive(paths, signals, c, client=client), 1),
-                )
-            for criterion in ("qp", "lp"):
                 say, killed = killing(cluster)
-                took, model = best(
-                    lambda c=criterion, s=say: fit_archive(paths, signals, c, client=client, progress=s), 1
-                )
+                for way, given in (("two workers", {}), ("two workers, one killed", {"progress": say})):
+                    given |= {"client": client}
+                    row(way, criterion, *best(lambda c=criterion, g=given: fit_archive(paths, signals, c, **g), 1))
                 assert killed.is_set()
-                row("two workers, one killed", criterion, took, model)
     header = ["way", "criterion", "reading and fit", "elements differ", "objective differs", "outside"]
     table(f"{COUNT} tables, {sum(t.transitions().k.size for t in transients)} transitions, n = 5, m = 4", header, rows)
     if failed:

@@ -125,6 +125,24 @@ def test_the_same_bits_as_in_mcap(tables, shipped, names, kind, tmp_path):
     assert len(read) > 1000 and given_by(read) == expected_of(shipped)
 
 
+def test_of_many_large_tables_the_numbers_of_most_are_held_only_while_they_are_read(
+    tables, shipped, names, monkeypatch
+):
+    monkeypatch.setattr("uncertain_lti.recordings.table._HELD", 0)
+    first, *bags = group_recordings([tables[".tsv"], tables[".csv"], tables[".npz"]])
+    assert "times" in vars(first)  # one that is alone is not read twice, whatever its size
+    paths = [[FieldPath(name) for name in names]]
+
+    def held():
+        return [key for bag in bags for key in ("times", "columns_by_field", "_rows") if key in vars(bag)]
+
+    assert not held() and all(bag.topics["/table"].count == len(shipped) for bag in bags)
+    for bag in bags:
+        found = bag.columns(["/table"], paths)
+        assert found.arrival.tobytes() == shipped.t_ns.tobytes() and not held()
+        assert found.values[0][:-1].tobytes() == rows_of(shipped)[:-1].tobytes()
+
+
 def test_parquet_and_feather(pa, shipped, names, tmp_path):
     from pyarrow import feather
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
@@ -100,6 +101,8 @@ def one_thread_each() -> Iterator[None]:
 
 def return_memory() -> None:
     """Give back what is freed, of which the C library keeps hundreds of MB after the threads of a large fit."""
+    if "pyarrow" in sys.modules:  # keeps as much of the tables that it read
+        sys.modules["pyarrow"].default_memory_pool().release_unused()
     with suppress(OSError, AttributeError):  # another C library
         ctypes.CDLL(None).malloc_trim(0)
 

@@ -295,7 +295,8 @@ def fit_many(
     taken, some, messages = None, list[Transient](), list[str]()
     if alarm == "panel":
         bags = group_recordings(paths, indexed=True, layout=signals.table)
-        some = _some(bags, signals)
+        some, total = _some(bags, signals), len(bags)
+        del bags  # of tables their numbers
         ways, said = _ways(criterion, additive, bool(asked)), {"describe_data": False, "progress": progress}
         at, why = choose_ends(some, criterion=criterion or "lp", additive=additive or "noise")
         if why:
@@ -310,8 +311,8 @@ def fit_many(
     )
     if taken is None:
         return model if isinstance(alarm, str) else model.replace(alarm=alarm)
-    note = f"learnt on {len(some)} of {plural(len(bags), 'recording')}, as many as memory is for"
-    note *= len(some) < len(bags)
+    note = f"learnt on {len(some)} of {plural(total, 'recording')}, as many as memory is for"
+    note *= len(some) < total
     return _saying(monitored_like(taken, model, some, false_alarms, note).finished(), messages, {})
 
 

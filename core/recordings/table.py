@@ -22,11 +22,11 @@ from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uncertain_lti.base.arrays import Index, Integers, Mask
+from uncertain_lti.base.arrays import Index, Integers, Mask, return_memory
 from uncertain_lti.base.errors import BagError
 from uncertain_lti.base.files import TABLES
 from uncertain_lti.base.text import once, plural, shortlist
@@ -62,6 +62,7 @@ _OF_SIGNALS = (
 _NAMES = re.compile(rf"(?i)(.*[\W_])?(name|{_OF_SIGNALS})")
 _VALUES = re.compile(r"(?i)_?((var|tag)?[\W_]*value|val|payload|reading|wert)")
 _TOGETHER = 0.9  # of the times, that have a number of each signal
+_HELD = 500_000_000  # bytes of several tables; those that follow are read anew when their numbers are asked for
 
 
 def is_table(path: Path) -> bool:
@@ -83,7 +84,7 @@ class Table(Recording):
     def __init__(self, path: Path, layout: TableLayout | None = None, run: _Run | None = None) -> None:
         layout = layout or TableLayout()
         file, raw, (time, times, words, self.time_unit), rows = run or _one_run(path, layout)
-        self.path, self.parts, self.layout = path, (file,), layout
+        self.path, self.parts, self.layout, self._kept = path, (file,), layout, True
         self.size = file.stat().st_size
         of_file = [*raw.notes, *([words] if words else [])]
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
@@ -158,6 +159,21 @@ class Table(Recording):
         """For another process, which reads the file again."""
         return Table, (self.path, self.layout)
 
+    def let_go(self) -> None:
+        """Of the numbers, which are read again whenever they are asked for."""
+        self._kept = False
+        del self.times, self.columns_by_field, self._rows
+        return_memory()
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name):
+            if name not in ("times", "columns_by_field", "_rows"):
+                raise AttributeError(name)
+            again = Table(self.path, self.layout)
+            self.times, self.columns_by_field, self._rows = again.times, again.columns_by_field, again._rows
+            return getattr(self, name)
+
     def type_fields(self, topic: str) -> TypeFields:
         """Columns as fields."""
         self._require([topic])
@@ -189,7 +205,10 @@ class Table(Recording):
         if progress is not None:
             for _ in progress(range(len(rows)), len(rows)):
                 pass
-        return Columns(of, self.times[rows], np.full(len(rows), -1, dtype=np.int64), values)
+        found = Columns(of, self.times[rows], np.full(len(rows), -1, dtype=np.int64), values)
+        if not self._kept:
+            self.let_go()
+        return found
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Rate, gaps and columns."""
@@ -259,15 +278,22 @@ def _of_words(field: str, words: Sequence[str], cells: Sequence[str]) -> dict[st
 
 def read_tables(paths: Sequence[Path], layout: TableLayout | None) -> list[Table]:
     """Every run of some files; those with one signal each of the same time, or in another unit, get a warning."""
-    tables = [run for path in paths for run in _every_run(path, layout or TableLayout())]
-    steps = [(float(np.median(np.diff(t.times))), t) for t in tables if len(t.times) > 2]
+    tables, steps, alone, held = list[Table](), list[tuple[float, Table]](), list[Table](), 0
+    for table in (run for path in paths for run in _every_run(path, layout or TableLayout())):
+        tables.append(table)
+        if len(table.times) > 2:
+            steps.append((float(np.median(np.diff(table.times))), table))
+        columns, whole = table.columns_by_field.values(), table.parts == (table.path,)
+        held += sum(column.nbytes for column in columns)
+        if whole and len(table.times) and table.times[0] > DATED_NS:
+            alone += [table] * (sum(column.dtype.kind not in "OM" for column in columns) == 1)
+        if whole and held > _HELD and len(tables) > 1:
+            table.let_go()
     least, fastest = min(steps, key=lambda one: one[0], default=(0.0, None))
     for (step, table), (unit, times) in product(steps, (("ms", 1e3), ("us", 1e6))):
         if fastest is not None and 0.8 * step < least * times < 1.25 * step:
             words = f"its steps are {step / least:.4g} times those of {fastest.path}: if its times are in {unit}"
             table._warnings.append(f"{table.path}: {words} and those in s, call its column time_{unit}")
-    dated = [t for t in tables if t.parts == (t.path,) and len(t.times) and t.times[0] > DATED_NS]
-    alone = [t for t in dated if sum(c.dtype.kind not in "OM" for c in t.columns_by_field.values()) == 1]
     for other in alone[1:]:
         if np.isin(other.times, alone[0].times).mean() > 0.5:
             remedy = "if each of them is of another signal of one machine, write them as columns of one file"

@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import core_count
+from uncertain_lti.base.arrays import core_count, return_memory
 from uncertain_lti.base.errors import BagError, SignalError, refuse_other
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.recordings.formats import group_recordings, open_recording
@@ -277,14 +277,16 @@ def read_transients(
     signals = signals.with_types(types_of(bags, signals))
     streams = read_streams(bags, signals, progress, processes)
     resolved = resolved_by([times_of(stream, signals) for stream in streams], signals)
-    transients = [sample(stream, resolved)[0] for stream in streams]
-    refuse_copies(transients)
     asked = [s for s in resolved.signals if "auto" in (s.steady, s.scale)]
+    again = streams.copy() if any(FieldPath(s.field).unwrap for s in asked) else []
+    transients = [sample(streams.pop(0), resolved)[0] for _ in bags]
+    refuse_copies(transients)
+    return_memory()
     if not asked:
         return _overlaps_told(transients)
     resolved, words = _resolve_operating_point(resolved, transients)
-    if any(FieldPath(s.field).unwrap for s in asked):  # the branch of an angle starts nearest to steady
-        transients = [sample(stream, resolved)[0] for stream in streams]
+    if again:  # the branch of an angle starts nearest to steady
+        transients = [sample(stream, resolved)[0] for stream in again]
     numbers = shortlist([f"{s.name} {s.steady:.9g} (scale {s.scale:.9g})" for s in resolved.signals], 12)
     first = (*transients[0].notes, f"operating point from {words}: {numbers}")
     return _overlaps_told(
