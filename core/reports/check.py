@@ -162,9 +162,9 @@ def _states(model: UncertainLTI, verdicts: Verdicts) -> dict[str, dict[str, Any]
     change, largest = jumps(model, np.concatenate([np.full((1, model.n), np.nan), x[:-1]]), x)
     states = {}
     for i, name in enumerate(model.state_names):
-        there = np.flatnonzero(~np.isnan(verdicts.flags[:, i]))
-        bad, own = np.flatnonzero(verdicts.flags[:, i] == 1.0), len(there)
-        width = (verdicts.upper - verdicts.lower)[verdicts.judged, i]
+        flags = verdicts.flags[:, i]
+        there, bad = np.flatnonzero(~np.isnan(flags)), np.flatnonzero(flags == 1.0)
+        own, width = len(there), (verdicts.upper[:, i] - verdicts.lower[:, i])[verdicts.judged]
         mean = float(np.nanmean(width)) if own else None
         values = x[np.isfinite(x[:, i]), i]
         span = float(np.ptp(values)) if len(values) else None

@@ -15,7 +15,6 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
@@ -35,7 +34,7 @@ from uncertain_lti.recordings.recording import DATED_NS, Columns, Progress, Reco
 from uncertain_lti.sampling.clock import INVALID, LATE, MISSING, TOO_OLD, Status, resolve
 from uncertain_lti.sampling.sampler import Sampler
 from uncertain_lti.sampling.steady_state import resolve_auto
-from uncertain_lti.sampling.transient import Transient
+from uncertain_lti.sampling.transient import Transient, unusable
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.signal_map import SignalMap, UncarriedTopicError
 from uncertain_lti.signals.values import of_table
@@ -438,11 +437,13 @@ def _resolve_operating_point(signals: SignalMap, transients: Sequence[Transient]
 
 def unused(transient: Transient) -> list[str]:
     """In words, how many transitions of a recording are not used, and why."""
-    counts = Counter(status.value for status in transient.statuses()[1:] if status is not Status.OK)
+    there = [(status.value, mask) for status, mask in unusable(transient).items() if mask.any()]
+    there.sort(key=lambda of: int(of[1].argmax()))  # that which was met first is said first
+    counts = {kind: int(mask.sum()) for kind, mask in there}
     counters = transient.counters
     parts = [f"{count} {kind}" for kind, count in counts.items()]
     lacking = counters.of(MISSING)
-    if counts[MISSING] > max(1.0, _FEW * len(transient)) and (most := max(lacking.values(), default=0)):
+    if counts.get(MISSING, 0) > max(1.0, _FEW * len(transient)) and (most := max(lacking.values(), default=0)):
         names = [name for name, count in lacking.items() if count > 0.5 * most][:3]
         parts[list(counts).index(MISSING)] += f" {' or '.join(names)}{' or others' * (len(lacking) > len(names))}"
     parts += [f"{counters[s.value]} dropped ({s.value})" for s in Status if s.dropped and counters[s.value]]

@@ -353,10 +353,9 @@ class Transient:
         """
         if not len(self):
             return []
-        back = np.diff(self.t_ns) < 0
-        cut = np.diff(self.segment) > 0
-        kinds = Status.RESET, Status.GAP, Status.MISSING, Status.OK
-        return [Status.FIRST, *map(kinds.__getitem__, np.select([back, cut, ~self.usable], range(3), 3).tolist())]
+        kinds, masks = zip(*unusable(self).items(), strict=True)
+        every = (*kinds, Status.OK)
+        return [Status.FIRST, *map(every.__getitem__, np.select(masks, range(len(kinds)), len(kinds)).tolist())]
 
     @property
     def segments(self) -> int:
@@ -490,6 +489,12 @@ class Transient:
         z = samples.csv_columns(path, [time, *states, *controls], delimiter, name)
         t, x, u = z[:, 0], z[:, 1 : 1 + len(states)], z[:, 1 + len(states) :]
         return cls(t, x, u, state_names=states, control_names=controls, **options)
+
+
+def unusable(transient: Transient) -> dict[Status, NDArray[np.bool_]]:
+    """Which transitions are not used (N,), each by the reason that goes before the others."""
+    back, cut = np.diff(transient.t_ns) < 0, np.diff(transient.segment) > 0
+    return {Status.RESET: back, Status.GAP: cut & ~back, Status.MISSING: ~(transient.usable | cut | back)}
 
 
 def _ends_of(at: At | Mapping[str, At], transient: Transient) -> tuple[At, ...]:
