@@ -208,6 +208,24 @@ def test_control_set_by_a_feedback_is_named_and_open_loop_is_not():
         assert "feedback" not in said(messages(healthy))
 
 
+def test_what_moves_axes_of_their_own_is_looked_at_by_axis():
+    """A command that follows another axis, as a geared one, was called fed back, and too weak to be told from it."""
+    rng, dt, count = np.random.default_rng(7), 0.01, 4000
+    u, x = np.zeros((count + 1, 2)), np.zeros((count + 1, 2))
+    u[:, 0] = steps(rng, count + 1)[:, 0]
+    for k in range(count):
+        x[k + 1] = x[k] + dt * 8 * (u[k] - x[k]) + 0.002 * rng.normal(size=2)
+        u[k + 1, 1] = x[k + 1, 0] + 1e-4 * rng.normal()
+    states, controls = (
+        [{"name": "{}" + end, "for": ["left", "right"], "topic": topic, "field": "position[{}]"}]
+        for end, topic in (("", "/s"), ("_command", "/u"))
+    )
+    for structure in ({}, {"structure": "own"}):
+        signals = SignalMap.from_dict({"states": states, "controls": controls, **structure})
+        found = messages(Transient(dt * np.arange(count + 1), x, u, signals=signals))
+        assert {"feedback", "weak"} & said(found) == (set() if structure else {"feedback", "weak"}), found
+
+
 @pytest.mark.parametrize(("dt", "slow"), [(0.02, False), (0.2, False), (0.5, True)])
 def test_step_too_long_for_the_fastest_mode(dt, slow):
     assert ("slow" in said(messages(run(dt=dt, noise=1e-5)))) == slow

@@ -24,10 +24,11 @@ from uncertain_lti.base.arrays import Array, runs
 from uncertain_lti.base.text import moment, plural, quoted, shortlist
 from uncertain_lti.identification import evidence, regimes
 from uncertain_lti.identification.discard import MUCH, Carriers
+from uncertain_lti.identification.evidence import Effects
 from uncertain_lti.identification.fleet import Fleet
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem, row_of
-from uncertain_lti.identification.structure import EVERY, Rows, rows_of
+from uncertain_lti.identification.structure import EVERY, Rows, own_of, rows_of
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.sampling.clock import longest_pause
@@ -89,8 +90,8 @@ def _rank(problem: Fleet | Problem, sums: Moments, names: Sequence[str], rows: R
 
 def _axes(sums: Moments, of: NDArray[np.intp], rows: Rows = EVERY) -> Iterator[tuple[list[int], float, Array, Array]]:
     """Eigenvalues, eigenvectors and correlation of some regressors, of those that come together in a row each."""
-    for row in rows:
-        own = of[(of >= len(row)) | row[np.minimum(of, len(row) - 1)]]
+    for row, _ in rows:
+        own = own_of(of, row)
         unit = 1.0 / sums.phi_scale[own]
         values, vectors = np.linalg.eigh(C := sums.centre[np.ix_(own, own)] * np.outer(unit, unit) / sums.count)
         yield from zip(repeat(own.tolist()), values.tolist(), vectors.T, repeat(C), strict=False)
@@ -124,13 +125,13 @@ def describe(
     if not coded:  # the envelope is fitted to the jumps, and what follows would be about them
         messages += _carried(few, discarded, problem, names, transients)
         alike = _collinear(problem, sums, names, past, rows)
-        noisy, late, held = _noise_like(part), _delayed(part, signals, past), _held(part, signals)
+        noisy, late, held = _noise_like(part), _delayed(part, signals, past, rows), _held(part, signals)
         messages += [*alike, *late, *held, *jittering(model, part, names), *_frozen(part, names, transients)]
         lacking = {} if late else _missing(part, signals)
         lacking = {i: m for i, m in lacking.items() if not any(i in of for of in held.values())}
         messages += lacking.values()
-        messages += far or _weak(problem, sums, signals, past, lacking)
-        messages += _fed_back(part, names, past, [i for i in model.signals.arrivals if names[i].endswith(ARRIVAL)])
+        messages += far or _weak(evidence.lost(problem, sums, past, rows), model.n, signals, lacking)
+        messages += _fed_back(part, names, past, rows)
         messages += _noisy({i: share for i, share in noisy.items() if i not in lacking}, names, part.dt)
         if apart and not alike and not noisy and not past:  # of the others the eigenvalues mean nothing
             messages += _slow(model) + _unstable(model)
@@ -228,13 +229,10 @@ def _collinear(
     return messages
 
 
-def _weak(
-    problem: Problem, sums: Moments, signals: Sequence[Signal], past: Collection[int], lacking: Collection[int]
-) -> list[str]:
+def _weak(every: Effects, n: int, signals: Sequence[Signal], lacking: Collection[int]) -> list[str]:
     """Controls whose effect is lost in the noise, unless another sample of the same field has it."""
-    every, of = evidence.lost(problem, sums, past), [(s.topic, s.inner) for s in signals]
-    names = [s.name for s in signals]
-    seen = {of[j] for j in range(problem.n, len(of)) if j not in every}
+    names, of = [s.name for s in signals], [(s.topic, s.inner) for s in signals]
+    seen = {of[j] for j in range(n, len(of)) if j not in every}
     found = {j: effect for j, effect in every.items() if effect[0] not in lacking and of[j] not in seen}
     state, certainty = max(found.values(), key=itemgetter(1), default=(0, 0.0))
     larger = max(2.0, evidence.DETERMINED / max(0.4, min((least for _, least in found.values()), default=1.0)))
@@ -247,33 +245,31 @@ def _weak(
 
 def _controls(found: Collection[int], names: Sequence[str]) -> str:
     """One control, or each of several."""
-    named = shortlist([f"'{names[j]}'" for j in found], 12)
+    named = shortlist([f"'{names[j]}'" for j in sorted(found)], 12)
     return ("each of the controls " if len(found) > 1 else "control ") + named
 
 
-def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], later: Sequence[int]) -> list[str]:
+def _fed_back(problem: Problem, names: Sequence[str], past: Collection[int], rows: Rows) -> list[str]:
     """Controls whose changes follow from the states: closed-loop recordings, or inputs too regular to separate.
 
     u_k - u_{k-1} is explained by x_k, x_{k-1} and u_{k-1} if a feedback sets u_k; an input that a person steps
-    at will is not. What the columns `later` had of u_k, at the end of the step before, is no explanation.
+    at will is not. What a column of the arrival has of u_k, at the end of the step before, is no explanation.
     """
     follows = evidence.successive(problem)
     if len(follows) <= 4 * problem.p:
         return []
     before, now = problem.z.T[follows], problem.z.T[follows + 1]
-    n = problem.n
-    basis = np.column_stack([now[:, :n], np.delete(before, later, axis=1), np.ones(len(before))])
-    gram = basis.T @ basis
-    found = {}
-    for j in [j for j in range(n, problem.p) if j not in past and j not in later]:
-        change = now[:, j] - before[:, j]
-        change = change - change.mean()
-        size = float(change @ change)
-        if size <= 1e-18 * float(now[:, j] @ now[:, j]) or np.count_nonzero(np.diff(change)) < 0.05 * len(change):
-            continue
-        left, _ = evidence.unexplained(gram, (basis.T @ change)[:, None], np.array([size]))
-        if (explained := 1.0 - float(left[0]) / size) > FED_BACK:
-            found[j] = explained
+    n, found, later = problem.n, dict[int, float](), [j for j, name in enumerate(names) if name.endswith(ARRIVAL)]
+    for own in (own_of(np.arange(problem.p), row) for row, _ in rows):
+        basis = np.column_stack([now[:, own[own < n]], before[:, np.setdiff1d(own, later)], np.ones(len(before))])
+        mine = [j for j in own[own >= n].tolist() if j not in past and j not in later]
+        change = now[:, mine] - before[:, mine]
+        change -= change.mean(axis=0)
+        often = np.count_nonzero(np.diff(change, axis=0), axis=0) >= 0.05 * len(change)
+        size = (change**2).sum(axis=0)
+        explained = 1.0 - evidence.unexplained(basis.T @ basis, basis.T @ change, size)[0] / np.maximum(size, 1e-300)
+        follow = (explained > FED_BACK) & often & (size > 1e-18 * (now[:, mine] ** 2).sum(axis=0))
+        found |= {j: share for j, share, so in zip(mine, explained.tolist(), follow, strict=True) if so}
     least = min(found.values(), default=0.0)
     return [
         f"the changes of {_controls(found, names)} follow from the states to {least:.0%}: a feedback sets it, so the "
@@ -428,10 +424,10 @@ def _frozen(problem: Problem, names: Sequence[str], transients: Sequence[Transie
     return [f"'{name}' stands at exactly one value for {most} samples {when}{also}: {advice}"] * bool(found)
 
 
-def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int]) -> list[str]:
+def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int], rows: Rows) -> list[str]:
     """Controls that explain the states better when taken some samples earlier."""
     found: dict[tuple[int, int], dict[int, float]] = {}
-    for j, (best, share) in evidence.late_controls(problem, past).items():
+    for j, (best, share) in evidence.late_controls(problem, past, rows).items():
         if share >= 0.005:  # of many states, of which few follow it, less may be sure
             found.setdefault((best, signals[problem.n + j].delay + best), {})[problem.n + j] = share
     return [
@@ -444,8 +440,7 @@ def _delayed(problem: Problem, signals: Sequence[Signal], past: Collection[int])
 
 def _missing(problem: Problem, signals: Sequence[Signal]) -> dict[int, str]:
     """States whose next sample depends on more than the signals at one instant."""
-    known = evidence.autocorrelation(problem)
-    messages = {}
+    known, messages = evidence.autocorrelation(problem), dict[int, str]()
     for i, signal in enumerate(signals[: problem.n]):
         if known is None or not known.follows(i):
             continue
@@ -471,11 +466,7 @@ def _stretches(problem: Problem) -> Problem:
 
 
 def _carried(
-    few: Carriers | None,
-    discarded: int | None,
-    problem: Problem,
-    names: Sequence[str],
-    transients: Sequence[Transient],
+    few: Carriers | None, discarded: int | None, problem: Problem, names: Sequence[str], transients: Sequence[Transient]
 ) -> list[str]:
     """States whose width a few samples carry."""
     if few is None:
@@ -507,10 +498,10 @@ def _where(problem: Problem, indices: Sequence[int], transients: Sequence[Transi
 
 def _noise_like(problem: Problem) -> dict[int, float]:
     """States whose next sample cannot be predicted from those before, and the share of its variance that can."""
-    n = problem.n
-    share = evidence.predicted(problem.z.T[:, :n], problem.z.T[:, n:], problem.x_next.T)
-    moving = np.ptp(problem.z.T[:, :n], axis=0) > 0
-    return {i: max(0.0, float(share[i])) for i in np.flatnonzero(moving & (share < evidence.NOISE)).tolist()}
+    x, u = np.split(problem.z.T, [problem.n], axis=1)
+    share = evidence.predicted(x, u, problem.x_next.T)
+    noisy = (np.ptp(x, axis=0) > 0) & (share < evidence.NOISE)
+    return {i: max(0.0, float(share[i])) for i in np.flatnonzero(noisy).tolist()}
 
 
 def _noisy(noise: dict[int, float], names: Sequence[str], dt: Array) -> list[str]:
@@ -547,13 +538,11 @@ def _unstable(model: UncertainLTI) -> list[str]:
             found.append(f"eigenvalues {shortlist(unstable, 4)} 1/s{at}")
         elif block.spectral_radius() > 1.0 + 1e-9:
             found.append(f"spectral radius {block.spectral_radius():.4g} at the recorded step{at}")
-    if not found:
-        return []
     listed = "; ".join(found[:3]) + (f"; and {len(found) - 3} more" if len(found) > 3 else "")
     return [
         f"the nominal model is unstable ({listed}): one-step bounds restart from the measured state, so the alarm is "
         f"as good as ever; simulate nothing with it"
-    ]
+    ] * bool(found)
 
 
 def _complex(value: complex) -> str:

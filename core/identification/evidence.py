@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,13 @@ from numpy.typing import NDArray
 from uncertain_lti.base.arrays import Array, in_stretches
 from uncertain_lti.identification.passes import Moments
 from uncertain_lti.identification.problem import Problem
+from uncertain_lti.identification.structure import EVERY, Rows, own_of
 from uncertain_lti.model.horizon import unbroken_over
 from uncertain_lti.model.operating_point import recorded
 from uncertain_lti.signals.signal_map import Signal
 
+Effects = dict[int, tuple[int, float]]
+"""Controls, each with a state or a number of samples, and how sure that is."""
 FASTEST = 1.05
 """Rows per second up to which a recording is of a plant: most sensors answer within a row, and levels are judged."""
 NOISE = 0.5
@@ -278,28 +282,26 @@ def lagged_states(signals: Sequence[Signal], n: int) -> set[int]:
     return {j for j, s in enumerate(signals) if j >= n and (s.delay > 0 or s.memory) and (s.topic, s.inner) in states}
 
 
-def lost(problem: Problem, moments: Moments, known: Collection[int] = ()) -> dict[int, tuple[int, float]]:
+def lost(problem: Problem, moments: Moments, known: Collection[int] = (), rows: Rows = EVERY) -> Effects:
     """Controls whose effect on every state is lost in the noise: the state on which most, and standard errors."""
-    free = np.flatnonzero(moments.phi_scale > 0)
-    centre, target = moments.centre[np.ix_(free, free)], moments.target[free]
-    if not len(free) or moments.count <= len(free):
-        return {}
-    inverse = np.linalg.pinv(centre, hermitian=True)
-    theta = inverse @ target
-    residual = np.maximum(moments.rate_square - np.einsum("ji,ji->i", theta, target), 1e-14 * moments.rate_square)
-    error = np.outer(np.diagonal(inverse), residual / (moments.count - len(free)))
-    certainty = np.abs(theta) / np.maximum(np.sqrt(np.maximum(error, 0.0)), 1e-300)
-    found = {}
-    for row, j in enumerate(free.tolist()):
-        if not problem.n <= j < problem.p or j in known or moments.low[j] == moments.high[j]:
+    most = Effects()
+    for row, of_row in rows:
+        free, states = own_of(np.flatnonzero(moments.phi_scale > 0), row), np.arange(problem.n)[of_row]
+        if not len(free) or moments.count <= len(free):
             continue
-        best = int(np.argmax(certainty[row]))
-        if certainty[row, best] < DETERMINED:
-            found[j] = (best, float(certainty[row, best]))
-    return found
+        target, square = moments.target[np.ix_(free, states)], moments.rate_square[states]
+        inverse = np.linalg.pinv(moments.centre[np.ix_(free, free)], hermitian=True)
+        theta = inverse @ target
+        residual = np.maximum(square - np.einsum("ji,ji->i", theta, target), 1e-14 * square)
+        error = np.outer(np.diagonal(inverse), residual / (moments.count - len(free)))
+        certainty = np.abs(theta) / np.maximum(np.sqrt(np.maximum(error, 0.0)), 1e-300)
+        for j, of in zip(free.tolist(), certainty, strict=True):
+            if problem.n <= j < problem.p and j not in known and moments.low[j] != moments.high[j]:
+                most[j] = max(most.get(j, (0, 0.0)), (int(states[np.argmax(of)]), float(of.max())), key=itemgetter(1))
+    return {j: effect for j, effect in most.items() if effect[1] < DETERMINED}
 
 
-def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tuple[int, float]]:
+def late_controls(problem: Problem, past: Collection[int] = (), rows: Rows = EVERY) -> Effects:
     """Controls that explain the states clearly better when taken some samples earlier."""
     n, p = problem.n, problem.p
     run = np.arange(problem.N) - unbroken_over(problem.order, [], None)  # samples before this one in its stretch
@@ -309,12 +311,15 @@ def late_controls(problem: Problem, past: Collection[int] = ()) -> dict[int, tup
     share = 1 + usable.size * (p + LONGEST_DELAY * (p - n)) // _ENOUGH
     usable = usable[in_stretches(np.arange(usable.size), share, _STRETCH)]
     lagged = np.stack([problem.z[n:, usable - lag] for lag in range(LONGEST_DELAY + 1)])
-    now = problem.z[:n, usable]
-    found = lags(now, lagged, problem.x_next[:, usable] - now, problem.dt[usable])
+    now, dt, found = problem.z[:n, usable], problem.dt[usable], Effects()
+    step = problem.x_next[:, usable] - now
+    for row, states in rows:
+        x, u = own_of(np.arange(n), row), own_of(np.arange(n, p), row) - n
+        found |= {int(u[j]): late for j, late in lags(now[x], lagged[:, u], step[states], dt).items()}
     return {j: late for j, late in found.items() if n + j not in past}
 
 
-def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
+def lags(x: Array, u: Array, increment: Array, dt: Array) -> Effects:
     """Controls that explain the states clearly better some samples earlier.
 
     `x` (n, N): states; `u` (lags + 1, m, N): controls this many samples before; `increment` (n, N): what the states
@@ -330,7 +335,7 @@ def lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int
     return found
 
 
-def _lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[int, float]]:
+def _lags(x: Array, u: Array, increment: Array, dt: Array) -> Effects:
     n, N = x.shape
     longest, m = len(u) - 1, u.shape[1]
     movers = [j for j in range(m) if np.ptp(u[0, j]) > 0]
@@ -359,7 +364,7 @@ def _lags(x: Array, u: Array, increment: Array, dt: Array) -> dict[int, tuple[in
             continue
         # next to a late control the present one adds nothing; if it does, the late one represents past states
         if scores[best] - score([[*undelayed, first + best - 1]])[0] < 0.3 * gain:
-            found[j] = (best, float(1 - np.exp(-gain / n / 2)))
+            found[j] = (best, float(1 - np.exp(-gain / len(increment) / 2)))
     return found
 
 

@@ -28,8 +28,9 @@ from uncertain_lti.model.uncertain_lti import UncertainLTI
 _KEYS = {"state", "from", "nominal", "half_width", "knot", "shared"}
 
 
-Rows = NDArray[np.bool_]
-EVERY = np.ones((1, 1), dtype=bool)
+Rows = Sequence[tuple[NDArray[np.bool_], Any]]
+"""Which of [x; u] rows have, and the states whose rows they are."""
+EVERY: Rows = [(np.ones(1, dtype=bool), slice(None))]
 """Rows that have all of [x; u], however many they are."""
 
 
@@ -38,7 +39,13 @@ def rows_of(model: UncertainLTI) -> Rows:
     if not model.signals.structure:
         return EVERY
     has = np.concatenate([np.abs(model.A) + model.dA, np.abs(model.B) + model.dB], axis=-1) > 0
-    return np.unique(has.reshape(-1, model.n, model.n + model.m).any(axis=0), axis=0)
+    sets, of = np.unique(has.reshape(-1, model.n, model.n + model.m).any(axis=0), axis=0, return_inverse=True)
+    return [(row, np.flatnonzero(of.ravel() == i)) for i, row in enumerate(sets)]
+
+
+def own_of(columns: NDArray[np.intp], row: NDArray[np.bool_]) -> NDArray[np.intp]:
+    """Those of some columns of [x; u; further terms] that a row has."""
+    return columns[(columns >= len(row)) | row[np.minimum(columns, len(row) - 1)]]
 
 
 class Structure:
