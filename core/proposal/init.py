@@ -17,6 +17,7 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from itertools import product, repeat
 
 import numpy as np
@@ -104,8 +105,8 @@ _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 _VARIANCE = re.compile(r"variance|(?<!process)_var(?=\[|$)")  # of an estimate
 
 
-def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[Source]:
-    """Every topic of the recordings with its numbers."""
+def read_sources(bags: Sequence[Recording], progress: Progress | None, asked: Sequence[str] = ()) -> list[Source]:
+    """Every topic of the recordings with its numbers, those of what a person asks for whatever it is called."""
     facts: dict[str, TopicFacts] = {}
     held: dict[str, Counter[str]] = defaultdict(Counter)  # in how many recordings a field is
     for bag in bags:
@@ -125,12 +126,13 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None) -> list[S
                 candidate.unit = of_each.pop() if len(of_each) == 1 else ""
             continue
         stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
+        role = role * (role != "apart" or not any(fnmatchcase(topic, pattern.partition(":")[0]) for pattern in asked))
         source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
         sources.append(source)
         if not fact.info.readable:
             source.reason, source.unreadable = fact.info.reason, True
-        elif source.role == "apart":
-            source.reason = "no signal of a machine by its name or type"
+        elif role == "apart":
+            source.reason = f"not looked at, by its name or type; --states {topic} does"
         elif total < (3 if source.role == "control" else FEWEST):
             source.reason = f"{plural(total, 'message')} only"
         elif not all(_messages(bag, topic) for bag in bags):
@@ -497,7 +499,7 @@ def propose(
         A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
     bags, layout = _opened(paths, table or TableLayout())
-    sources = read_sources(bags, progress)
+    sources = read_sources(bags, progress, (*states, *controls))
     warnings = [warning for bag in bags for warning in bag.warnings]
     # a unit that is taken for granted is written down, so that other recordings are read alike
     taken = {bag.time_unit for bag in bags if isinstance(bag, Table)} - {""}
