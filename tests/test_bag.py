@@ -576,6 +576,9 @@ def test_a_file_that_is_missing_names_those_beside_it(tmp_path: Path) -> None:
     assert "there is no such file or folder; check the path" in error_of(tmp_path / "nix.mcap")
     write(TWO, []).save(tmp_path / "there.mcap")
     assert "there are there.mcap" in error_of(tmp_path / "nix.mcap")
+    (tmp_path / "run_1").mkdir()
+    (tmp_path / "run_1/metadata.yaml").touch()  # of rosbag2 a recording is a folder
+    assert "there are run_1, there.mcap" in error_of(tmp_path / "nix.mcap")
     (tmp_path / "live.mcap.part").touch()
     assert f"or was killed: read {tmp_path / 'live.mcap.part'}" in error_of(tmp_path / "live.mcap")
     for quoted in (tmp_path / "*.mcap", Path("~/nix.mcap")):

@@ -74,8 +74,8 @@ def not_mcap(path: Path, head: bytes) -> BagError:
 
 def missing(path: Path) -> BagError:
     """The error for a path that is not there; names the recordings in the same folder."""
-    inside = path.parent.iterdir() if path.parent.is_dir() else ()
-    there = sorted((p for p in inside if p.suffix in (*SUFFIXES, *TABLES)), key=natural)
+    inside = sorted(path.parent.iterdir(), key=natural) if path.parent.is_dir() else ()
+    there = [p for p in inside if p.suffix in (*SUFFIXES, *TABLES) or (p / "metadata.yaml").exists()]
     hint = f"; in {path.parent} there are {file_names(there)}" if there else "; check the path"
     if str(path).startswith("~") or "*" in path.name:
         hint = "; a shell replaces ~ and * only where they are not in quotes"
