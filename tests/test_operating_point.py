@@ -208,6 +208,14 @@ def test_of_two_end_stops_the_one_at_which_a_recording_begins_is_steady(begins: 
     assert steady == [begins] and words.endswith("with s0 at an end stop") and "give `steady`" not in words
 
 
+def test_where_every_recording_begins_is_rest_though_it_is_an_extreme_value() -> None:
+    """A leg that stands is stretched, and goes one way from there: it was called an end stop, to be replaced."""
+    away = np.linspace(-0.9, 1.2, 60)[:, None]
+    values = np.vstack([rest(-0.9, 40), away, away[::-1], rest(-0.9, 60), away, away[::-1]])
+    steady, _, words = resolve_auto(signals(AUTO), [values])
+    assert steady == [-0.9] and "end stop" not in words
+
+
 def test_a_noisy_signal_beside_one_at_its_end_stop_does_not_hide_it() -> None:
     joint = driven(1.2, held=300, rests=40)
     other = 5.0 + 0.01 * np.sin(np.arange(len(joint)) * 1.7)[:, None]

@@ -184,7 +184,7 @@ def resolve_auto(signals: Sequence[Signal], recordings: Sequence[Array]) -> tupl
         chosen = max(range(len(found)), key=rank)
         still = medians[chosen]
         words = f"{lengths[chosen]} still samples (every signal within {band:.0%} of its range)"
-        if held[longest]:
+        if held[longest] and not rank(longest)[0]:
             names = ", ".join(signals[j].name for j in held[longest])
             at_stop = f"with {names} at an end stop"
             words += f", all of them {at_stop}: give `steady` yourself" * (chosen == longest)
