@@ -122,6 +122,17 @@ def test_the_score_is_over_its_threshold_just_where_the_alarm_is(rules, most):
     assert [p.title for p in chart.panels][1:] == ["x2", "x1"] and chart.panels[0].note  # who did it comes first
 
 
+def test_the_score_names_what_is_farthest_beyond_its_threshold():
+    """`check` named the pressure at 2.4 times its threshold, and the page the speed, at 1.1 times."""
+    zeros, x = np.zeros((2, 2)), np.zeros((40, 2))
+    x[30:] = [0.3, 0.9]
+    rules = [StatisticRule("energy", 0.01, 1.4)]
+    model = UncertainLTI(zeros, zeros[:, :1], zeros, zeros[:, :1], v=[0.2, 0.2], alarm=rules)
+    verdicts = EnvelopeMonitor(model).check(Transient(np.arange(40) * 0.01, x, np.zeros((40, 1))))
+    assert len(verdicts.raised(int(verdicts.alarm.argmax()))) == 2
+    assert "raised by energy of x2" in alarm_chart(model, verdicts, columns_of(verdicts)).panels[0].note
+
+
 def ink(path):
     """Share of the pixels that are not nearly white."""
     return float((np.asarray(Image.open(path).convert("L")) < 230).mean())

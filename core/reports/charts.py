@@ -244,7 +244,7 @@ def alarm_panel(model: UncertainLTI, verdicts: Verdicts, columns: Columns) -> tu
     raised: Sequence[Raised] = ()
     if columns.alarm.any():
         first = int(columns.starts[columns.alarm.argmax()])
-        raised = verdicts.raised(first + int(verdicts.alarm[first:].argmax()))
+        raised = sorted(verdicts.raised(first + int(verdicts.alarm[first:].argmax())), key=lambda by: -abs(by.value))
     return score_panel(columns, score, f"raised by {raised[0].what}; " if raised else ""), states
 
 
