@@ -569,7 +569,7 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
     for j, candidate in enumerate(pool):
         if j not in kept:
             candidate.ready = "state"
-            alone = "the controls do not show in it, and nothing couples it to the states above"
+            alone = "in one step neither the controls nor the states above show in it, nor it in them"
             candidate.reason = room.reason if j in full else alone
     return [pool[j] for j in sorted(kept)]
 
