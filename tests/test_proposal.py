@@ -2313,18 +2313,19 @@ def test_what_an_encoder_says_of_the_speed_is_no_count(tmp_path, name):
     assert "additive: noise" in proposal.text and "how fast it turned" not in proposal.text, proposal.text
 
 
-def test_a_place_a_way_and_a_mode_are_no_states(tmp_path):
+@pytest.mark.parametrize("code", ["c1_mode", "phase", "recipe_step"])
+def test_a_place_a_way_and_a_mode_are_no_states(tmp_path, code):
     """Another drive is elsewhere, and the numbers of a mode are names: neither tells what comes next."""
     rng = np.random.default_rng(3)
     u, mode = np.repeat(rng.normal(size=60), 25), np.repeat(rng.choice([0.0, 9.0, 10.0], size=30), 50)
     speed, lat_g = answers(rng, np.column_stack([u + 0.1 * mode, u])).T
     way = np.round(np.cumsum(np.abs(speed)), 1)
     columns = {"Latitude_Y": 30 + 1e-5 * np.cumsum(speed), "PilotLon": -97 + 1e-5 * np.cumsum(u), "distance_miles": way}
-    columns |= {"Heading": np.cumsum(5 * speed) % 360, "speed": speed, "lat_g": lat_g, "c1_mode": mode, "throttle": u}
+    columns |= {"Heading": np.cumsum(5 * speed) % 360, "speed": speed, "lat_g": lat_g, code: mode, "throttle": u}
     proposal = propose([table_of(tmp_path / "a.csv", columns, 0.05 * np.arange(len(u)))])
     assert [c.path for c in proposal.states] == ["unwrap(Heading, 360)", "speed", "lat_g"], proposal.text
     assert [c.path for c in proposal.controls] == ["throttle"], proposal.text
-    assert "c1_mode" in proposal.text and "a code by its name, and its numbers are no amounts" in proposal.text
+    assert code in proposal.text and "a code by its name, and its numbers are no amounts" in proposal.text
 
 
 @pytest.mark.parametrize(

@@ -505,7 +505,7 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
     return warnings
 
 
-_CODE = re.compile(r"(^|[_.])(mode|status|state|flag|gear)(_?\d+)?$")
+_CODE = re.compile(r"(^|[_.])(mode|modus|status|state|flag|gear|phase|step|schritt)(_?\d+)?$")
 """Name of a number that, with whole numbers up to `_LABELS` of them, says what a machine was switched to."""
 
 
