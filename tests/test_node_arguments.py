@@ -242,6 +242,25 @@ def test_a_middleware_that_does_not_come_down_does_not_keep_the_process(tmp_path
     assert (done.stdout, done.returncode) == ("it ends\n", -signal.SIGALRM), done
 
 
+_SET_BACK = """
+import time
+from rclpy.node import Node
+from uncertain_lti_ros import process
+
+real, began = time.time, time.monotonic()
+time.time = lambda: real() - 3600.0 * (time.monotonic() > began + 1.0)
+with process.living(lambda: Node("set_back")) as life:
+    life.node.create_timer(600.0, print).reset = lambda: print("set again")
+    life.executor.spin_once(timeout_sec=60.0)
+    print("woken" if time.monotonic() < began + 30.0 else "late")
+"""
+
+
+def test_a_system_clock_that_is_set_back_lets_no_timer_and_no_call_wait(tmp_path: Path) -> None:
+    """The wheels of rclpy wait for an instant of that clock, so heartbeat and signals waited for as long as it went."""
+    assert process(tmp_path, _SET_BACK).stdout == "set again\nwoken\n"
+
+
 @pytest.mark.parametrize(
     ("module", "fake", "says"),
     [

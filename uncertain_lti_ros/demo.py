@@ -50,9 +50,7 @@ _DISCOVERY = 1.5  # s in which the programs of a domain find each other
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `uncertain-lti demo`."""
-    parser.add_argument(
-        "--output", "-o", metavar="FOLDER", default="demo-output", help="where model and figure are written"
-    )
+    parser.add_argument("-o", "--output", metavar="FOLDER", default="demo-output", help="where model and figure go")
     parser.add_argument("--rate", type=speed, default=4.0, metavar="R", help="speed of the player (default 4)")
     parser.add_argument("--json", action="store_true", help="print what came out as JSON")
 
@@ -105,15 +103,11 @@ def run(args: argparse.Namespace) -> Result:
         save(figure, output / name)
         say(f"figure: {output / name}")
     data = {
-        "model": str(model_file),
-        "verdicts": len(expected),
-        "equal_live_and_offline": same,
-        "fault": {"t": t, "what": what},
-        "violated_before": early,
-        "violated_after": late,
+        "model": str(model_file), "verdicts": len(expected), "equal_live_and_offline": same,
+        "fault": {"t": t, "what": what}, "violated_before": early, "violated_after": late,
         "first_alarm_t": float(raised[0]) if len(raised) else None,
         "figures": [str(output / name) for name in figures],
-    }
+    }  # fmt: skip
     return Result(DONE if same == len(expected) and in_time else BAD_INPUT, data)
 
 
@@ -123,9 +117,7 @@ def _bags() -> Path:
     for root in (Path(__file__).resolve().parents[1], *(Path(p) / "share/uncertain_lti_ros" for p in prefixes)):
         if (root / "bags" / CHECK).is_file():
             return root / "bags"
-    raise BagError(
-        f"bags/{CHECK} is neither in the folder of the package nor in its share folder; run the demo from a checkout"
-    )
+    raise BagError(f"bags/{CHECK} is neither beside the package nor in its share folder; run it from a checkout")
 
 
 def _watch(life: Life, args: argparse.Namespace, model: Path, bag: Path, expected: Any) -> dict[int, Any]:
@@ -157,9 +149,7 @@ def _watch(life: Life, args: argparse.Namespace, model: Path, bag: Path, expecte
         if not life.until(lambda: life.node.count_publishers(_FLAGS), _PATIENCE):
             if not life.alive:
                 raise KeyboardInterrupt
-            raise UncertainLTIError(
-                f"the envelope_monitor node did not start within {_PATIENCE:g} s; look at its messages above"
-            )
+            raise UncertainLTIError(f"envelope_monitor did not start within {_PATIENCE:g} s; see its messages above")
         with _process(player) as playing:
             heard = time.monotonic()
             life.until(over)

@@ -35,15 +35,11 @@ PARAMETERS = {
     "plant": (
         Declared("steps", 1200, "Samples to publish.", True, 2, 10**9),
         Declared("seed", 1, "Seed of the pulses and of the draws.", True, 0, 10**9),
-        Declared(
-            "fault_at", -1, "Sample from which on the matrices leave their intervals; -1: never.", True, -1, 10**9
-        ),
+        Declared("fault_at", -1, "First sample whose matrices leave their intervals; -1: none.", True, -1, 10**9),
         *_PACE,
     ),
     "turbofan": (
-        Declared(
-            "manoeuvre", "levels", "pulses (open loop), check (lever 68 to 60 deg) or levels (lever in between).", True
-        ),
+        Declared("manoeuvre", "levels", "pulses (open loop), check (lever 68 to 60 deg) or levels (between).", True),
         Declared("amplitude", 0.0, "Of the pulses, over the scale of each control; only for pulses.", True, -1.0, 1.0),
         Declared("noise", 0.0, "Standard deviation of each reading, over its scale.", True, 0.0, 1.0),
         Declared("seed", 0, "Seed of the noise.", True, 0, 10**9),
@@ -51,9 +47,7 @@ PARAMETERS = {
         Declared("fault_at", 24.0, "Onset of the fault, s after the first sample.", True, 0.0, 1e6),
         Declared("samples", 0, "Samples to publish; 0: the usual number of the manoeuvre.", True, 0, 10**9),
         *_PACE,
-        Declared(
-            "simulated_time", True, "Stamps of a simulated clock, the same in every run; false: from now on.", True
-        ),
+        Declared("simulated_time", True, "Simulated stamps, the same in every run; false: from now on.", True),
     ),
 }
 

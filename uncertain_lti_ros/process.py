@@ -18,6 +18,7 @@ import re
 import signal
 import sys
 import textwrap
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -272,6 +273,7 @@ def hold_overrides(node: Node, args: Sequence[str]) -> None:
 
 _LATENCY = 0.1  # s that a signal waits at most
 _SPIN = 30.0  # s between two checks whether rclpy has been shut down from elsewhere
+_LOOK = 0.5  # s between two looks at the system's clock
 _PAUSE = 0.01  # s after an error, which may occur again at once
 _LAST = 20  # s that taking the middleware down may take after a signal
 
@@ -300,6 +302,18 @@ class Life:
             self.executor = SingleThreadedExecutor()
             self.executor_name = "default executor (messages that arrive together may swap)"
         self.executor.add_node(node)
+        threading.Thread(target=self._watch_clock, name="clock", daemon=True).start()
+
+    def _watch_clock(self) -> None:
+        """Set the timers again after the system's clock was set back: rclpy's wheels wait for an instant of it."""
+        while self.alive:
+            before = time.time() - time.monotonic()
+            time.sleep(_LOOK)
+            if time.time() - time.monotonic() < before - _LATENCY:
+                with suppress(InvalidHandle):  # one that was just destroyed
+                    for timer in [*self.node.timers]:
+                        timer.reset()
+                    self.executor.create_task(bool)  # what a call waits for, to wake it too
 
     @property
     def alive(self) -> bool:
