@@ -395,6 +395,41 @@ def test_two_simulated_clocks_at_once_are_told(bench: StartBench) -> None:
     on.diagnostics.reaches(STALE, saying="2 publishers send /clock, and time jumps between them; stop all but one")
 
 
+def test_what_comes_before_the_first_simulated_time_is_no_sample(world: World, tmp_path: Path) -> None:
+    """It was a sample at 0 s, which the first one of a simulation that begins there was judged from."""
+    model = by_hand("log")
+    process = world.monitor(saved(model, tmp_path), use_sim_time=True, state_timeout=0.5)
+    flags = world.listen(JointState, f"{NODE}/flags").connected()
+    clock, power, voltage = (
+        world.publisher(Clock, "/clock"),
+        *(world.publisher(Float64, n) for n in model.signals.topics),
+    )
+    world.subscribed(clock, power, voltage)
+    tick = Clock()
+    for k in range(40):
+        if k >= 20:
+            tick.clock.nanosec = (k - 19) * STEP_NS
+            clock.publish(tick)
+        voltage.publish(Float64(data=float(model.operating_point.u_s[0])))
+        power.publish(Float64(data=float(model.operating_point.x_s[0]) + 9.0 * (k < 20)))
+        if k == 19:
+            process.says(
+                "messages on /power are dropped (no stamp): no time has come on /clock; start what publishes it"
+            )
+            assert "more seldom" not in process.output and not flags.messages
+        time.sleep(0.005)
+    got = flags.count(20)
+    assert [stamp_of(m) for m in got] == [(k + 1) * STEP_NS for k in range(20)]
+    np.testing.assert_array_equal([m.position[0] for m in got], [float("nan"), *[0] * 19])
+
+
+def test_before_the_first_simulated_time_no_stamp_lies_in_the_future(bench: StartBench) -> None:
+    on = bench(use_sim_time=True)
+    on.plant.send(5)
+    on.flagged(5)
+    assert on.world.status()["future"] == {}
+
+
 def test_a_node_that_was_busy_takes_each_message_at_its_simulated_time(world: World, tmp_path: Path) -> None:
     """rclpy keeps the last tick alone: all that had come meanwhile was of one instant."""
     model = by_hand("log")

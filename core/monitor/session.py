@@ -189,7 +189,7 @@ class Session(Stream):
         found += [why_not(kind, self.model) for kind in kinds if since[counted.get(kind, kind.value)]]
         dropped = [status.value for status in Status if status.dropped and since[status.value]]
         if dropped:
-            coarse = self.coarse_clock(since[Status.EQUAL.value])
+            coarse = self.coarse_clock(since[Status.EQUAL.value], since[Status.UNSTAMPED.value])
             found.append(f"messages on {clock} are dropped ({', '.join(dropped)}){coarse}")
         found += [f"{topic}: a message {self.why_unreadable[topic]}" for topic in sorted(self.unreadable - unreadable)]
         found = found or self.absent(self.model.signals)
@@ -259,11 +259,12 @@ class Session(Stream):
                     found[signal.topic] = FieldPath(signal.field).absent(reader.decode(data))
         return [f"{topic}: {why}" for topic, why in found.items() if why]
 
-    def coarse_clock(self, equal: int) -> str:
-        """What to do about equal stamps, if there are any, where they are times of receipt by a simulated clock."""
-        if not equal or self.model.signals.time.get(self.sampler.clock) != "log":
+    def coarse_clock(self, equal: int, none: int = 0) -> str:
+        """What to do about equal times of receipt by a simulated clock, or before it has any; empty of stamps."""
+        if not equal + none or self.model.signals.time.get(self.sampler.clock) != "log":
             return ""
-        return ": /clock moves more seldom than they come; play with --clock, or by ros2 bag with --clock-topics-all"
+        often = "/clock moves more seldom than they come; play with --clock, or by ros2 bag with --clock-topics-all"
+        return f": {often if equal else 'no time has come on /clock; start what publishes it'}"
 
     def rule_text(self) -> str:
         """The rules of the alarm in words."""

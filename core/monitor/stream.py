@@ -379,12 +379,15 @@ class Stream:
         if reader.strange:
             self._pass_over(topic, heard)
             return _NOTHING, False
-        if stamp_ns is not None and stamp_ns > arrival_ns + _FUTURE_NS:
+        if stamp_ns is not None and 0 < arrival_ns < stamp_ns - _FUTURE_NS:  # 0: before the first tick of /clock
             self.future[topic] += 1
             self.period.future += 1
         sampler = self.sampler
         if topic != sampler.clock:
             sampler.push(topic, arrival_ns, stamp_ns, values)  # decides nothing
+            return _NOTHING, False
+        if not arrival_ns and self.model.signals.time[topic] == "log":  # as `record` leaves it out
+            sampler.counters[Status.UNSTAMPED.value] += 1
             return _NOTHING, False
         samples = sampler.number
         verdicts = []
