@@ -77,6 +77,9 @@ def two_at_once(messages: list[Message]) -> list[Message]:
 DELAYS: dict[str, Callable[[list[Message]], list[Message]]] = {  # of others `perturbed.held_up_on_the_way` has any
     "two samples come at once, their states less so": two_at_once,
     "stopped, then in parts": in_parts,
+    "stopped, and a pause amid the controls": lambda m: held_up(
+        stopped(m, 5.01, 16, STATE_TOPIC), CONTROL_TOPIC, 9.0145, 10.4
+    ),
     "stopped, and controls 3 s later": lambda m: held_up(stopped(m, 5.01, 16, STATE_TOPIC), CONTROL_TOPIC, 5.01, 12.0),
 }
 

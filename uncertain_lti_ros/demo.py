@@ -58,8 +58,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> Result:
     """Run the demo."""
     say, bags = args.say, _bags()
-    output = Path(args.output)
-    output.mkdir(parents=True, exist_ok=True)
+    (output := Path(args.output)).mkdir(parents=True, exist_ok=True)
     model_file = output / "turbofan.model.json"
 
     say("1. Fitting a healthy turbofan (a nonlinear model with noisy sensors): pulses of every control both ways,")

@@ -58,7 +58,8 @@ class _Way:
         if len(self._lately) < 2 or self._lately[-1][2] < least + LATE:
             return True
         (before, first, _), (last, sent, _) = self._lately[-2], self._lately[-1]
-        return (last - before) * _BURST >= (sent - first) * 1e-9
+        apart = (sent - first) * 1e-9
+        return apart / _BURST <= last - before <= apart + LATE  # after a longer pause more is behind it
 
     def ahead_ns(self, now: float) -> int:
         """By how much the clock of the sender is behind, ns: messages are on the way for long, and all as long."""
