@@ -11,6 +11,7 @@
 
 import math
 import re
+import shutil
 import struct
 from itertools import combinations, permutations, product
 from pathlib import Path
@@ -202,14 +203,26 @@ def test_a_command_that_one_recording_lacks_is_told_by_name(tmp_path):
     assert str(paths[1]) in warning and str(paths[0]) not in warning and "leave those recordings out" in warning
 
 
-def test_no_more_is_read_than_memory_holds(tmp_path, monkeypatch):
-    """The command and the first of two states fit the limit."""
+def test_no_more_is_looked_at_than_memory_holds_and_every_number_is(tmp_path, monkeypatch):
+    """Of more, some of the recordings, or a part of the one: every number but the first ones was passed over."""
     import uncertain_lti.proposal.init as module
 
-    monkeypatch.setattr(module, "MOST_VALUES", 900)
-    proposal = proposed(tmp_path, driven(extra=beside("/plant/z_state", lambda x, u: 2 * x)))[1]
-    assert signals_of(proposal) == ([("/plant/state", "data")], [("/plant/cmd", "data")])
-    assert "too large" in proposal.text
+    path, whole = proposed(tmp_path, driven(extra=beside("/plant/z_state", lambda x, u: 2 * x)))
+    paths = [path, *(shutil.copy(path, tmp_path / f"{k}.mcap") for k in range(3))]
+    numbers = 3 * len(whole.states[0].values[0])
+    for most, of, looked_at in (
+        (0.5 * numbers, paths[:1], "the middle 50% of run.mcap"),
+        (2.5 * numbers, paths, "2 of 4 recordings"),
+        (9 * numbers, paths, ""),
+    ):
+        monkeypatch.setattr(module, "MOST_VALUES", most)
+        proposal = propose(of)
+        assert signals_of(proposal) == signals_of(whole) and len(proposal.states) == 2
+        assert looked_at in " ".join(proposal.warnings) and ("were looked at" in str(proposal.warnings)) == bool(
+            looked_at
+        )
+        taken = sum(map(len, proposal.states[0].values)) * 3
+        assert min(most, len(of) * numbers) * 0.7 < taken <= most + 9
 
 
 # --- made up ones -----------------------------------------------------------------------------------------------

@@ -139,7 +139,7 @@ def test_of_many_large_tables_the_numbers_of_most_are_held_only_while_they_are_r
     assert not held() and all(bag.topics["/table"].count == len(shipped) for bag in bags)
     for bag in bags:
         found = bag.columns(["/table"], paths)
-        assert found.arrival.tobytes() == shipped.t_ns.tobytes() and not held()
+        assert found.arrival.tobytes() == shipped.t_ns.tobytes() and len(held()) == 3  # of one of them
         assert found.values[0][:-1].tobytes() == rows_of(shipped)[:-1].tobytes()
 
 

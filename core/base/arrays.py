@@ -74,6 +74,11 @@ def in_stretches(place: NDArray[np.intp], share: int, length: int) -> NDArray[np
     return np.asarray(place // length % share == 0)
 
 
+def spread(count: int) -> list[int]:
+    """Places in such an order that the first ones, however many, are spread over all."""
+    return sorted(range(count), key=lambda i: int(f"{i:064b}"[::-1], 2))
+
+
 def runs(flags: Mask) -> list[tuple[int, int]]:
     """[start, stop) of every run of true values."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(np.int8)))

@@ -23,7 +23,7 @@ from itertools import product, repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from uncertain_lti.base.arrays import Array
+from uncertain_lti.base.arrays import Array, spread
 from uncertain_lti.base.errors import BagError, absent
 from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.proposal.candidates import (
@@ -36,7 +36,6 @@ from uncertain_lti.proposal.candidates import (
     ask_for,
     at_rest,
     bare,
-    is_label,
     part_by_role,
     role_by_name,
     role_of_column,
@@ -45,7 +44,7 @@ from uncertain_lti.proposal.candidates import (
 )
 from uncertain_lti.proposal.choosing import assign_roles, choose
 from uncertain_lti.proposal.members import all_of_them, moves_per
-from uncertain_lti.proposal.process_data import ALWAYS, WEATHER, is_plant, plant_signals
+from uncertain_lti.proposal.process_data import ALWAYS, WEATHER, in_words, is_plant, plant_signals, run_column
 from uncertain_lti.proposal.signals_file import (
     ATTITUDE,
     as_unwatched,
@@ -61,10 +60,10 @@ from uncertain_lti.proposal.signals_file import (
     words_of,
 )
 from uncertain_lti.recordings.formats import group_recordings
-from uncertain_lti.recordings.recording import Progress, Recording, TopicFacts
-from uncertain_lti.recordings.table import Table, names_signals
+from uncertain_lti.recordings.recording import Columns, Progress, Recording, TopicFacts
+from uncertain_lti.recordings.table import Table
 from uncertain_lti.recordings.table_text import QUALITY, rated
-from uncertain_lti.recordings.table_times import called_time, may_be
+from uncertain_lti.recordings.table_times import called_time
 from uncertain_lti.sampling.steady_state import codes, shared_codes
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.values import TABLE, TableLayout
@@ -76,13 +75,7 @@ LONGEST_ARRAY = 35
 DUST = 1e-9
 """Range of a number of a ROS message, in its SI unit, below which no sensor tells it: of a simulated joint at rest."""
 MOST_VALUES = 50_000_000
-"""Numbers read at most; fields beyond are listed and not looked at."""
-
-
-_RUN = re.compile(
-    r"(^|_)(run|trial|episode|experiment|exp|test|group|session|rollout|flight|lap|trajectory|traj|unit)s?"
-    r"(_?(id|no|nr|num|number|index|idx))?$"
-)  # name of a column that says which run a row is of
+"""Numbers looked at, about; of more, some recordings or a part of one."""
 
 
 _CLOCK = {"time", "timestamp", "stamp", "clock", "tow", "utc", "epoch", "sec", "secs", "seconds"}  # words in its name
@@ -96,8 +89,6 @@ _COUNTER = {"count", "counter", "cycle", "cycles", "frame", "id", "seq"}  # like
 _COMPUTED = {"err", "error", "average", "avg", "mean", "sum", "total", "diff", "difference", "deviation"}
 _PLACE = re.compile(r"latitude|longitude|(^|_)(lat|lon|lng)$")  # column of a place on the map
 _APART = "not in every recording"
-MOST_WORDS, _SWITCHED = 8, 0.1
-"""Words of a column that is switched, and share of the rows in which it is, at most."""
 _FILL = "fill the empty cells with the number above"
 
 
@@ -105,8 +96,10 @@ _SPREAD = re.compile(r"\[(\d+)\.\.(\d+)\]")
 _VARIANCE = re.compile(r"variance|(?<!process)_var(?=\[|$)")  # of an estimate
 
 
-def read_sources(bags: Sequence[Recording], progress: Progress | None, asked: Sequence[str] = ()) -> list[Source]:
-    """Every topic of the recordings with its numbers, those of what a person asks for whatever it is called."""
+def read_sources(
+    bags: Sequence[Recording], progress: Progress | None, asked: Sequence[str] = ()
+) -> tuple[list[Source], list[str]]:
+    """Every topic of the recordings with its numbers, those of what a person asks for whatever it is called; notes."""
     facts: dict[str, TopicFacts] = {}
     held: dict[str, Counter[str]] = defaultdict(Counter)  # in how many recordings a field is
     for bag in bags:
@@ -145,16 +138,16 @@ def read_sources(bags: Sequence[Recording], progress: Progress | None, asked: Se
                 source.reason = "no number in it"
             elif role in ("state", ""):
                 sources += part_by_role(source)
-    _limit(bags, sources)
-    for bag in bags:
-        _read(bag, [s for s in sources if s.candidates], progress)
+    some, share, said = _looked_at(bags, sources)
+    for bag in some:
+        _read(bag, [s for s in sources if s.candidates], share, progress)
     for source in sources:
         source.halting |= len({bool((stamp > 0).any()) for stamp in source.stamp}) > 1
         if source.candidates and not source.rate > 0:
             source.reason, source.candidates = "no time passes between its messages", []
         elif source.candidates:
             _sift(source)
-    return sources
+    return sources, [said] * bool(said)
 
 
 def _messages(bag: Recording, topic: str) -> int:
@@ -166,50 +159,13 @@ def moving_numbers(bag: Recording, progress: Progress | None) -> tuple[list[tupl
 
     Returns (messages,): topic, path, time of arrival in s after the first message of them all, and values.
     """
-    sources = read_sources([bag], progress)
+    sources, left = read_sources([bag], progress)
     chosen = [(s, c) for s in sources if not s.reason for c in s.candidates if not c.reason]
     start = min((int(s.arrival[0][0]) for s, _ in chosen), default=0)
     found = [(s.topic, c.path, np.multiply(s.arrival[0] - start, 1e-9), c.values[0]) for s, c in chosen]
-    left = [f"{s.topic}: {s.reason}" for s in sources if s.reason]
+    left += [f"{s.topic}: {s.reason}" for s in sources if s.reason]
     left += [f"{s.topic} {c.path}: {c.reason}" for s in sources if not s.reason for c in s.candidates if c.reason]
     return found, left
-
-
-def run_column(bags: Sequence[Recording]) -> str:
-    """Column of tables that tells the runs in one file apart."""
-    tables = [bag for bag in bags if isinstance(bag, Table)]
-    names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
-    found = {name: min(_runs_told(table, name) for table in tables) for name in names}
-    told = [name for name, runs in found.items() if runs]  # of a repetition of a load at a speed, the repetition
-    return max(told, key=lambda name: (_RUN.search(name.lower()) is not None, found[name]), default="")
-
-
-def _in_words(bags: Sequence[Recording], runs: str | None) -> dict[str, list[str]]:
-    """Columns of tables in which a few words change in most recordings, as of a status; the words, the usual first."""
-    found: dict[str, list[Counter[str]]] = {}
-    for table in (bag for bag in bags if isinstance(bag, Table)):
-        for name, column in table.columns_by_field.items():
-            rarely = column.dtype.kind == "O" and np.count_nonzero(column[1:] != column[:-1]) <= _SWITCHED * len(column)
-            if rarely and name != runs and not is_label(name) and not may_be(column):
-                found.setdefault(name, []).append(Counter(cell for row in column if (cell := str(row or "").strip())))
-    words = {name: [word for word, _ in sum(each, Counter()).most_common()] for name, each in found.items()}
-    changing = (name for name, each in found.items() if 2 * sum(len(of) > 1 for of in each) >= len(bags))
-    return {name: words[name] for name in changing if len(words[name]) <= MOST_WORDS}
-
-
-def _runs_told(table: Table, name: str) -> int:
-    column = table.columns_by_field.get(name)
-    if column is None or column.ndim != 1 or column.dtype.kind == "M" or len(column) < 2 * FEWEST:
-        return 0
-    if column.dtype.kind == "f" and not (column == np.rint(column)).all():
-        return 0
-    changes = 1 + np.flatnonzero(column[1:] != column[:-1])
-    runs = len(changes) + 1
-    if not 2 <= runs <= len(column) // FEWEST or len(set(column[[0, *changes]].tolist())) < runs:
-        return 0
-    of_signals = names_signals(name) and not all(topic.readable for topic in table.topics.values())
-    anew = not of_signals and (np.diff(table.times)[changes - 1] < 0).all()
-    return runs if _RUN.search(name.lower()) or anew else 0
 
 
 def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Source]:
@@ -228,15 +184,16 @@ def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Sou
     return sources
 
 
-def _limit(bags: Sequence[Recording], sources: Sequence[Source]) -> None:
-    """Look at no more numbers than memory holds: commands first, then states, from the first field on."""
-    order = ("control", "state", "reference", "")
-    left = MOST_VALUES
-    for source in sorted((s for s in sources if s.candidates), key=lambda s: order.index(s.role)):
-        for candidate in source.free:
-            left -= max(1, sum(_messages(bag, source.topic) for bag in bags))
-            if left < 0:
-                candidate.reason = "not looked at, the recordings are too large: propose from a shorter one"
+def _looked_at(bags: Sequence[Recording], sources: Sequence[Source]) -> tuple[Sequence[Recording], float, str]:
+    """Recordings with as many numbers as memory is for, spread over all, the share of their time, and what to say."""
+    each = [sum(len(s.free) * _messages(bag, s.topic) for s in sources) for bag in bags]
+    order, taken = spread(len(bags)), 1
+    while taken < len(bags) and sum(each[i] for i in order[: taken + 1]) <= MOST_VALUES:
+        taken += 1
+    some, share = [bags[i] for i in sorted(order[:taken])], min(1.0, MOST_VALUES / max(each[order[0]], 1))
+    part = f"the middle {share:.0%} of {some[0].path.name}" if share < 1.0 else f"{taken} of {len(bags)} recordings"
+    said = f"of more numbers than memory is for, those of {part} were looked at"
+    return some, share, said * (taken < len(bags) or share < 1.0)
 
 
 def _candidates(source: Source, fields: Sequence[str]) -> list[Candidate]:
@@ -254,12 +211,18 @@ def _candidates(source: Source, fields: Sequence[str]) -> list[Candidate]:
     return found
 
 
-def _read(bag: Recording, sources: Sequence[Source], progress: Progress | None) -> None:
-    """Values of every candidate in one recording."""
+def _read(bag: Recording, sources: Sequence[Source], share: float, progress: Progress | None) -> None:
+    """Values of every candidate in one recording, or in the middle of it, such a share of its time."""
+    ends = [t for s in sources for t in (bag.topics[s.topic].first, bag.topics[s.topic].last) if t is not None]
     for source in sources:
         readable = [c for c in source.candidates if not c.reason]
         paths = [FieldPath(c.path) for c in readable]
         columns = bag.columns([source.topic], [paths], progress)
+        if share < 1.0:
+            middle = np.abs(2 * (columns.arrival - min(ends)) - np.ptp(ends)) <= share * np.ptp(ends)
+            of = (array[middle] for array in (columns.topic, columns.arrival, columns.stamp, columns.values[0]))
+            topic, arrival, stamp, values = of
+            columns = Columns(topic, arrival, stamp, [values])
         stamps = columns.stamp[columns.stamp >= 0]
         if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(columns.arrival) - 1):
             source.halting = True
@@ -499,8 +462,8 @@ def propose(
         A recording cannot be read, or holds nothing that could be a state, or nothing that was asked for.
     """
     bags, layout = _opened(paths, table or TableLayout())
-    sources = read_sources(bags, progress, (*states, *controls))
-    warnings = [warning for bag in bags for warning in bag.warnings]
+    sources, warnings = read_sources(bags, progress, (*states, *controls))
+    warnings += [warning for bag in bags for warning in bag.warnings]
     # a unit that is taken for granted is written down, so that other recordings are read alike
     taken = {bag.time_unit for bag in bags if isinstance(bag, Table)} - {""}
     layout = TableLayout.from_dict(layout.to_dict() | {"unit": taken.pop()}, "table") if len(taken) == 1 else layout
@@ -560,7 +523,7 @@ def _opened(paths: Sequence[str | os.PathLike[str]], layout: TableLayout) -> tup
     if not layout.runs and (runs := run_column(bags)):
         layout = replace(layout, runs=runs)
         bags = group_recordings(list(paths), layout=layout)
-    if layout.words is None and (words := _in_words(bags, layout.runs)):
+    if layout.words is None and (words := in_words(bags, layout.runs)):
         layout = replace(layout, words=words)
         bags = group_recordings(list(paths), layout=layout)
     return bags, layout

@@ -11,17 +11,32 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from uncertain_lti.base.arrays import Array
 from uncertain_lti.identification.evidence import FASTEST, held_for
-from uncertain_lti.proposal.candidates import FEWEST, READ, SHOWS, TWO_VALUES, Candidate, Source, Steps, steps_of
+from uncertain_lti.proposal.candidates import (
+    FEWEST,
+    READ,
+    SHOWS,
+    TWO_VALUES,
+    Candidate,
+    Source,
+    Steps,
+    is_label,
+    steps_of,
+)
 from uncertain_lti.proposal.choosing import drop_copies
 from uncertain_lti.proposal.signals_file import set_own_scale
+from uncertain_lti.recordings.recording import Recording
+from uncertain_lti.recordings.table import Table, names_signals
 from uncertain_lti.recordings.table_text import field_name
+from uncertain_lti.recordings.table_times import may_be
 from uncertain_lti.signals.field_path import FieldPath
 from uncertain_lti.signals.values import TABLE
 
@@ -42,6 +57,54 @@ GATED = 0.99
 """Share of the rows in which a flow is 0 when, and only when, its pump or valve is off."""
 _WEATHER = re.compile(r"(^|_)(outdoor|outside|ambient|wea(ther|bus_|sta_))(?!.*(coil|damper|fan|flow|pump|unit|valve))")
 _TURNED = re.compile(r"(^|_)(x?mv|valve|pump|damper|vfd|setpoint|sp|op)(_|\d|$)")
+
+_RUN = re.compile(
+    r"(^|_)(run|trial|episode|experiment|exp|test|group|session|rollout|flight|lap|trajectory|traj|unit)s?"
+    r"(_?(id|no|nr|num|number|index|idx))?$"
+)  # name of a column that says which run a row is of
+MOST_WORDS, _SWITCHED = 8, 0.1
+"""Words of a column that is switched, and share of the rows in which it is, at most."""
+
+
+def run_column(bags: Sequence[Recording]) -> str:
+    """Column of tables that tells the runs in one file apart."""
+    tables = [bag for bag in bags if isinstance(bag, Table)]
+    names = tables[0].columns_by_field if tables and len(tables) == len(bags) else ()
+    told = dict.fromkeys(names, math.inf)
+    for table in tables:
+        if not told:  # and the next one need not be opened
+            break
+        told = {name: least for name, most in told.items() if (least := min(most, _runs_told(table, name)))}
+    # of a repetition of a load at a speed, the repetition
+    return max(told, key=lambda name: (_RUN.search(name.lower()) is not None, told[name]), default="")
+
+
+def in_words(bags: Sequence[Recording], runs: str | None) -> dict[str, list[str]]:
+    """Columns of tables in which a few words change in most recordings, as of a status; the words, the usual first."""
+    found: dict[str, list[Counter[str]]] = {}
+    for table in (bag for bag in bags if isinstance(bag, Table)):
+        for name, column in table.columns_by_field.items():
+            rarely = column.dtype.kind == "O" and np.count_nonzero(column[1:] != column[:-1]) <= _SWITCHED * len(column)
+            if rarely and name != runs and not is_label(name) and not may_be(column):
+                found.setdefault(name, []).append(Counter(cell for row in column if (cell := str(row or "").strip())))
+    words = {name: [word for word, _ in sum(each, Counter()).most_common()] for name, each in found.items()}
+    changing = (name for name, each in found.items() if 2 * sum(len(of) > 1 for of in each) >= len(bags))
+    return {name: words[name] for name in changing if len(words[name]) <= MOST_WORDS}
+
+
+def _runs_told(table: Table, name: str) -> int:
+    column = table.columns_by_field.get(name)
+    if column is None or column.ndim != 1 or column.dtype.kind == "M" or len(column) < 2 * FEWEST:
+        return 0
+    if column.dtype.kind == "f" and not (column == np.rint(column)).all():
+        return 0
+    changes = 1 + np.flatnonzero(column[1:] != column[:-1])
+    runs = len(changes) + 1
+    if not 2 <= runs <= len(column) // FEWEST or len(set(column[[0, *changes]].tolist())) < runs:
+        return 0
+    of_signals = names_signals(name) and not all(topic.readable for topic in table.topics.values())
+    anew = not of_signals and (np.diff(table.times)[changes - 1] < 0).all()
+    return runs if _RUN.search(name.lower()) or anew else 0
 
 
 def is_plant(sources: Sequence[Source]) -> bool:

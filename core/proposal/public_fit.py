@@ -18,6 +18,7 @@ from typing import Any, Literal
 
 from numpy.typing import ArrayLike
 
+from uncertain_lti.base.arrays import spread
 from uncertain_lti.base.errors import FitError, SignalError
 from uncertain_lti.base.text import plural
 from uncertain_lti.identification import fitting
@@ -329,10 +330,9 @@ def _check_alarm(alarm: str | Sequence[Rule], false_alarms: float | None) -> Non
 
 def _some(bags: Sequence[Recording], signals: SignalMap) -> list[Transient]:
     """Recordings spread over the whole row, with SAMPLE numbers together."""
-    order = sorted(range(len(bags)), key=lambda i: int(f"{i:064b}"[::-1], 2))
     found: dict[int, Transient] = {}
     left = SAMPLE
-    for i in order:
+    for i in spread(len(bags)):
         (run,) = read_transients(bags[i].parts if len(bags[i].parts) > 1 else bags[i].path, signals)
         size = run.x.size + run.u.size + run.s.size
         if size > left and found:

@@ -22,7 +22,8 @@ from dataclasses import replace
 from itertools import pairwise, product
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
+from weakref import WeakSet
 
 import numpy as np
 
@@ -63,6 +64,7 @@ _NAMES = re.compile(rf"(?i)(.*[\W_])?(name|{_OF_SIGNALS})")
 _VALUES = re.compile(r"(?i)_?((var|tag)?[\W_]*value|val|payload|reading|wert)")
 _TOGETHER = 0.9  # of the times, that have a number of each signal
 _HELD = 500_000_000  # bytes of several tables; those that follow are read anew when their numbers are asked for
+_NUMBERS = "times", "columns_by_field", "_rows"
 
 
 def is_table(path: Path) -> bool:
@@ -81,10 +83,12 @@ class Table(Recording):
     `path`: file; or one run in it, `FILE[run]`; `layout`: which columns are time and run; `time_unit`: if guessed.
     """
 
+    _reopened: ClassVar[WeakSet[Table]] = WeakSet()  # the last one, if any
+
     def __init__(self, path: Path, layout: TableLayout | None = None, run: _Run | None = None) -> None:
         layout = layout or TableLayout()
         file, raw, (time, times, words, self.time_unit), rows = run or _one_run(path, layout)
-        self.path, self.parts, self.layout, self._kept = path, (file,), layout, True
+        self.path, self.parts, self.layout = path, (file,), layout
         self.size = file.stat().st_size
         of_file = [*raw.notes, *([words] if words else [])]
         apart = {time, *([find_column(file, layout.runs, list(raw.columns), "the runs")] if layout.runs else [])}
@@ -160,18 +164,22 @@ class Table(Recording):
         return Table, (self.path, self.layout)
 
     def let_go(self) -> None:
-        """Of the numbers, which are read again whenever they are asked for."""
-        self._kept = False
-        del self.times, self.columns_by_field, self._rows
+        """Of the numbers, which are read again when they are asked for, and held until those of another table are."""
+        for name in _NUMBERS:
+            vars(self).pop(name, None)
+        Table._reopened.discard(self)
         return_memory()
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name):
-            if name not in ("times", "columns_by_field", "_rows"):
+            if name not in _NUMBERS:
                 raise AttributeError(name)
-            again = Table(self.path, self.layout)
-            self.times, self.columns_by_field, self._rows = again.times, again.columns_by_field, again._rows
+            for other in [*Table._reopened]:
+                other.let_go()
+            again = vars(Table(self.path, self.layout))
+            vars(self).update((number, again[number]) for number in _NUMBERS)
+            Table._reopened.add(self)
             return getattr(self, name)
 
     def type_fields(self, topic: str) -> TypeFields:
@@ -205,10 +213,7 @@ class Table(Recording):
         if progress is not None:
             for _ in progress(range(len(rows)), len(rows)):
                 pass
-        found = Columns(of, self.times[rows], np.full(len(rows), -1, dtype=np.int64), values)
-        if not self._kept:
-            self.let_go()
-        return found
+        return Columns(of, self.times[rows], np.full(len(rows), -1, dtype=np.int64), values)
 
     def facts(self, progress: Progress | None = None) -> list[TopicFacts]:
         """Rate, gaps and columns."""
