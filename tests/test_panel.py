@@ -421,10 +421,13 @@ def test_a_monitor_that_sees_large_jumps_alone_is_not_praised(learnt, shares, ki
     found = worth(full, replace(panel, biases=span * shares, unlike=()))
     assert found[0] == kind and found[1].startswith(words)
     assert "large" in words or "large" not in found[1]
-    if kind == "good":  # where most of the recordings would alarm at thresholds of the others
-        panel = replace(panel, biases=span * shares, unlike=())
-        panel.__dict__["reached"] = np.full(panel.units, 2.0)
-        assert worth(full, panel)[0] == "some" and "expect an alarm in most" in worth(full, panel)[1]
+    if kind == "good":  # where a third of the recordings, or most, would alarm at thresholds of the others
+        panel, units = replace(panel, biases=span * shares, unlike=()), panel.units
+        third = -(-units // 3)
+        for alarming, said in ((third - 1, ""), (third, f"in {third} of {units} healthy"), (units, "in most healthy")):
+            panel.__dict__["reached"] = np.where(np.arange(units) < alarming, 2.0, 0.5)
+            assert panel.alarming == alarming and worth(full, panel)[0] == ("some" if said else "good")
+            assert f"expect an alarm {said}" * bool(said) in worth(full, panel)[1]
 
 
 def one_noisier(seed: int, noisier: int, states: int = 12) -> Transient:

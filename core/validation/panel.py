@@ -550,8 +550,9 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
             "worth having while the machine runs as in the one recording, which says nothing of another day: "
             f"{further}; {sees}"
         )
-    if 2 * panel.alarming > panel.units:
-        return "some", f"worth having, but expect an alarm in most healthy recordings: {sees}"
+    if 3 * panel.alarming >= panel.units:
+        often = "most" if 2 * panel.alarming > panel.units else f"{panel.alarming} of {panel.units}"
+        return "some", f"worth having, but expect an alarm in {often} healthy recordings: {sees}"
     return "good", f"worth having: {sees}"
 
 
