@@ -1473,10 +1473,8 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
         assert signals_of(proposal) == ([("/table", c) for c in more.replace("*", "AC")], [("/table", "B")])
     proposal = propose([table], controls=["/table:B"])  # one column of what is measured leaves the others there
     assert signals_of(proposal) == ([("/table", "A"), ("/table", "C")], [("/table", "B")])
-    path = save(
-        tmp_path / "car.mcap", driven(("/battery/state", "/battery/cmd")), {}
-    )  # a name that says: of no machine
-    refuses(BagError, "--states /battery/state does", propose, [path])
+    path = save(tmp_path / "car.mcap", driven(("/battery/state", "/battery/cmd")), {})  # called as of no machine
+    refuses(BagError, "by its name or type; if it is one, name it in --states", propose, [path])
     proposal = propose([path], states=["/battery/state"], controls=["/battery/cmd"])
     assert signals_of(proposal) == ([("/battery/state", "data")], [("/battery/cmd", "data")])
     path = tmp_path / "run.mcap"

@@ -125,7 +125,7 @@ def read_sources(
         if not fact.info.readable:
             source.reason, source.unreadable = fact.info.reason, True
         elif role == "apart":
-            source.reason = f"not looked at, by its name or type; --states {topic} does"
+            source.reason = "no signal of a machine by its name or type; if it is one, name it in --states"
         elif total < (3 if source.role == "control" else FEWEST):
             source.reason = f"{plural(total, 'message')} only"
         elif not all(_messages(bag, topic) for bag in bags):
