@@ -150,6 +150,8 @@ def test_inputs_under_a_prefix_and_their_enable_condition(world: World, tmp_path
     status = world.status("/robot1/envelope_monitor")
     assert status["verdicts"] == 7 and status["armed"] is True
     assert status["received"] == {f"/robot1{CONTROL}": 8, f"/robot1{STATE}": 8}
+    nobody = "nobody publishes /robot1/mode, which parameter enable names"
+    assert world.set("/robot1/envelope_monitor", enable="/mode data == 3") == (True, nobody), "where it is listened for"
 
 
 def test_a_required_monitor_ends_if_its_model_is_wrong_and_a_prefix_is_a_name(world: World, tmp_path: Path) -> None:

@@ -416,10 +416,11 @@ class EnvelopeMonitorNode(LifecycleNode):
             return
         topic = session.enable_topic
         publishers_tell = not (session.rule.enable_type or topic in session.model.signals.topics)
-        found = [info.topic_type for info in self.get_publishers_info_by_topic(self.settings.there(topic))]
+        there = self.resolve_topic_name(self.settings.there(topic))
+        found = [info.topic_type for info in self.get_publishers_info_by_topic(there)]
         if not found:
             if session.heard(topic) is None:
-                self._enable_problem = f"nobody publishes {topic}, which parameter enable names"
+                self._enable_problem = f"nobody publishes {there}, which parameter enable names"
         elif publishers_tell and session.enable_type not in found:
             try:
                 session.found_enable_type(found[0])
