@@ -471,7 +471,8 @@ class Verdicts:
             return ()
         values, blamed = self.over_thresholds()
         rules = ((i, int(blamed[k, i])) for i in np.flatnonzero(self.rule_alarms[k]).tolist())
-        return self.alarms.reasons(rules, values[k].tolist(), self.horizon_utilisation[k], self.flags[k])
+        sizes = np.concatenate([self.utilisation[k, None], self.longer_utilisation[k]])
+        return self.alarms.reasons(rules, values[k].tolist(), sizes, self.flags[k])
 
     @property
     def state(self) -> Array:

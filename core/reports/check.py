@@ -206,8 +206,8 @@ def _jump(verdicts: Verdicts, name: str, bad: Index, change: Array, largest: flo
 def _horizons(model: UncertainLTI, verdicts: Verdicts) -> list[dict[str, Any]]:
     """What became of the windows of each horizon."""
     found = []
-    for j, steps in enumerate(model.steps, 1):
-        table, states = verdicts.horizon_utilisation[:, j], {}
+    for j, steps in enumerate(model.steps):
+        table, states = verdicts.longer_utilisation[:, j], {}
         with np.errstate(invalid="ignore"):
             left = np.abs(table) > 1.0
         for name, rows in zip(model.state_names, map(np.flatnonzero, left.T), strict=True):
@@ -223,31 +223,33 @@ def _repeats(model: UncertainLTI, verdicts: Verdicts, which: Mask) -> list[dict[
     """The repeats that some samples (N+1, n) belong to, in order of time; without those that go on to be frozen."""
     if model.repeats is None or not which.any():
         return []
-    transient, first, found = verdicts.transient, dict[tuple[int, int], int](), dict[tuple[int, int], dict[str, Any]]()
+    transient, spans, found = verdicts.transient, dict[tuple[int, int], tuple[int, int]](), []
     z = np.hstack([transient.x, transient.u])
-    for i, name in enumerate(model.state_names):
+    ever = np.fmax.reduce(z) - np.fmin.reduce(z)  # without NaN
+    for i in range(model.n):
         fresh = np.concatenate([[True], (np.diff(transient.x[:, i]) != 0) | (np.diff(transient.segment) > 0)])
         begins = np.maximum.accumulate(np.where(fresh, np.arange(len(fresh)), 0))
         for start, stop in runs(which[:, i]):
             if not verdicts.frozen[start, i] and stop < len(which) and verdicts.frozen[stop, i]:
                 continue
-            begin = int(begins[start])
-            since = first.setdefault((i, begin), start)  # where verdicts pause, the repeat goes on
-            seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, since))
-            longest = float(model.repeats.longest_repeat_s[i])
-            here, ever = (np.fmax.reduce(part) - np.fmin.reduce(part) for part in (z[begin:stop], z))  # without NaN
-            moving = np.flatnonzero(here > MOVES * ever)
-            found[i, begin] = {
-                "state": name,
-                **_instant(transient, begin),
-                "seconds": seconds,
-                "told_after": told,
-                "longest_in_fit": longest,
-                "why": verdicts.why_frozen.get((since, i), ""),
-                "moving": [model.signals.signals[j].name for j in moving],
-                "text": f"{name} {repeat_words(seconds, longest)} from {instant_text(_instant(transient, begin))}",
-            }
-    return sorted(found.values(), key=lambda repeat: (repeat["k"], repeat["state"]))
+            key = i, int(begins[start])
+            spans[key] = spans.get(key, (start,))[0], stop  # where verdicts pause, the repeat goes on
+    for (i, begin), (since, stop) in spans.items():
+        name, longest = model.state_names[i], float(model.repeats.longest_repeat_s[i])
+        seconds, told = (float(transient.t_ns[k] - transient.t_ns[begin]) * 1e-9 for k in (stop - 1, since))
+        moving = np.flatnonzero(np.fmax.reduce(z[begin:stop]) - np.fmin.reduce(z[begin:stop]) > MOVES * ever)
+        repeat = {
+            "state": name,
+            **_instant(transient, begin),
+            "seconds": seconds,
+            "told_after": told,
+            "longest_in_fit": longest,
+            "why": verdicts.why_frozen.get((since, i), ""),
+            "moving": [model.signals.signals[j].name for j in moving],
+            "text": f"{name} {repeat_words(seconds, longest)} from {instant_text(_instant(transient, begin))}",
+        }
+        found.append(repeat)
+    return sorted(found, key=lambda repeat: (repeat["k"], repeat["state"]))
 
 
 def long_repeats(data: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -332,9 +334,7 @@ class PerSample:
 
 def _nulls(values: Array) -> list[Any]:
     """Numbers as lists, None in place of those that are not finite."""
-    found = values.astype(object)
-    found[~np.isfinite(values)] = None
-    return list(found.tolist())
+    return list(np.ma.masked_invalid(values).tolist())
 
 
 def _why_unknown(model: UncertainLTI, verdicts: Verdicts, data: dict[str, Any]) -> str:
