@@ -576,3 +576,21 @@ def test_of_many_states_the_table_shows_those_most_often_outside():
     head = next(i for i, line in enumerate(lines) if line.split()[:2] == ["state", "violations"])
     assert [line.split()[0] for line in lines[head + 1 : head + 4]] == ["x45", "x48", "x1"]
     assert "  and 10 more rows; --json has all" in lines
+
+
+def test_of_many_recordings_a_fit_says_of_the_first_what_was_read_and_of_those_that_lose_much(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was a line for each: of 2000 short tables 2000, above what was fitted."""
+    rng, names = np.random.default_rng(0), []
+    for i in range(30):
+        x = np.cumsum(rng.normal(size=20)).round(3)
+        rows = [f"{0.1 * k:.1f},{value}" for k, value in enumerate(x) if i != 25 or k % 4]
+        names.append(str(tmp_path / f"run_{i:02}.csv"))
+        Path(names[-1]).write_text("\n".join(["time,x", *rows * (1 + (i == 25))]))
+    signals = tmp_path / "s.yaml"
+    signals.write_text("table: {time: time}\nstates: [{name: x, topic: /table, field: x}]\ncontrols: []\n")
+    fitted = [*names, "--signals", str(signals), "--alarm", "containment", "--output", str(tmp_path / "m.model.json")]
+    assert main(["fit", *fitted]) == 0
+    told = [line for line in capsys.readouterr().out.splitlines() if "usable transition" in line]
+    assert [line.rpartition("run_")[2][:2] for line in told] == [f"{i:02}" for i in (*range(20), 25)]

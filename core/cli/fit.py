@@ -88,15 +88,18 @@ def _fit_in_memory(options: argparse.Namespace) -> UncertainLTI:
 
 
 def _read(options: argparse.Namespace, signals: str | SignalMap) -> list[Transient]:
-    """The recordings that are named, each with a line that says what was read."""
+    """The recordings that are named; a line for each of the first, and of those that lose much, says what was read."""
     from uncertain_lti import read_transients
-    from uncertain_lti.reports.model_text import recording_text
+    from uncertain_lti.reports.model_text import MOST_SHOWN, recording_text
     from uncertain_lti.sampling.reading import loses_much
 
     transients = read_transients(options.bags, signals, options.progress.iterate("reading"), processes=None)
     options.progress.note(*(note for transient in transients for note in transient.notes))
-    for transient in transients:
-        (options.say_losses if loses_much(transient) else options.say)(recording_text(transient))
+    for i, transient in enumerate(transients):
+        if (lossy := loses_much(transient)) or i < MOST_SHOWN:
+            (options.say_losses if lossy else options.say)(recording_text(transient))
+    if (more := len(transients) - MOST_SHOWN) > 0:
+        options.say(f"and {plural(more, 'more recording')}, named where much is not used")
     return transients
 
 

@@ -39,7 +39,7 @@ from uncertain_lti.sampling.transient import Transient
 from uncertain_lti.signals.values import CRITERIA, of_table
 
 MOST_SHOWN = 20
-"""Signals whose elements, and discarded transitions that are printed."""
+"""Signals whose elements, discarded transitions, and recordings of a fit that are printed."""
 
 
 def recording_text(transient: Transient) -> str:
