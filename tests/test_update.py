@@ -206,6 +206,8 @@ def test_repeats_and_residuals_join():
     updated = one.update(held)
     assert (updated.repeats.longest_repeat_s >= other.repeats.longest_repeat_s).all()
     assert np.linalg.eigvalsh(updated.residuals.covariance).min() >= 0
+    quieter, joined, before = (np.diag(m.residuals.covariance) for m in (other, updated, one))
+    assert (quieter < joined).all() and (joined < before).all()
 
 
 @pytest.mark.parametrize(
@@ -259,7 +261,8 @@ def test_the_command_updates(tmp_path, capsys):
     assert "memory" not in json.loads(capsys.readouterr().out)
     old.replace(signatures=[Signature("worn", [1], [np.eye(old.n)])]).save(names[0])
     assert main(["fit", bags[2], "--update", names[0], "--output", names[1], "--force"]) == 0
-    assert "its signatures" in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert "its signatures" in said.err and "fitted before" not in said.out
     engine_bag(tmp_path / "run2x.mcap", 200, 2)  # it has grown
     assert main(["fit", bags[2], "--update", names[1], "--output", names[2], "--force"]) == 0
     assert f"{bags[2]}: fitted before with other samples, and both count; " in capsys.readouterr().out
