@@ -546,8 +546,7 @@ class WorkingSet:
     def _settle(self, row: Programmes, solve: Callable[[Programmes], str], polish: bool = False) -> None:
         if not row.unknown:
             self._row_rounds[row.i] += 1
-            self._check_known(row)
-            return
+            return  # a sample that it does not contain contradicts it, as of any row that is settled
         for number in range(MAX_ROUNDS if row.refined else FEW_ROUNDS):
             self._solve_or_contradict(row, solve)
             self._row_rounds[row.i] += 1
@@ -569,11 +568,3 @@ class WorkingSet:
             if found := row.contradiction():
                 raise InfeasibleError(row.i, *found) from None
             raise
-
-    def _check_known(self, row: Programmes) -> None:
-        """A row that the structure fixes altogether must contain every sample but for rounding."""
-        slack = row.slack() if row.limit is None else row.half - np.abs(row.y)
-        worst = int(np.argmin(slack)) if len(slack) else 0
-        if len(slack) and slack[worst] < -1e-9:
-            distance = float(-slack[worst] * row.sizes(worst) * row.scale)
-            raise InfeasibleError(row.i, int(row.samples.index[worst]), distance)
