@@ -87,7 +87,8 @@ def test_a_part_keeps_the_step_of_its_run() -> None:
 def test_what_was_counted_before_is_added_to() -> None:
     transient = Transient([0.0, 1.0, 1.0, 2.0], np.zeros(4), [], counters={"equal stamp": 2, "late /u": 3})
     assert transient.counters == {"equal stamp": 3, "late /u": 3}
-    assert transient.replace(name="again").counters == transient.counters and not +transient.replace(slice(1, 3)).counters
+    assert transient.replace(name="again").counters == transient.counters
+    assert not +transient.replace(slice(1, 3)).counters
 
 
 def test_the_default_gap_is_two_and_a_half_median_steps() -> None:
