@@ -614,6 +614,21 @@ def test_structure_rules_of_a_signals_file():
         refuses(FitError, words, Structure.from_rules, rules, *names)
 
 
+@pytest.mark.parametrize("noise", [1e-3, 1e-8])
+@pytest.mark.parametrize(("side", "sign"), [("lower", 1), ("upper", -1)])
+def test_a_nominal_element_ends_at_the_bound_that_the_data_would_pass(side, sign, noise):
+    rng = np.random.default_rng(0)
+    u, w = np.repeat(rng.uniform(-1, 1, (151, 1)), 20, axis=0), noise * rng.uniform(-1, 1, (3020, 2))
+    x = np.zeros((3020, 2))
+    for k in range(3019):
+        x[k + 1] = x[k] + 0.01 * (np.array([[-1.0, 0.5], [0.2, -2.0]]) @ x[k] + np.array([1.0, 2.0]) * u[k] + w[k])
+    transient = Transient(np.arange(3020) * 0.01, x, u)
+    bound = np.full((2, 2), np.nan)
+    bound[0, 1] = fit(transient, "qp", additive="disturbance").A[0, 1] + 0.3 * sign * noise
+    model = with_structure(transient, "disturbance", "qp", **{side: {"A": bound}})
+    assert model.A[0, 1] == pytest.approx(bound[0, 1], rel=1e-13, abs=1e-4 * noise)
+
+
 def test_structure_goes_to_the_model_file_and_back(tmp_path):
     transient = drawn(small_plant(72), 150, 72, noise=1e-3)
     given = Structure(2, 1, fixed={"A": [[np.nan, 0.3], [0.0, np.nan]]}, upper={"B": [[1.0], [np.nan]]})

@@ -212,6 +212,9 @@ def test_results_print_on_one_line_and_as_a_table():
         assert any("<x0>" in cell for row in rows for cell in row), "names are escaped, and come back"
     first = rows_of(model._repr_html_())[1]
     assert first[1] == f"{model.A[0, 0]:.4g} ± {model.dA[0, 0]:.3g}"
+    widths, cells = verdicts.upper[1:, 0] - verdicts.lower[1:, 0], rows_of(verdicts._repr_html_())[1]
+    assert [float(cell) for cell in cells[3:5]] == pytest.approx([widths.mean(), widths.max()], rel=1e-2)
+    assert widths.min() < 0.9 * widths.max()
     assert "inside all bounds: " in validation._repr_html_()
     assert "100.000% inside" in repr(verdicts) and "no alarm" in repr(verdicts)
 
@@ -246,8 +249,8 @@ def test_a_notebook_shows_a_figure_without_being_told_how():
 def test_a_run_goes_to_pandas_and_back():
     first = run(seed=3)
     late = Transient(first.t_ns + 1_700_000_000_123_456_789, first.x, first.u, state_names=first.state_names)
-    for absolute, start in ((True, late.t_ns[0]), (False, 0)):
-        frame = late.to_dataframe(absolute)
+    for options, start in (({"absolute": True}, late.t_ns[0]), ({}, 0)):
+        frame = late.to_dataframe(**options)
         states, controls = list(late.state_names), list(late.control_names)
         again = Transient.from_dataframe(frame, states=states, controls=controls)
         assert np.array_equal(again.t_ns, late.t_ns - late.t_ns[0] + start)
