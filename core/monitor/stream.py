@@ -423,8 +423,8 @@ class Stream:
 
     def know_rivals(self, topics: Iterable[str]) -> None:
         """Have messages of several publishers on these topics come by turns; those of states should be of one."""
-        clock, strange = self.sampler.clock, self._strange
-        rivals = [t for t in topics if t in self.received and t not in strange and (t == clock or not self.held(t))]
+        strange = self._strange
+        rivals = [t for t in topics if t in self.received and t not in strange and not self.held(t)]
         said = "several publishers send by turns, and are taken for one; stop all but one"
         self.reasons.rivals = f"{', '.join(rivals)}: {said}" if rivals else ""
 
