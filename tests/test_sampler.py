@@ -803,6 +803,13 @@ def test_min_step_thins_a_fast_stream_out() -> None:
     assert resolved.max_gap == pytest.approx(0.025)
 
 
+@pytest.mark.parametrize("lengths", [(2,), (40,), (2, 40), (900, 2)])
+def test_a_constant_step_is_the_period_of_recordings_of_any_length(lengths: tuple[int, ...]) -> None:
+    signals = SignalMap((Signal("x", "/c", "data"),), step="constant")
+    resolved = resolve(signals, {"/c": [np.arange(count) * TICK for count in lengths]}, {"/c": "log"})
+    assert resolved.step == pytest.approx(0.01)
+
+
 def test_a_lost_sample_is_a_gap_where_memories_look_back_over_it_but_jitter_is_none() -> None:
     recalls = SignalMap((Signal("x", "/c", "data"), Signal("before", "/c", "lag(data, 1)")))
     even = np.arange(1000) * TICK
