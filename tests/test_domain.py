@@ -58,6 +58,14 @@ def test_what_is_outside_is_named_by_signal_or_by_pair() -> None:
     assert not outside_in_words(model, np.array([[0.5], [0.2]]))
 
 
+def test_of_pairs_that_which_is_new_most_often_is_named_first() -> None:
+    rng = np.random.default_rng(0)
+    s, noise = rng.uniform(-1, 1, (4000, 1)), 0.02 * rng.uniform(-1, 1, (4000, 2))
+    model = fit(Transient(np.arange(4000) * 0.1, np.hstack([s, s + noise[:, :1]]), noise[:, 1:] - s), additive="noise")
+    z = np.array([[0.8, 0.8, 0.8]] * 20 + [[0.8, -0.8, -0.8]] * 2).T
+    assert outside_in_words(model, z) == "combinations of x2 with u1, x1 with u1, x1 with x2 that were not fitted"
+
+
 def test_the_span_of_a_state_is_in_recorded_units() -> None:
     domain = Domain(*map(np.array, ([-0.5, 0.0], [1.5, 0.25], [0.0], [1.0])))
     assert domain.span(np.array([3.0, 8.0])).tolist() == [6.0, 2.0]
