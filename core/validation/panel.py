@@ -546,12 +546,10 @@ def worth(model: UncertainLTI, panel: Panel) -> tuple[str, str]:
         )
     sees = f"it sees jumps of {ranges}" + f", large ones alone of {shortlist(coarse, 4)}" * bool(coarse)
     if alone:
-        return "some", (
-            "worth having while the machine runs as in the one recording, which says nothing of another day: "
-            f"{further}; {sees}"
-        )
+        once = "worth having while the machine runs as in the one recording, which says nothing of another day"
+        return "some", f"{once}: {further}; {sees}"
     if 3 * panel.alarming >= panel.units:
-        often = "most" if 2 * panel.alarming > panel.units else f"{panel.alarming} of {panel.units}"
+        often = f"{panel.alarming} of {panel.units}" if 2 * panel.alarming <= panel.units else "most"
         return "some", f"worth having, but expect an alarm in {often} healthy recordings: {sees}"
     return "good", f"worth having: {sees}"
 
