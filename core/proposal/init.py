@@ -18,7 +18,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
-from itertools import product, repeat
+from itertools import accumulate, product, repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +119,8 @@ def read_sources(
                 candidate.unit = of_each.pop() if len(of_each) == 1 else ""
             continue
         stamped, role = fact.stamps in ("usable", "mixed"), role_by_name(topic, fact.info.type)
-        role = role * (role != "apart" or not any(fnmatchcase(topic, pattern.partition(":")[0]) for pattern in asked))
+        if role == "apart" and any(fnmatchcase(topic, pattern.partition(":")[0]) for pattern in asked):
+            role = ""
         source = Source(topic, fact.info.type, role, stamped, fact.stamp_offset)
         sources.append(source)
         if not fact.info.readable:
@@ -186,11 +187,10 @@ def _of_table(topic: str, rows: int, everywhere: Mapping[str, bool]) -> list[Sou
 
 def _looked_at(bags: Sequence[Recording], sources: Sequence[Source]) -> tuple[Sequence[Recording], float, str]:
     """Recordings with as many numbers as memory is for, spread over all, the share of their time, and what to say."""
-    each = [sum(len(s.free) * _messages(bag, s.topic) for s in sources) for bag in bags]
-    order, taken = spread(len(bags)), 1
-    while taken < len(bags) and sum(each[i] for i in order[: taken + 1]) <= MOST_VALUES:
-        taken += 1
-    some, share = [bags[i] for i in sorted(order[:taken])], min(1.0, MOST_VALUES / max(each[order[0]], 1))
+    wanted, order = [(s.topic, len(s.free)) for s in sources], spread(len(bags))
+    together = [*accumulate(sum(count * _messages(bags[i], topic) for topic, count in wanted) for i in order)]
+    taken = max(1, sum(numbers <= MOST_VALUES for numbers in together))
+    some, share = [bags[i] for i in sorted(order[:taken])], min(1.0, MOST_VALUES / max(together[0], 1))
     part = f"the middle {share:.0%} of {some[0].path.name}" if share < 1.0 else f"{taken} of {len(bags)} recordings"
     said = f"of more numbers than memory is for, those of {part} were looked at"
     return some, share, said * (taken < len(bags) or share < 1.0)
@@ -220,9 +220,8 @@ def _read(bag: Recording, sources: Sequence[Source], share: float, progress: Pro
         columns = bag.columns([source.topic], [paths], progress)
         if share < 1.0:
             middle = np.abs(2 * (columns.arrival - min(ends)) - np.ptp(ends)) <= share * np.ptp(ends)
-            of = (array[middle] for array in (columns.topic, columns.arrival, columns.stamp, columns.values[0]))
-            topic, arrival, stamp, values = of
-            columns = Columns(topic, arrival, stamp, [values])
+            values = columns.values[0][middle]
+            columns = Columns(columns.topic[middle], columns.arrival[middle], columns.stamp[middle], [values])
         stamps = columns.stamp[columns.stamp >= 0]
         if len(stamps) > 1 and np.count_nonzero(np.diff(stamps) > 0) < 0.5 * (len(columns.arrival) - 1):
             source.halting = True

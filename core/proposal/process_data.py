@@ -7,7 +7,7 @@
 # "AS IS" BASIS, WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied. See the License for the
 # specific language governing permissions and limitations under the License.
 
-"""Process data: which columns are states, which are controls; all that is measured is judged."""
+"""Process data: which columns of tables are states, controls, runs, or words; all that is measured is judged."""
 
 from __future__ import annotations
 
