@@ -1616,6 +1616,17 @@ def test_motors_are_taken_or_left_as_one_with_the_true_reason(tmp_path):
     assert "at most 12 states are tried together" in proposal.text and "too short" not in proposal.text
 
 
+@pytest.mark.parametrize(("rows", "cells", "most"), [(10_000, 14, 12), (50_000, 30, 30)])
+def test_of_more_cells_alike_than_there_is_room_for_as_many_as_there_is_are_states(tmp_path, rows, cells, most):
+    """One was, and of a recording that is looked at in stretches the room was that of the stretches."""
+    rng = np.random.default_rng(6)
+    commands = np.repeat(rng.normal(size=(rows // 50, 2)), 50, axis=0)
+    heat = answers(rng, commands[:, np.arange(cells) % 2], pole=np.linspace(0.8, 0.97, cells))
+    columns = {f"temp_{i}": heat[:, i] for i in range(cells)}
+    columns |= {f"cmd_{i}": commands[:, i] for i in range(2)}
+    assert len(propose([table_of(tmp_path / "a.csv", columns, fmt="%.6f")]).states) == most
+
+
 def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):
     """As of an aeroplane, whose ailerons show far more than its elevator in everything together."""
     rng = np.random.default_rng(6)

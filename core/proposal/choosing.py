@@ -31,6 +31,7 @@ from uncertain_lti.identification.evidence import (
     two_sensors,
 )
 from uncertain_lti.proposal.candidates import (
+    ENOUGH,
     FAINT,
     FEWEST,
     OF_QUATERNION,
@@ -38,6 +39,7 @@ from uncertain_lti.proposal.candidates import (
     Candidate,
     Source,
     Steps,
+    clock_of,
     explained,
     is_measured,
     is_physical,
@@ -413,7 +415,7 @@ def choose(
     before = drop_functions(steps_of(pool, used), pool)
     pool, doubt = drop_noise(before, used)
     noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TABLE]  # measured, in a table
-    N = len(steps_of(pool, used).X)
+    N = len(steps_of(pool, used).X) * (1 + clock_of(pool).count // ENOUGH)  # of all
     room = max(2, N // PER_UNKNOWN)
     used = _strongest(_driven(pool, used, 0), used, _Room(N, room // 2, "controls"))
     steps = steps_of(pool, used)
@@ -513,8 +515,7 @@ def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = 
 
 def _strongest(driven: Array, used: list[Candidate], room: _Room) -> list[Candidate]:
     """The controls that show most, up to a number; `driven` (1 + m, n): of all controls, and of each."""
-    if len(used) > room.most:
-        _first([used[j] for j in np.argsort(driven[1:].max(axis=1, initial=0.0))[::-1]], room)
+    _first([used[j] for j in np.argsort(driven[1:].max(axis=1, initial=0.0))[::-1]], room)
     return [c for c in used if not c.reason]
 
 
@@ -548,9 +549,8 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
     kept, full = list[int](), set[int]()
 
     def take(strongest: int) -> None:
-        family = [j for j in order if families[j] == families[strongest] and j not in kept]
-        if len(family) > room.most:
-            family = [strongest]
+        family = [j for j in order if families[j] == families[strongest]]
+        family = [j for j in family if j not in kept] if len(family) <= room.most else [strongest]
         (kept.extend if len(kept) + len(family) <= room.most else full.update)(family)
 
     for i in order:
