@@ -72,11 +72,16 @@ def test_the_budget_ends_it_with_the_best_so_far():
 
 
 def test_ctrl_c_keeps_what_is_done():
+    said = []
+
     def interrupted(text):
-        raise KeyboardInterrupt
+        said.append(text)
+        if text.startswith("as fit does, "):
+            raise KeyboardInterrupt
 
     tuned = tune(RUNS, progress=interrupted)
     assert "the time ran out" in tuned.reason and tuned.model.alarm
+    assert any(text.startswith("fit 1 of ") for text in said[:-1]), "the first fit says how far it is, too"
 
 
 def test_what_cannot_be_tuned_is_refused():

@@ -321,7 +321,7 @@ def tune(
     if not budget > 0:
         raise FitError(f"budget is {budget}; give a positive number of seconds")
     until = time.monotonic() + budget
-    model = fit(transients, false_alarms=false_alarms, groups=groups)
+    model = fit(transients, false_alarms=false_alarms, groups=groups, progress=progress)
     transients = [controls_as(t, model.signals.controls) for t in transients]
     alarm = model.fit_summary["alarm"]
     if "biases" not in alarm:
