@@ -1616,7 +1616,7 @@ def test_motors_are_taken_or_left_as_one_with_the_true_reason(tmp_path):
     assert "at most 12 states are tried together" in proposal.text and "too short" not in proposal.text
 
 
-@pytest.mark.parametrize(("rows", "cells", "most"), [(10_000, 14, 12), (50_000, 30, 30)])
+@pytest.mark.parametrize(("rows", "cells", "most"), [(10_000, 14, 12), (50_000, 26, 26)])
 def test_of_more_cells_alike_than_there_is_room_for_as_many_as_there_is_are_states(tmp_path, rows, cells, most):
     """One was, and of a recording that is looked at in stretches the room was that of the stretches."""
     rng = np.random.default_rng(6)
@@ -1625,6 +1625,15 @@ def test_of_more_cells_alike_than_there_is_room_for_as_many_as_there_is_are_stat
     columns = {f"temp_{i}": heat[:, i] for i in range(cells)}
     columns |= {f"cmd_{i}": commands[:, i] for i in range(2)}
     assert len(propose([table_of(tmp_path / "a.csv", columns, fmt="%.6f")]).states) == most
+
+
+def test_what_takes_longest_of_many_signals_says_how_far_it_is(tmp_path):
+    """Of 72 columns `init` was silent for 13 s."""
+    rng, asked = np.random.default_rng(6), []
+    commands = np.repeat(rng.normal(size=(40, 1)), 50, axis=0)
+    path = table_of(tmp_path / "a.csv", {"x": answers(rng, commands)[:, 0], "cmd": commands[:, 0]})
+    found = propose([path], delays=lambda items, total: asked.append(total) or items)
+    assert asked == [11] and found.text == propose([path]).text
 
 
 def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):

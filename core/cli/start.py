@@ -101,7 +101,8 @@ def init(options: argparse.Namespace) -> Result:
         if os.path.exists(output):
             raise SignalError(f"{output}: is there already; choose another output, or move it away")
         target(output, holds=b"", kind="signals file", example="signals.yaml")
-    reading, chosen = options.progress.iterate("reading"), {"states": options.states, "controls": options.controls}
+    seeking, reading = options.progress.iterate("seeking what acts when", "delays"), options.progress.iterate("reading")
+    chosen = {"states": options.states, "controls": options.controls, "delays": seeking}
     proposal = propose(options.bags, reading, **chosen, like=options.like, table=_layout(options))
     options.progress.note(*proposal.warnings)
     proposed = {

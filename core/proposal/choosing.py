@@ -15,6 +15,7 @@ import math
 import re
 from collections.abc import Sequence
 from itertools import permutations
+from typing import Any
 
 import numpy as np
 
@@ -163,8 +164,7 @@ def drop_copies(pool: Sequence[Candidate], exact: bool = False) -> list[Candidat
     `exact`: only what is another one but for scale, offset and the last digits: of two sensors that move together, each
     shows the faults of the other.
     """
-    kept: list[Candidate] = []
-    may = _may_move_with(pool)
+    kept, may = list[Candidate](), _may_move_with(pool)
     for candidate in pool:
         near = (c for c in kept if (id(c), id(candidate)) in may)
         if twin := next((c for c in near if _moves_with(candidate, c, exact or _each_its_own(candidate, c))), None):
@@ -303,7 +303,8 @@ def _within_loops(
     parts = [s.parted(some, "state") for s in controls if (some := [c for c in reached if c in s.free])]
     controls, states = [s for s in controls if s.free], [*states, *parts]
     used = [c for s in controls for c in s.free]
-    unmoved = [s for s in states if references and not _driven(s.free, used, SHORT_DELAY)[0].max(initial=0.0) > SHOWS]
+    short = range(SHORT_DELAY + 1 if references else 0)
+    unmoved = [s for s in states if short and not _driven(s.free, used, short)[0].max(initial=0.0) > SHOWS]
     moved = {c: max(STEERS, most_shown([c], sent)) for c in reached}
     own = [c for s in states if s.type == TABLE for c in s.free]  # columns, each for itself
     inner = [r for r in references if any(most_shown([c], r.free) > by for c, by in moved.items())]
@@ -378,7 +379,7 @@ def assign_roles(
 
 
 def choose(
-    states: Sequence[Source], controls: Sequence[Source], like: str = "", asked: bool = False
+    states: Sequence[Source], controls: Sequence[Source], like: str = "", asked: bool = False, progress: Any = None
 ) -> tuple[list[Candidate], str]:
     """States of the model, and a sentence where they look like none; reasons go to what is left out.
 
@@ -417,18 +418,17 @@ def choose(
     noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TABLE]  # measured, in a table
     N = len(steps_of(pool, used).X) * (1 + clock_of(pool).count // ENOUGH)  # of all
     room = max(2, N // PER_UNKNOWN)
-    used = _strongest(_driven(pool, used, 0), used, _Room(N, room // 2, "controls"))
-    steps = steps_of(pool, used)
-    states_room, driven = _Room(N, room - len(used), "states"), _driven(pool, used)
+    used = _strongest(_driven(pool, used, [0]), used, _Room(N, room // 2, "controls"))
+    states_room, every = _Room(N, room - len(used), "states"), range(LONGEST_DELAY + 1)
+    driven = _driven(pool, used, progress(every, len(every)) if progress else every)
     if N < FEWEST:
         keep = pool[:MOST]
     elif all(re.search(rf"position\.[xyz]$|({OF_QUATERNION})\(", c.path) for c in pool):  # place and attitude of a body
         keep = _steered(pool, states_room, driven)
     else:
-        keep = _coupled(steps, pool, states_room, driven.max(axis=0, initial=0.0))
-    drop_idle_controls(steps_of(keep, used), used, _driven(keep, used, 0)[1:].max(axis=1, initial=0.0))
-    used = [c for c in used if not c.reason]
-    _delay(keep, used)
+        keep = _coupled(steps_of(pool, used), pool, states_room, driven.max(axis=0, initial=0.0))
+    drop_idle_controls(steps_of(keep, used), used, _driven(keep, used, [0])[1:].max(axis=1, initial=0.0))
+    _delay(keep, [c for c in used if not c.reason])
     levels = [c for c in noise if np.ptp(c.finite) <= _BURSTS * np.ptp(np.percentile(c.finite, (1, 99)))]
     for candidate in levels[: max(0, states_room.most - len(keep))]:
         candidate.reason, candidate.ready, candidate.why = "", "", "mostly noise from row to row: its level is judged"
@@ -490,25 +490,22 @@ def _driven_more(source: Source, faster: Sequence[Source], used: Sequence[Candid
     return bool((there & ~np.any(elsewhere, axis=0)).any())
 
 
-def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], latest: int = LONGEST_DELAY) -> Array:
-    """How clearly all controls, and each, show in each candidate's next step (1 + m, n), at the delay at which most.
-
-    It may be none: a servo carries a command out before the next message, which is the first to hold it.
-    """
-    m = len(used)
-    found = np.zeros((1 + m, len(pool)))
+def _driven(pool: Sequence[Candidate], used: Sequence[Candidate], lags: Any = range(LONGEST_DELAY + 1)) -> Array:
+    """How clearly all controls, and each, show in each candidate's next step (1 + m, n), at the delay at which most."""
+    found = np.zeros((1 + (m := len(used)), len(pool)))
 
     def most(steps: Steps) -> Array:
         if not m or len(steps.X) < FEWEST:
             return found
         return np.maximum(found, steps.effects())
 
-    for lag in range(latest + 1):
+    for lag in lags:
         found = most(steps_of(pool, used, [lag] * m))
     steps = steps_of(pool, [*used, *used], [0] * m + [-1] * m)
     if not m or len(steps.X) < FEWEST:
         return found
     U, V = np.hsplit(steps.U / size_of(steps.U), 2)
+    # a servo carries a command out before the next message, which is the first to hold it
     servo = from_both_ends(steps.X, U, V, steps.dX, np.ones(m, dtype=bool))[0]
     return np.where(servo, most(Steps(steps.X, V, steps.dX)), found)
 
@@ -544,8 +541,7 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
 
     A family, such as the axes of a body or its motors, is taken or left as one, unless it has no room alone.
     """
-    order = [int(i) for i in np.argsort(-driven, kind="stable")]
-    families = [candidate.family for candidate in pool]
+    order, families = np.argsort(-driven, kind="stable").tolist(), [candidate.family for candidate in pool]
     kept, full = list[int](), set[int]()
 
     def take(strongest: int) -> None:

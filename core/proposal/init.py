@@ -425,6 +425,7 @@ def propose(
     controls: Sequence[str] = (),
     like: str = "",
     table: TableLayout | None = None,
+    delays: Progress | None = None,
 ) -> Proposal:
     """Suggest states and controls of a machine from recordings of it.
 
@@ -449,6 +450,8 @@ def propose(
 
     table : TableLayout, optional
         Which columns of tables are time and run, or their step, for the file as well; default to look for them.
+    delays : callable, optional
+        As `progress`, for the delays at which controls may act; each takes a while where signals are many.
 
     Returns
     -------
@@ -484,7 +487,7 @@ def propose(
     moving = {(c.topic, c.path): c for s in sources for c in s.free}
     if not measured:
         raise BagError(f"{bags[0].path}: {_nothing(sources, warnings)}")
-    chosen, doubt = choose(measured, commands, like, bool(states))
+    chosen, doubt = choose(measured, commands, like, bool(states), delays)
     doubt = doubt or ("" if commands else at_rest(sources))
     used = [c for s in commands for c in s.free]
     if like and {c.element for c in [*chosen, *used]} != {like}:
