@@ -26,6 +26,8 @@ from uncertain_lti.model.alarm_rule import AlarmRule, StatisticRule
 from uncertain_lti.model.domain import Sampling
 from uncertain_lti.model.schedule import Axis, Schedule
 from uncertain_lti.model.terms import ARRAYS
+from uncertain_lti.signals.signal import Signal
+from uncertain_lti.signals.signal_map import SignalMap
 
 pytest.importorskip("rclpy", reason="rclpy is not installed")
 
@@ -508,6 +510,21 @@ def test_silence_of_each_input_and_its_return_are_told_once() -> None:
         f"no message on {CONTROL} for # s",
         "no verdict for # s: p, q missing, stale or not finite",
     ]
+
+
+def test_of_many_topics_no_line_names_them_all_nor_is_there_one_of_each() -> None:
+    """Of 62 topics that fell silent at once there were 62 lines."""
+    cells = tuple(Signal(f"x{i}", f"/cell{i}", "data", type="std_msgs/msg/Float64") for i in range(20))
+    rig = Rig()
+    rig.watch(by_hand(signals=SignalMap(cells, by_hand().signals.controls)), Rule())
+    rig.publishers = {cell.topic: 1 for cell in cells} | rig.publishers
+    rig.take(CONTROL, vector(rig.t_ns, 0.0, 0.0))
+    for cell in cells[::-1]:
+        rig.take(cell.topic, float64(0.0))
+    rig.wait(5.0)
+    lines = rig.lines
+    assert len(lines) <= 5 and not any("x12" in line or "/cell13" in line for line in lines), lines
+    assert any(line.startswith("no message on /cell1, ") and " and 8 more for " in line for line in lines), lines
 
 
 def test_of_many_stalls_those_that_are_told_have_their_length() -> None:

@@ -34,6 +34,7 @@ from rclpy.parameter import Parameter
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import ModelError, UncertainLTIError
+from uncertain_lti.base.text import shortlist
 from uncertain_lti.monitor.intake import Intake
 from uncertain_lti.monitor.outputs import VIOLATION
 from uncertain_lti.monitor.session import ERROR, STALE, WARN, EventLog, Failures, Report, Rule, Session
@@ -284,7 +285,7 @@ class EnvelopeMonitorNode(LifecycleNode):
         self._event_log.begin(self.session, time.monotonic())
         resolved = {topic: self.resolve_topic_name(self.settings.there(topic)) for topic in self.session.types}
         topics = [topic if topic == name else f"{topic} (as {name})" for topic, name in resolved.items()]
-        self.get_logger().info(f"active: listening to {', '.join(topics)}")
+        self.get_logger().info(f"active: listening to {shortlist(topics)}")
         self.intake.active = True
         self.outputs.poll()
         self._beat()

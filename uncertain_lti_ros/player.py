@@ -33,7 +33,7 @@ from rosgraph_msgs.msg import Clock
 from std_srvs.srv import Trigger
 
 from uncertain_lti.base.errors import BagError, SignalError, UncertainLTIError
-from uncertain_lti.base.text import meant, plural
+from uncertain_lti.base.text import meant, plural, shortlist
 from uncertain_lti.cli.command import DONE, Result, complain
 from uncertain_lti.recordings.bag import Bag
 from uncertain_lti.recordings.message_types import RawMessage
@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> Result:
         note(*bag.warnings)
         if not args.clock and args.rate not in (None, 1.0) and (unstamped := _unstamped(bag, list(played))):
             note(
-                f"no header stamps: {', '.join(unstamped)}; a node that uses the time of receipt sees steps "
+                f"no header stamps: {shortlist(unstamped)}; a node that uses the time of receipt sees steps "
                 f"{args.rate:g} times as fast; play with --clock, and start the listeners with use_sim_time"
             )
         _wait(life, played, args.wait, note)
@@ -121,9 +121,9 @@ def run(args: argparse.Namespace) -> Result:
             note(f"fell behind the requested rate by up to {behind:.1f} s, {apart}")
         took = time.monotonic() - began
         if joined := [topic for topic, count in _listeners(played).items() if count > heard[topic]]:
-            note(f"{', '.join(joined)}: a subscriber came after playing began, and lacks what was before; play again")
+            note(f"{shortlist(joined)}: a subscriber came after playing began, and lacks what was before; play again")
         if missed := _unconfirmed(life, played):
-            note(f"{', '.join(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
+            note(f"{shortlist(missed)}: a subscriber did not confirm every message within {_ACKNOWLEDGED:g} s")
     ended = f"{bag.path}: played {plural(sent.total(), 'message')} of {plural(len(played), 'topic')} in {took:.1f} s"
     if life.signal is None:
         args.say(ended)
@@ -217,9 +217,9 @@ def _wait(life: Life, played: dict[str, Publisher], limit: float, note: Callable
         return
     unmet = [topic for topic, there, found in zip(played, wanted(), counts, strict=True) if there > found]
     if not any(wanted()):
-        note(f"there is no subscriber to {', '.join(played)} after {limit:g} s")
+        note(f"there is no subscriber to {shortlist(list(played))} after {limit:g} s")
     elif unmet:
-        note(f"{', '.join(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
+        note(f"{shortlist(unmet)}: a subscriber asks for more quality of service than is offered; playing nevertheless")
 
 
 def _listeners(played: dict[str, Publisher]) -> dict[str, int]:

@@ -75,10 +75,11 @@ def run(args: argparse.Namespace) -> Result:
     simulated: bool = args.use_sim_time
     with living(lambda: Node(f"uncertain_lti_recorder_{os.getpid()}")) as life, _File(output, dict(args.note)) as file:
         topics = list(dict.fromkeys(resolved_name(life.node, topic) for topic in args.topics))
-        types = _wait_for(life, topics + [CLOCK] * simulated, args.wait, args.progress.note)
+        named, asked = shortlist(topics), topics + [CLOCK] * simulated
+        types = _wait_for(life, asked, args.wait, args.progress.note)
         taken = _InOrder(file, topics, SimulatedTime(life.node) if simulated else None)
         subscriptions = [_subscribe(life.node, topic, types[topic], file, taken) for topic in topics]
-        (args.progress.note if args.json else args.say)(f"recording {', '.join(topics)} to {output}; stop with Ctrl-C")
+        (args.progress.note if args.json else args.say)(f"recording {named} to {output}; stop with Ctrl-C")
         stage = args.progress.stage("recording") if args.progress.shown else nullcontext(lambda _: None)
         with stage as step:
             _record(life, subscriptions, file, taken, args.duration, step, args.progress.note)
@@ -89,7 +90,7 @@ def run(args: argparse.Namespace) -> Result:
             by = f"{whose} went back by up to {taken.fell_ns * 1e-9:.2g} s"
             args.progress.note(f"{by}: log times {times}, and `check` may judge otherwise than a node")
         if not file.count:
-            came = f"no message came on {', '.join(topics)}{f' after a time on {CLOCK}' * simulated}"
+            came = f"no message came on {named}{f' after a time on {CLOCK}' * simulated}"
             raise BagError(f"{output}: not written, {came}; check who publishes")
     lost = sum(subscription.lost for subscription in subscriptions)
     on_the_way = f", {lost} lost on the way" if lost else ""
@@ -119,11 +120,11 @@ def _wait_for(life: Life, topics: list[str], limit: float | None, note: Callable
 
     limit = math.inf if limit is None else limit
     if not life.until(found, min(1.0, limit)) and life.alive and limit > 1.0:
-        note(f"waiting for {', '.join(missing)}")
+        note(f"waiting for {shortlist(missing)}")
         life.until(found, limit - 1.0)
     if missing:
         since = f" after {limit:g} s" if life.alive else ", and was waited for, so nothing is recorded"
-        raise BagError(f"{', '.join(missing)}: not there{since}; start what publishes it")
+        raise BagError(f"{shortlist(missing)}: not there{since}; start what publishes it")
     return {topic: there[topic][0] for topic in topics}
 
 

@@ -48,7 +48,7 @@ def times(count: int) -> str:
     return "once" if count == 1 else f"{count} times"
 
 
-def shortlist(names: Sequence[str], limit: int) -> str:
+def shortlist(names: Sequence[str], limit: int = 12) -> str:
     """The first names, and how many more there are."""
     return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")
 

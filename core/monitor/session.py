@@ -132,8 +132,7 @@ class Session(Stream):
     def _taken_in(self, period: Period, now: float, timeout: float) -> tuple[list[str], list[str]]:
         """What there is to say of the messages of a period that is a warning, and what is none."""
         complaints, calm = list[str](), list[str]()
-        lacking = self.lacking(period.counters)
-        came_late = self.came_late(period.counters)
+        lacking, came_late = self.lacking(period.counters), self.came_late(period.counters)
         for status in (Status.GAP, Status.RESET, Status.MISSING, Status.STEP, Status.MODE, Status.FROZEN):
             if count := period.statuses[status]:
                 why = why_not(status, self.model)
@@ -182,7 +181,7 @@ class Session(Stream):
             return "; ".join([f"no message on {clock}", *found, *self.absent(self.model.signals)])
         since = self.sampler.counters - counters
         if lacking := self.lacking(counters):
-            found.append(f"{', '.join(signal.name for signal in lacking)} missing, stale or not finite")
+            found.append(f"{shortlist([signal.name for signal in lacking])} missing, stale or not finite")
             found += self.absent(lacking)
         counted = {Status.GAP: "gaps", Status.RESET: "resets"}
         kinds = Status.GAP, Status.RESET, Status.STEP, Status.MODE, Status.FROZEN
@@ -198,7 +197,7 @@ class Session(Stream):
     def _unheard(self) -> list[str]:
         """Topics of which nothing has come since the start, in words."""
         never = [topic for topic in self.types if self.heard(topic) is None]
-        return [f"nothing received on {', '.join(never)}"] * bool(never)
+        return [f"nothing received on {shortlist(never)}"] * bool(never)
 
     def ceased(self, now: float, timeout: float) -> dict[str, str]:
         """Topics that came steadily and do no more, while their last values count for ever, and what is said of them.
@@ -457,33 +456,32 @@ class EventLog:
             if (lines or name == "problems") and self._matters[name].becomes(value, now):
                 for line in lines:
                     self._log(OK, line)
-        ceased = session.ceased(now, timeout)
+        ceased, alike = session.ceased(now, timeout), dict[str, list[str]]()
         for topic in session.types:
             if topic != clock:
-                self._look_at_topic(session, topic, now, timeout, publishers.get(topic, 0), ceased.get(topic, ""))
+                said = self._of_topic(session, topic, now, timeout, publishers.get(topic, 0), ceased.get(topic, ""))
+                alike.setdefault(said, []).append(topic)
+        for said in filter(None, alike):
+            self._log(OK, said.replace("{topics}", shortlist(alike[said])))
         self._look_at_verdicts(session, now, timeout)
 
-    def _look_at_topic(
-        self, session: Session, topic: str, now: float, timeout: float, publishers: int, ceased: str
-    ) -> None:
+    def _of_topic(self, session: Session, topic: str, now: float, timeout: float, publishers: int, ceased: str) -> str:
         heard = session.heard(topic)
         if heard is None:
-            return  # the line on verdicts has it
-        held = session.held(topic)
-        age = now - heard
+            return ""  # the line on verdicts has it
+        held, age = session.held(topic), now - heard
         gone = age > timeout and math.isinf(held) and not publishers
         silent = age > max(timeout, held) or gone or bool(ceased)
-        if self._matters[f"silence {topic}"].becomes(silent or None, now):
-            said = f"no message on {topic} for {age:.1f} s{' and no publisher any more' * gone}"
-            self._log(OK, (said if gone else ceased or said) if silent else f"messages on {topic} again")
+        lacks = f"no message on {{topics}} for {age:.1f} s{' and no publisher any more' * gone}"
+        said = (lacks if gone else ceased or lacks) if silent else "messages on {topics} again"
+        return said if self._matters[f"silence {topic}"].becomes(silent or None, now) else ""
 
     def _look_at_verdicts(self, session: Session, now: float, timeout: float) -> None:
-        without = session.without_verdict(now)
-        matter = self._matters["verdicts"]
+        without, matter = session.without_verdict(now), self._matters["verdicts"]
         if session.judging(now, timeout):
             if matter.becomes("", now):
                 masked = f"; masked: {', '.join(session.monitor.masked)}" if session.monitor.masked else ""
-                first = f"judging {', '.join(session.model.state_names)}; alarm when {session.rule_text()}{masked}"
+                first = f"judging {shortlist(session.model.state_names)}; alarm when {session.rule_text()}{masked}"
                 again = f"judging again, after {self._lasted:.1f} s without a verdict"
                 self._log(OK, again if self._judged else first)
                 self._judged = True
