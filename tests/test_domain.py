@@ -24,7 +24,7 @@ from uncertain_lti import fit as fit_public
 from uncertain_lti.base.errors import ModelError
 from uncertain_lti.identification import fit
 from uncertain_lti.identification.structure import Structure
-from uncertain_lti.kernel.arithmetic import Judge
+from uncertain_lti.kernel.arithmetic import Judge, occupy, outside_domain
 from uncertain_lti.model.domain import MOST_CELLS, Domain, Occupancy, cells_for, jumps, outside_in_words
 from uncertain_lti.signals.signal_map import Signal, SignalMap
 
@@ -208,6 +208,22 @@ def test_one_sample_and_many_agree(size: int, cells: int, seed: int) -> None:
         for row, at in zip(z, place, strict=True)
     ]
     assert naive == expected.tolist()
+
+
+@pytest.mark.parametrize("cells", [5, 10, 15])
+def test_what_was_seen_is_seen_on_a_grid_over_larger_ranges(cells: int) -> None:
+    """Also what lies at the end of the smaller range, as of a fan that has a third speed in summer."""
+    rng = np.random.default_rng(cells)
+    winter = np.array([rng.choice([20.0, 60.0], 40), np.round(rng.normal(size=40), 1), np.full(40, 3.0)])
+    for further in ([100.0, 9.0, 4.0], [0.0, -9.0, 2.0], [20.0, 0.0, 3.0]):
+        ends = winter, np.column_stack([winter, further])
+        boxes = [(z.min(axis=1), z.max(axis=1)) for z in ends]
+        visited = np.zeros((3, cells, cells), dtype=bool)
+        occupy(winter, *boxes[0], visited)
+        before = Domain(boxes[0][0][:2], boxes[0][1][:2], boxes[0][0][2:], boxes[0][1][2:], Occupancy.of(visited))
+        held = before.measure.within(before, *boxes[1])
+        assert not outside_domain(winter, *boxes[1], held).any()
+        assert further[1] == 0.0 or not held[0].all(), "and not everything is"
 
 
 def a_file(folder: Path) -> tuple[UncertainLTI, dict[str, Any]]:

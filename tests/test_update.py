@@ -199,6 +199,15 @@ def test_combinations_that_were_seen_stay_seen():
         assert not updated.domain.outside(run.x[:-1], run.u[:-1]).any()
 
 
+def test_given_again_the_recordings_have_the_combinations_of_one_fit():
+    runs = runs_of(4, (20_000, 900, 900), noise=0.02)
+    runs[1:] = (Transient(r.t, r.x * by, r.u * by, name=r.name) for r, by in zip(runs[1:], (1.2, 1.5), strict=True))
+    model = fit(runs[0], "qp", **PAPER)
+    for count in (2, 3):
+        model = model.update(runs[:count])
+    assert np.array_equal(model.domain.measure.occupied, fit(runs, "qp", **PAPER).domain.measure.occupied)
+
+
 def test_repeats_and_residuals_join():
     runs = runs_of(6, (3000, 2000))
     held = Transient(runs[1].t, np.repeat(runs[1].x[::4], 4, axis=0)[: len(runs[1])], runs[1].u, name="held")

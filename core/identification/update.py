@@ -74,8 +74,8 @@ class _Updated(Fleet):
     def occupancy(self, low: Array, high: Array) -> Occupancy | None:
         """Combinations of two signals that the model has seen, or that are new."""
         seen = self._model.domain.measure
-        if seen is None:
-            return None
+        if seen is None or self._memory.rest is None:  # then all are there
+            return None if seen is None else super().occupancy(low, high)
         new = [passes.occupied(part, low, high, seen.cells, 1) for part in self._new.partitions]
         both = Occupancy.of(np.logical_or.reduce(new)).occupied | seen.within(self._model.domain, low, high)
         return Occupancy(seen.cells, both)

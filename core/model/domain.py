@@ -97,7 +97,9 @@ class Occupancy:
         least = np.concatenate((before.x_min, before.u_min))
         own = np.concatenate((before.x_max, before.u_max)) - least
         begin = ((least - low) / span)[:, None] + (own / span)[:, None] * edges
-        end = begin + (own / span / self.cells)[:, None]
+        end = begin + (wide := (own / span / self.cells)[:, None])
+        begin[:, :1] -= wide + 2e-9  # an outermost cell has a neighbour now, which is near what lies at its edge
+        end[:, -1:] += wide + 2e-9
         ends = begin + 1e-9, end - 1e-9
         first, last = (np.clip((at * self.cells).astype(int), 0, self.cells - 1) for at in ends)
         cells = np.arange(self.cells)[:, None]
