@@ -298,6 +298,19 @@ def test_the_command_reads_earlier_recordings_again_where_they_are_needed(tmp_pa
         in capsys.readouterr().err
     )
     equal(UncertainLTI.load("new.json"), UncertainLTI.load("all.json"))
+    Path("quiet.csv").rename("elsewhere.csv")  # a recording that is given again is found where it is now
+    assert main(["fit", "loud.csv", "elsewhere.csv", "--update", "old.json", "--output", "new.json", "--force"]) == 0
+    assert [s["file"] for s in UncertainLTI.load("new.json").fit_summary["sources"]] == ["elsewhere.csv", "loud.csv"]
+    assert main(["fit", "loud.csv", "elsewhere.csv", "--update", "new.json", "--output", "no.json"]) == 2
+    assert main(["validate", "new.json"]) == 0
+    capsys.readouterr()
+    known = UncertainLTI.load("all.json")  # as fitted in Python, which keeps no checksums, of recordings that are gone
+    known.replace(fit_summary=known.fit_summary | {"sources": [{"file": "gone.csv"}, {"file": "loud.csv"}]}).save(
+        "p.json"
+    )
+    np.savetxt("more.csv", table[:200], "%.12g", ",", header="t,a,b,c,u,v", comments="")
+    assert main(["fit", "more.csv", "--update", "p.json", "--output", "new.json", "--force"]) == 0
+    Path("elsewhere.csv").rename("quiet.csv")
     Path("quiet.csv").write_text(Path("quiet.csv").read_text() + "400.02,0,0,0,0,0\n")
     assert main(["fit", "loud.csv", "--update", "old.json", "--output", "new.json", "--force"]) == 2
     assert "give quiet.csv again, together with the new ones" in capsys.readouterr().err

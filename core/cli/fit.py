@@ -21,6 +21,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from uncertain_lti.base.errors import BagError, FitError, ModelError, UnprovenError
+from uncertain_lti.base.files import sha256
 from uncertain_lti.base.text import plural
 from uncertain_lti.cli import interrupted
 from uncertain_lti.cli.command import OPTIONS, RECORDINGS, RULES, Result, declared, helped, load_model, model_target
@@ -127,15 +128,14 @@ def _updated(options: argparse.Namespace) -> UncertainLTI:
             f"its signatures ({len(model.signatures)}) are of the bounds of before and are left out; learn them again"
         )
         options.progress.note(f"{options.update}: {lost}")
-    there = model.fit_summary["sources"]
-    new = [file for file in _files(transients) if file["file"] not in [source["file"] for source in there]]
-    return _with_sources(updated, [*there, *new])
+    there = [*model.fit_summary["sources"], *_files(transients)]
+    by_mark = {source.get("sha256", source["file"]): source for source in there}  # where each was found last
+    return _with_sources(updated, by_mark.values())
 
 
 def _earlier(options: argparse.Namespace, model: UncertainLTI) -> list[Transient]:
     """The recordings that a model was fitted to, if all are where its file says, or beside it, and unchanged."""
     from uncertain_lti import read_transients
-    from uncertain_lti.base.files import sha256
 
     files = {_found(source["file"], options.update): source.get("sha256") for source in model.fit_summary["sources"]}
     if not all(os.path.isfile(file) and sha256(file) == known for file, known in files.items()):
@@ -170,7 +170,7 @@ def _fit_archive(options: argparse.Namespace) -> UncertainLTI:
             asked = {name: getattr(options, name) for name in ("additive", "alarm", "false_alarms")}
             given = {"schedule": schedule, "cache": options.cache, "client": client, "progress": step}
             model = fit_many(options.bags, options.signals, options.criterion, **asked, **given)
-    return _with_sources(model, model.fit_summary["sources"])
+    return _with_sources(model, [{**s, "sha256": sha256(s["file"])} for s in model.fit_summary["sources"]])
 
 
 def _local_cluster(dask: Any, workers: int) -> Any:
@@ -207,8 +207,9 @@ def _asked(options: argparse.Namespace) -> dict[str, Any] | None:
 
 
 def _files(transients: Iterable[Transient]) -> list[dict[str, str]]:
-    """The files of recordings, each once: a table may hold several."""
-    return [{"file": name} for name in dict.fromkeys(name for t in transients for name in t.sources)]
+    """The files of recordings with their checksums, each once: a table may hold several."""
+    names = dict.fromkeys(name for t in transients for name in t.sources)
+    return [{"file": name, "sha256": sha256(name)} for name in names]
 
 
 def _found(file: str, model: str) -> str:
@@ -222,11 +223,8 @@ def _is_there(recording: str) -> bool:
 
 
 def _with_sources(model: UncertainLTI, sources: Iterable[dict[str, Any]], group: str | None = None) -> UncertainLTI:
-    """The model with the checksums of the files that it was fitted to, and the key of their groups."""
-    from uncertain_lti.base.files import sha256
-
-    marked = [s if "sha256" in s else {**s, "sha256": sha256(s["file"])} for s in sources]
-    facts = {**model.fit_summary, "sources": marked}
+    """The model with the files that it was fitted to, and the key of their groups."""
+    facts = {**model.fit_summary, "sources": list(sources)}
     return model.replace(fit_summary=facts | ({} if group is None else {"group": group}))
 
 

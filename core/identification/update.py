@@ -112,7 +112,7 @@ def updated(
         number = marks.setdefault(recording.mark, len(every))
         problem = replace(problem, source=np.full(problem.N, number))
         if number < len(memory.recordings):
-            known[number] = problem
+            known[number], every[number] = problem, recording  # it may be in another place now
         elif problem.N and number == len(every):
             every.append(recording)
             fresh.append(problem)
