@@ -46,6 +46,17 @@ def test_without_dates_recordings_are_counted(model):
     assert "it is past its threshold of 1" in text
 
 
+def test_what_the_model_was_fitted_to_does_not_count(model):
+    """Its bounds hold them, so that all after them reach farther."""
+    steady = checked(model, 0.0, 86_400.0, count=16)
+    fitted = [{**one, "recording": f"run {number % 2}"} for number, one in enumerate(steady[:8])]
+    for one in fitted:
+        one["states"] = {name: {**state, "largest": 0.3} for name, state in one["states"].items()}
+    assert drift_in_words(model, [*fitted, *steady[8:]]) == []
+    other = model.replace(memory={**model.memory, "recordings": [3, ["run 9", ""]]})
+    assert drift_in_words(other, [*fitted, *steady[8:]]) != []
+
+
 def test_a_node_that_runs_for_weeks_says_it_of_its_days(model):
     days, noon = Days(model), int(1.79e18)
     for number in range(15):

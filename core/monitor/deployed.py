@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 
 from uncertain_lti.base.arrays import Index
 from uncertain_lti.base.errors import ModelError
-from uncertain_lti.base.text import plural, shortened
+from uncertain_lti.base.text import list_of, plural, shortened
 from uncertain_lti.model.alarm_rule import StatisticRule
 from uncertain_lti.model.uncertain_lti import UncertainLTI
 from uncertain_lti.monitor.alarm import Armed, Arming, Condition
@@ -159,23 +159,23 @@ def drift_in_words(model: UncertainLTI, recordings: Sequence[Mapping[str, Any]],
     """A sentence on each state whose largest utilisation moves, and when it reaches its threshold.
 
     Its logarithm is a line over the weeks, or over the recordings where their stamps are no dates; `recordings`: as of
-    `check_data`; `what`: they are.
+    `check_data`, without those that the model was fitted to, which its bounds hold by construction; `what`: they are.
     """
-    some = sorted((r for r in recordings if r["verdicts"]), key=lambda r: int(r["t_ns"]))
+    fitted = [list_of(each)[:1] for each in list_of((model.memory or {}).get("recordings"))]
+    new = (r for r in recordings if r["verdicts"] and [r.get("recording")] not in fitted)
+    some = sorted(new, key=lambda r: int(r["t_ns"]))
     if len(some) < RECORDINGS:
         return []
     stamps = np.array([r["t_ns"] for r in some], dtype=np.float64)
     dated = stamps[0] > _YEAR_2001 and stamps[-1] - stamps[0] > _WEEK
     unit, at = ("week", (stamps - stamps[0]) / _WEEK) if dated else (what, np.arange(len(some)) * 1.0)
-    x, found = at - at.mean(), []
-    sure = _student(len(x) - 2, CHANCE / model.n)
+    x, sure, found = at - at.mean(), _student(len(at) - 2, CHANCE / model.n), []
     for name, limit in zip(model.state_names, _limits(model), strict=True):
         peaks = np.array([r["states"][name]["largest"] or math.nan for r in some])
         y = np.log(peaks) - np.log(peaks).mean()
         slope = float(x @ y / (x @ x))
-        error = float(np.linalg.norm(y - slope * x)) / math.sqrt((len(x) - 2) * float(x @ x))
-        if not abs(slope) > sure * error:  # not of what was not judged, either
-            continue
+        if not abs(slope) > sure * float(np.linalg.norm(y - slope * x)) / math.sqrt((len(x) - 2) * float(x @ x)):
+            continue  # nor of what was not judged
         text = f"the largest utilisation of {shortened(name)} {'rises' if slope > 0.0 else 'falls'} by "
         text += f"{100 * abs(math.expm1(slope)):.2g} % a {unit} over {plural(len(x), what)}"
         left = (math.log(limit) - float(np.log(peaks).mean())) / slope - float(x[-1])
