@@ -300,8 +300,12 @@ def test_quiet_outside_the_fitted_domain_is_no_quiet(folder, cli):
     middle = np.median([s["state"][0] for s in printed["recordings"][0]["verdict_per_sample"]])
     model["domain"]["x_max"][0] = float(middle)  # half of what was seen is now beyond what was fitted
     path.write_text(json.dumps(model))
-    first, *_, last = cli("check", path, folder / "run.mcap", status=3).out.splitlines()
-    assert first.startswith("UNKNOWN: 4") or first.startswith("UNKNOWN: 5")
+    first, *_, last, take_in = cli("check", path, folder / "run.mcap", status=3).out.splitlines()
+    assert first.startswith("UNKNOWN: 4")
+    assert take_in.startswith("if the machine was healthy: uncertain-lti fit --update ")
+    none = model | {"domain": model["domain"] | {"x_max": [-1e3] * 2, "x_min": [-2e3] * 2}}  # is it the same machine?
+    (folder / "none.model.json").write_text(json.dumps(none))
+    assert "fit --update" not in cli("check", folder / "none.model.json", folder / "run.mcap", status=3).out
     assert "outside the fitted domain, where nothing vouches for the bounds" in first and "says nothing" in last
     assert re.search(r"that reach as far: \w+ at [\d.-]+ to [\d.-]+ \(fitted: [\d.-]+ to [\d.-]+\)$", first)
     assert cli.json("report", path, folder / "run.mcap", status=3)["recordings"][0]["outcome"] == "unknown"

@@ -154,6 +154,7 @@ _SLOW = "say what took how long"
 )
 def check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
+    from uncertain_lti.model.domain import STRANGE, vouched
     from uncertain_lti.monitor.deployed import drift_in_words
     from uncertain_lti.reports.check import check_data, check_text, outcome
     from uncertain_lti.reports.findings import overview
@@ -169,7 +170,8 @@ def check(options: argparse.Namespace) -> Result:
     for bag, verdicts, decisions in judged:
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
-        if data["alarm"] and not data["reason"]:
+        farther = vouched(model) < (data["outside_domain_share"] or 0.0) <= STRANGE
+        if farther or data["alarm"] and not data["reason"]:
             files = bag.parts if len(bag.parts) > 1 and not bag.path.is_dir() else [bag.path]
             loud += map(shlex.quote, map(str, files))
         apart = "\n" * (len(results) > 1)  # some begin with a headline, before the name
@@ -184,15 +186,13 @@ def check(options: argparse.Namespace) -> Result:
     if len(results) > 1:
         options.say(str(overview(results)))
     status = judged.status(results)
-    drift = drift_in_words(model, results)
-    for text in drift:
+    for text in (drift := drift_in_words(model, results)):
         options.say(text)
     if loud and model.memory and not deployed.words():
         name, those = shlex.quote(options.model), " ".join(loud[:3]) + " ..." * (len(loud) > 3)
         options.say(f"if the machine was healthy: uncertain-lti fit --update {name} --output {name} --force {those}")
-    of_all = "unknown" if status == BAD_INPUT else outcome(results)
-    ended = {"alarm": status == ALARM, "outcome": of_all, "exit_status": status}
-    about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **ended}
+    of_all = {"alarm": status == ALARM, "outcome": "unknown" if status == BAD_INPUT else outcome(results)}
+    about: dict[str, Any] = {"model": options.model, "deployed": deployed.words(), **of_all, "exit_status": status}
     return Result(status, {**about, "recordings": results, "drift": drift, "not_checked": judged.refused})
 
 

@@ -100,8 +100,7 @@ class Occupancy:
         end = begin + (wide := (own / span / self.cells)[:, None])
         begin[:, :1] -= wide + 2e-9  # an outermost cell has a neighbour now, which is near what lies at its edge
         end[:, -1:] += wide + 2e-9
-        ends = begin + 1e-9, end - 1e-9
-        first, last = (np.clip((at * self.cells).astype(int), 0, self.cells - 1) for at in ends)
+        first, last = (np.clip((e * self.cells).astype(int), 0, self.cells - 1) for e in (begin + 1e-9, end - 1e-9))
         cells = np.arange(self.cells)[:, None]
         lies = (cells >= first[:, None]) & (cells <= np.maximum(first, last)[:, None])  # (n + m, larger, own)
         pairs = list(combinations(range(len(low)), 2)) or [(0, 0)]
