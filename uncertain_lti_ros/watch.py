@@ -55,14 +55,18 @@ class _Said:
     def __init__(self, names: list[str]) -> None:
         self.names, self.statistic_names = names, list[str]()
         self.t_ns, self.alarm = np.zeros(_MOST, dtype=np.int64), np.zeros(_MOST, dtype=bool)
-        self.flags, self.utilisation = np.full((2, _MOST, len(names)), np.nan)
+        self.flags, self.utilisation = np.empty((2, _MOST, len(names)))
         self.statistics = np.empty((_MOST, 0))
         self.count = 0
         self.early = dict[int, list[tuple[NDArray[Any], JointState]]]()  # by stamp: numbers that overtook their flags
 
-    def rows(self) -> list[NDArray[Any]]:
-        """Copies of all five, the oldest sample first."""
+    def rows(self, window: float) -> list[NDArray[Any]]:
+        """Copies of all five over the last seconds, the oldest sample first."""
         order = np.arange(max(0, self.count - _MOST), self.count) % _MOST
+        t_ns = self.t_ns[order]
+        shown = t_ns >= t_ns[-1:] - window * 1e9
+        shown[: max(np.flatnonzero(np.diff(t_ns) < -BACK_NS), default=-1) + 1] = False  # of the pass before, in a loop
+        order = order[shown]
         return [ring[order] for ring in (self.t_ns, self.alarm, self.flags, self.utilisation, self.statistics)]
 
 
@@ -112,7 +116,8 @@ class Watched:
     def _statistics(self, message: JointState) -> None:
         if self._said.statistic_names != list(message.name):
             self._said.statistic_names = list(message.name)
-            self._said.statistics = np.full((_MOST, len(message.name)), np.nan)
+            self._said.statistics = np.empty((_MOST, len(message.name)))
+            self._said.statistics[: self._said.count] = np.nan
         self._put(self._said.statistics, message)
 
     def _put(self, ring: NDArray[Any], message: JointState) -> None:
@@ -134,11 +139,9 @@ class Watched:
         """The last `window` seconds."""
         with self._lock:
             said, heard, reason = self._said, self._heard, self._reason
-            statistic_names, (t_ns, *rows) = said.statistic_names, said.rows()
-        shown = t_ns >= t_ns[-1:] - self._window * 1e9
-        shown[: max(np.flatnonzero(np.diff(t_ns) < -BACK_NS), default=-1) + 1] = False  # of the pass before, in a loop
-        alarm, flags, utilisation, statistics = (row[shown] for row in rows)
-        t = np.maximum.accumulate(t_ns[shown])  # one that is late is drawn beside the one before it
+            statistic_names, rows = said.statistic_names, said.rows(self._window)
+        t_ns, alarm, flags, utilisation, statistics = rows
+        t = np.maximum.accumulate(t_ns)  # one that is late is drawn beside the one before it
         t = (t - t[-1:]) * 1e-9
         quiet, gone = time.monotonic() - heard, ""
         silent = quiet > max(_SILENT, 3.0 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0)
