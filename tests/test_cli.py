@@ -598,3 +598,12 @@ def test_of_many_recordings_a_fit_says_of_the_first_what_was_read_and_of_those_t
     assert main(["fit", *fitted]) == 0
     told = [line for line in capsys.readouterr().out.splitlines() if "usable transition" in line]
     assert [line.rpartition("run_")[2][:2] for line in told] == [f"{i:02}" for i in (*range(20), 25)]
+
+
+def test_of_many_recordings_a_check_tells_of_those_in_alarm_and_lists_all(folder, cli):
+    """It was ten lines for each: of 1000 recordings 10 000, the alarms somewhere among them."""
+    calm = [shutil.copy(folder / "run.mcap", folder / f"calm_{i:02}.mcap") for i in range(21)]
+    out = cli("check", folder / "m.model.json", *calm, folder / "bad.mcap", status=1).out
+    told, alone, table = out.partition("in this table alone 21 recordings without an alarm:\n")
+    assert alone and "bad.mcap: 300 samples" in told and "calm" not in told
+    assert table.count("no alarm") == 21 and table.count("ALARM") == 1

@@ -156,8 +156,9 @@ def check(options: argparse.Namespace) -> Result:
     """Check each recording and return whether the alarm was raised."""
     from uncertain_lti.model.domain import STRANGE, vouched
     from uncertain_lti.monitor.deployed import drift_in_words
-    from uncertain_lti.reports.check import check_data, check_text, outcome
+    from uncertain_lti.reports.check import OUTCOMES, check_data, check_text, long_repeats, outcome
     from uncertain_lti.reports.findings import overview
+    from uncertain_lti.reports.model_text import MOST_SHOWN
 
     judged = Judged(options, load_model(options.model), options.bags)
     model, bags, deployed = judged.model, judged.bags, judged.deployed
@@ -166,7 +167,7 @@ def check(options: argparse.Namespace) -> Result:
         from uncertain_lti.reports.annotate import annotate, targets
 
         copies = dict(zip(bags, targets(options.write, bags), strict=True))
-    results, loud = [], list[str]()
+    results, loud, calm = [], list[str](), 0
     for bag, verdicts, decisions in judged:
         data = check_data(model, verdicts, samples=options.json)
         results.append(data)
@@ -174,8 +175,11 @@ def check(options: argparse.Namespace) -> Result:
         if farther or data["alarm"] and not data["reason"]:
             files = bag.parts if len(bag.parts) > 1 and not bag.path.is_dir() else [bag.path]
             loud += map(shlex.quote, map(str, files))
-        apart = "\n" * (len(results) > 1)  # some begin with a headline, before the name
-        options.say(apart + check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
+        if len(bags) > MOST_SHOWN and data["outcome"] not in OUTCOMES[:2] and not long_repeats(data):
+            calm += 1
+        else:
+            apart = "\n" * (len(results) > calm + 1)  # some begin with a headline, before the name
+            options.say(apart + check_text(data) + (f" ({words})" if (words := deployed.words()) else ""))
         if (copy := copies.get(bag)) is not None:
             writing = options.progress.iterate("writing")
             made = annotate(bag.parts, verdicts, decisions, copy, model, options.model, deployed.monitor.rule, writing)
@@ -184,7 +188,8 @@ def check(options: argparse.Namespace) -> Result:
             messages = plural(made.messages, "message")
             options.say(f"{messages} and the verdicts below {made.topics} written to {made.path}")
     if len(results) > 1:
-        options.say(str(overview(results)))
+        said = f"in this table alone {plural(calm, 'recording')} without an alarm:\n"
+        options.say(said * bool(calm) + str(overview(results)))
     status = judged.status(results)
     for text in (drift := drift_in_words(model, results)):
         options.say(text)
