@@ -1482,13 +1482,19 @@ def test_what_is_asked_for_takes_the_place_of_what_looks_like_it(tmp_path):
         refuses(BagError, "meets nothing that moves", propose, [path], **asked)
 
 
-def test_a_column_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path):
-    path = csv(tmp_path / "run.csv", ["time", "speed", "u"], [(0.1 * k, np.sin(k), np.cos(2 * k)) for k in range(100)])
-    for asked, words in (
-        ("speed", "a field is asked for with its topic, /table:speed$"),
-        ("none", "topics there: /table$"),
-    ):
-        refuses(BagError, words, propose, [path], states=[asked])
+@pytest.mark.parametrize("asked", ["Belt speed [m/s]", "Belt_speed_m_s", "Belt*", "/table:Belt_speed_m_s"])
+def test_a_column_is_asked_for_by_its_name_in_the_file_or_as_a_field(asked, tmp_path):
+    """It had to be named with the topic that tables have."""
+    rng = np.random.default_rng(0)
+    speed = np.repeat(rng.normal(size=(20, 1)), 20, axis=0)
+    path = table_of(tmp_path / "a.csv", {"A": answers(rng, speed)[:, 0], "Belt speed [m/s]": speed[:, 0]})
+    assert signals_of(propose([path], controls=[asked]))[1] == [("/table", "Belt_speed_m_s")]
+    refuses(BagError, "topics there: /table$", propose, [path], states=["none"])
+
+
+def test_a_field_that_is_asked_for_without_its_topic_is_named_with_it(tmp_path):
+    path = save(tmp_path / "run.mcap", driven(), {})
+    refuses(BagError, "a field is asked for with its topic, /.*:data", propose, [path], states=["data"])
 
 
 def table_of(path, columns, time=None, fmt="%.18e"):

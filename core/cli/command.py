@@ -242,7 +242,7 @@ OPTIONS: dict[str, dict[str, Any]] = {
     ),
     # how to begin
     "--states": _takes(
-        "what may be a state, in place of what looks like one; * stands for any letters",
+        "what may be a state, in place of what looks like one, also a column of a table; * stands for any letters",
         "TOPIC[:FIELD]",
         nargs="+",
         default=[],

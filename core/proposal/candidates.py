@@ -28,8 +28,9 @@ from uncertain_lti.base.text import plural, shortlist
 from uncertain_lti.identification.evidence import left, size_of
 from uncertain_lti.recordings.recording import Recording, usual_step
 from uncertain_lti.recordings.table import Table
+from uncertain_lti.recordings.table_text import field_name
 from uncertain_lti.signals.field_path import FUNCTIONS, of_quaternion
-from uncertain_lti.signals.values import TABLE
+from uncertain_lti.signals.values import TABLE, TABLE_TOPIC
 
 FEWEST = 20
 """Messages that a topic needs, and samples that a signal must leave its usual value in a fortieth of."""
@@ -497,11 +498,9 @@ def set_aside_labels(sources: Sequence[Source], bags: Sequence[Recording]) -> li
                 candidate.reason = "a label by its name, and no signal of the machine"
         if len(counts) > 1:
             usual, number = counts.most_common(1)[0]
-            warnings.append(
-                f"{name} looks like a label, and is not {f'{usual:.6g}' if isinstance(usual, float) else usual} in "
-                f"{plural(counts.total() - number, 'row')}: leave out of the recordings what was not "
-                "healthy, as a fit takes all of them for healthy"
-            )
+            usual, of = f"{usual:.6g}" if isinstance(usual, float) else usual, plural(counts.total() - number, "row")
+            remedy = "leave out of the recordings what was not healthy, as a fit takes all of them for healthy"
+            warnings.append(f"{name} looks like a label, and is not {usual} in {of}: {remedy}")
     return warnings
 
 
@@ -550,22 +549,20 @@ def at_rest(sources: Sequence[Source]) -> str:
 
 def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str], where: str) -> None:
     """Give the roles that a person asks for in place of those by name; a source that has both is split in two."""
-    asked = {"state": states, "control": controls}
-    met: dict[str, set[Candidate]] = {role: set() for role in asked}
+    states, controls = ([_with_topic(pattern, sources) for pattern in patterns] for patterns in (states, controls))
+    asked, met = {"state": states, "control": controls}, {"state": set[Candidate](), "control": set[Candidate]()}
     every = [(s, c) for s in sources for c in s.candidates]
     for role, pattern in ((role, pattern) for role, patterns in asked.items() for pattern in patterns):
-        topic, _, field = pattern.partition(":")
-        of_topic = [c for s, c in every if fnmatchcase(s.topic, topic)]
-        found = [c for c in of_topic if fnmatchcase(_plain(c.path), _plain(field or "*"))]
+        topic, path = (one or "*" for one in _plain(pattern).partition(":")[::2])
+        found = [c for s, c in every if fnmatchcase(s.topic, topic) and fnmatchcase(_plain(c.path), path)]
         if not any(not c.reason for c in found):
-            fields = [f"{s.topic}:{c.path}" for s, c in every if pattern == c.path]
             why = f"; topics there: {shortlist(list(dict.fromkeys(s.topic for s in sources)), 20)}"
             if found:
                 why = f"; {found[0].path} is {found[0].reason}"
-            elif fields:
+            elif fields := [f"{s.topic}:{c.path}" for s, c in every if pattern == c.path]:
                 why = f"; a field is asked for with its topic, {' or '.join(fields[:3])}"
             raise BagError(f"{where}: --{role}s {pattern} meets nothing that moves{why}")
-        if role == "state" and not field:  # of topics, what is measured by its name, if anything is
+        if role == "state" and path == "*":  # of topics, what is measured by its name, if anything is
             found = [c for c in found if c.source.role not in ("control", "reference")] or found
         met[role].update(found)
     fewer, more = sorted(met, key=lambda role: len(met[role]))
@@ -587,6 +584,15 @@ def ask_for(sources: list[Source], states: Sequence[str], controls: Sequence[str
             for candidate in source.free:
                 if candidate not in mine:
                     candidate.reason = source.reason or why
+
+
+def _with_topic(pattern: str, sources: Sequence[Source]) -> str:
+    """What is asked for, with the topic of tables if it is a column, by its name as a field or in the file."""
+    if any(fnmatchcase(s.topic, pattern.partition(":")[0]) for s in sources):
+        return pattern
+    columns = [_plain(c.path) for s in sources if s.type == TABLE for c in s.candidates]
+    names = (n for n in (pattern, field_name(pattern)) if any(fnmatchcase(c, _plain(n)) for c in columns))
+    return next((f"{TABLE_TOPIC}*:{name}" for name in names), pattern)
 
 
 def _plain(path: str) -> str:
