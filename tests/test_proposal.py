@@ -334,6 +334,8 @@ COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "ya
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 COLUMNS += [("action[0..5]", "control"), ("action_3", "control"), ("reaction", "state"), ("tau[0..6]", "control")]
 COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
+COLUMNS += [("zone3_heater", "control"), ("bypass_valve_pct", "control"), ("valve_temp", "state"), ("preheater", "state")]
+COLUMNS += [("damper_feedback", "state"), ("mixing_valve_2", "control"), ("valve_setpoint", "reference")]
 COLUMNS += [("Zieletage", "reference"), ("U_dc_V", "state"), ("U_q", "control")]
 
 
@@ -1947,20 +1949,20 @@ def test_a_servo_whose_command_comes_in_the_row_of_its_answer_is_a_state(tmp_pat
     )
 
 
-@pytest.mark.parametrize(("name", "moves"), [("valve", True), ("valve", False), ("battery", True), ("ErrRP", True)])
+@pytest.mark.parametrize(("name", "moves"), [("gate", True), ("gate", False), ("battery", True), ("ErrRP", True)])
 def test_a_column_that_is_set_now_and_then_is_a_command_if_it_shows(tmp_path, name, moves):
     """A battery's level and a place, which change as seldom, were controls."""
     rng = np.random.default_rng(4)
-    valve, level, rows = 0.0, 0.0, []
+    gate, level, rows = 0.0, 0.0, []
     for k in range(600):
-        valve = float(rng.choice([0.0, 0.4, 1.0])) if k % 25 == 0 else valve
-        rows.append((f"{0.1 * k:.1f}", valve, f"{level:.6f}"))
-        level += 0.1 * ((valve if moves else 0.0) - 0.5 * level) + 1e-3 * rng.standard_normal()
+        gate = float(rng.choice([0.0, 0.4, 1.0])) if k % 25 == 0 else gate
+        rows.append((f"{0.1 * k:.1f}", gate, f"{level:.6f}"))
+        level += 0.1 * ((gate if moves else 0.0) - 0.5 * level) + 1e-3 * rng.standard_normal()
     path = csv(tmp_path / "tank.csv", ["time", name, "level"], rows)
     proposal = propose([path])
     commands = [c.path for c in proposal.controls]
-    moves = moves and name == "valve"
-    assert commands == (["valve"] if moves else []), proposal.text
+    moves = moves and name == "gate"
+    assert commands == (["gate"] if moves else []), proposal.text
     assert ("by correlation alone: nothing is called a command here" in proposal.text) == moves
     if moves:
         assert [c.path for c in proposal.states] == ["level"]

@@ -317,7 +317,7 @@ _COMMANDS = "cmd|command|input|actuat|throttle|steer|thrust|pwm|pedal|joy|ackerm
 _COMMANDS += "|drive(?!n|_?(train|axle|shaft|wheel|end))"  # parts of a machine are none
 _COMMAND, _ABOVE = re.compile(f"({_COMMANDS}|contr)"), re.compile(f"({_COMMANDS})")  # a controller publishes all kinds
 _COLUMN = re.compile(
-    r"^u_?\d*$|^u_(?!dc|zk|bat|netz|bus)|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?(con|calc?))?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)"
+    r"^u_?\d*$|^u_(?!dc|zk|bat|netz|bus)|_u$|(^|_)in$|^in_|_in_|(^|_)actions?(_?\d+)?$|clipped|(^|_)(tau(_?(con|calc?))?_?\d*$|duty|(esc|servo).*_[uµ]s$|(rcou_c|raw_servo)\d)|(?<![a-z])(heater|valve|damper|burner)s?(_?\d+)?(_(pct|percent|open(ing)?))?$"
 )
 _DESIRED = re.compile(r"(^|_)(Des[A-Z]|[A-Z]Des$)")  # as the log of an autopilot spells what its controllers follow
 _SET = re.compile(r"(^|_)[Ss]et([A-Z_]|$)")  # a control of a table too, as it is spelt: no Settling
