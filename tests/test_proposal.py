@@ -1644,6 +1644,18 @@ def test_what_takes_longest_of_many_signals_says_how_far_it_is(tmp_path):
     assert asked == [11] and found.text == propose([path]).text
 
 
+def test_cells_alike_leave_room_for_what_is_unlike_them(tmp_path):
+    """What one of many alike measures others show as well; a pressure, less driven than they, only itself."""
+    rng = np.random.default_rng(6)
+    commands = np.repeat(rng.normal(size=(200, 2)), 50, axis=0)
+    heat = answers(rng, commands[:, np.arange(14) % 2], pole=np.linspace(0.8, 0.97, 14))
+    columns = {f"temp_{i}": heat[:, i] for i in range(14)}
+    columns["pressure"] = answers(rng, commands[:, :1], noise=0.02)[:, 0]
+    columns |= {f"cmd_{i}": commands[:, i] for i in range(2)}
+    proposed = [c.path for c in propose([table_of(tmp_path / "a.csv", columns, fmt="%.6f")]).states]
+    assert len(proposed) == 12 and "pressure" in proposed
+
+
 def test_every_axis_that_some_surface_turns_is_proposed(tmp_path):
     """As of an aeroplane, whose ailerons show far more than its elevator in everything together."""
     rng = np.random.default_rng(6)

@@ -258,7 +258,7 @@ class _Room:
     def __init__(self, N: int, carried: int, what: str) -> None:
         most = max(MOST, N // EACH)
         self.most = min(max(1, carried), most)
-        many = f"others show more, and at most {most} {what} are tried together; exchange one if this matters"
+        many = f"others show more or are less alike; at most {most} {what} are tried together: exchange one if need be"
         self.reason = many if carried >= most else f"the recording is too short for more than {self.most} {what}"
 
 
@@ -539,10 +539,12 @@ def _steered(pool: list[Candidate], room: _Room, driven: Array) -> list[Candidat
 def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) -> list[Candidate]:
     """States in whose next step the controls show, those that help to predict them, and those that follow them.
 
-    A family, such as the axes of a body or its motors, is taken or left as one, unless it has no room alone.
+    A family, such as a body's axes, is taken or left as one; of one larger than the room all but one come last.
     """
     order, families = np.argsort(-driven, kind="stable").tolist(), [candidate.family for candidate in pool]
-    kept, full = list[int](), set[int]()
+    kept, full, counted, strength = list[int](), set[int](), 0, dict[int, float]()
+    first = {families[j]: j for j in reversed(order)}
+    order.sort(key=lambda j: families.count(families[j]) > room.most and first[families[j]] != j)
 
     def take(strongest: int) -> None:
         family = [j for j in order if families[j] == families[strongest]]
@@ -554,7 +556,6 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
             take(i)
     if not kept:
         return _first(pool, room)
-    counted, strength = 0, dict[int, float]()
     while rest := [j for j in order if j not in kept and j not in full]:
         if len(kept) > counted:
             counted, strength = len(kept), dict(zip(rest, steps.coupling(kept, rest).tolist(), strict=True))
@@ -564,9 +565,8 @@ def _coupled(steps: Steps, pool: list[Candidate], room: _Room, driven: Array) ->
         take(strongest)
     for j, candidate in enumerate(pool):
         if j not in kept:
-            candidate.ready = "state"
             alone = "in one step neither the controls nor the states above show in it, nor it in them"
-            candidate.reason = room.reason if j in full else alone
+            candidate.reason, candidate.ready = room.reason if j in full else alone, "state"
     return [pool[j] for j in sorted(kept)]
 
 
