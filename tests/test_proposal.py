@@ -334,9 +334,9 @@ COLUMNS = [(name, "reference") for name in ("q_des1", "tau_des", "sp_pitch", "ya
 COLUMNS += [(name, "state") for name in ("description", "spread", "gasp", "refuel_time", "sp_measured")]
 COLUMNS += [("action[0..5]", "control"), ("action_3", "control"), ("reaction", "state"), ("tau[0..6]", "control")]
 COLUMNS += [("referencia", "reference"), ("T_soll", "reference"), ("consigne", "reference"), ("isolle", "state")]
-COLUMNS += [("zone3_heater", "control"), ("bypass_valve_pct", "control"), ("valve_temp", "state"), ("preheater", "state")]
-COLUMNS += [("damper_feedback", "state"), ("mixing_valve_2", "control"), ("valve_setpoint", "reference")]
-COLUMNS += [("Zieletage", "reference"), ("U_dc_V", "state"), ("U_q", "control")]
+COLUMNS += [("zone3_heater", "control"), ("bypass_valve_pct", "control"), ("valve_temp", "state")]
+COLUMNS += [("preheater", "state"), ("damper_feedback", "state"), ("mixing_valve_2", "control")]
+COLUMNS += [("valve_setpoint", "reference"), ("Zieletage", "reference"), ("U_dc_V", "state"), ("U_q", "control")]
 
 
 @pytest.mark.parametrize(("column", "role"), COLUMNS)
