@@ -141,6 +141,11 @@ class Source:
         """Messages of all recordings."""
         return sum(len(a) for a in self.arrival)
 
+    @property
+    def share(self) -> int:
+        """One message in so many is looked at for what shows in what."""
+        return 1 + self.count // ENOUGH
+
     @cached_property
     def rate(self) -> float:
         """Messages per second, by the usual step (`usual_step`), 1/s."""
@@ -252,7 +257,7 @@ def steps_of(states: Sequence[Candidate], controls: Sequence[Candidate], lags: S
     lags = lags or [0] * len(controls)
     longest = max(lags, default=0)
     clock = clock_of(states)
-    share = 1 + clock.count // ENOUGH
+    share = clock.share
     found = [tuple(np.empty((0, len(columns))) for columns in (states, controls, states))]
     for number, every in enumerate(clock.arrival):
         rows = np.arange(len(every))
@@ -273,10 +278,7 @@ def steps_of(states: Sequence[Candidate], controls: Sequence[Candidate], lags: S
 
 
 def earlier(values: Array, samples: int) -> Array:
-    """Each value some samples before, or later.
-
-    `values` (N,): one per sample; Returns (N,): naN where there is none.
-    """
+    """Each value some samples before, or later (N,); NaN where there is none."""
     if samples < 0:
         return earlier(values[::-1], -samples)[::-1]
     return np.concatenate([np.full(min(samples, len(values)), np.nan), values[: max(len(values) - samples, 0)]])
@@ -285,10 +287,7 @@ def earlier(values: Array, samples: int) -> Array:
 def held(
     candidate: Candidate, number: int, clock: Source, oldest: float | None = None, rows: Any = slice(None)
 ) -> Array:
-    """Latest value at each message of the clock, or at some of them, its `rows`.
-
-    Returns (messages,): naN before the first value, and where it is too old.
-    """
+    """Latest value at each message of the clock, or at its `rows`; NaN before the first, and where it is too old."""
     source = candidate.source
     if number >= len(source.arrival) or not len(source.arrival[number]) or number >= len(candidate.values):
         return np.full(len(clock.arrival[number][rows]), np.nan)

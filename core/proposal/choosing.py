@@ -32,7 +32,6 @@ from uncertain_lti.identification.evidence import (
     two_sensors,
 )
 from uncertain_lti.proposal.candidates import (
-    ENOUGH,
     FAINT,
     FEWEST,
     OF_QUATERNION,
@@ -416,7 +415,7 @@ def choose(
     before = drop_functions(steps_of(pool, used), pool)
     pool, doubt = drop_noise(before, used)
     noise = [c for c in before if c.reason and c.topic == main.topic and main.type == TABLE]  # measured, in a table
-    N = len(steps_of(pool, used).X) * (1 + clock_of(pool).count // ENOUGH)  # of all
+    N = len(steps_of(pool, used).X) * clock_of(pool).share  # of all
     room = max(2, N // PER_UNKNOWN)
     used = _strongest(_driven(pool, used, [0]), used, _Room(N, room // 2, "controls"))
     states_room, every = _Room(N, room - len(used), "states"), range(LONGEST_DELAY + 1)
